@@ -1,0 +1,248 @@
+"""What one experiment recorded: samples, settings, cycles."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import RecordError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Outcome(enum.IntEnum):
+    """How an experiment ended; the values are those of RelayExperiment.msg."""
+
+    UNKNOWN = 0
+    COMPLETED = 1
+    ABORTED = 2
+    FAILED = 3
+
+
+@dataclass(frozen=True)
+class RelaySettings:
+    """What the relay did in an experiment.
+
+    The command is ``baseline + bias + amplitude`` (high) or ``baseline + bias - amplitude``
+    (low); a direct-acting relay goes low when the measurement rises to
+    ``setpoint + hysteresis`` and high when it falls to ``setpoint - hysteresis``.
+
+    :param setpoint: measurement about which the relay switches [y].
+    :param baseline: command of the operating point [u].
+    :param amplitude: half the distance of the two levels, mu [u], > 0.
+    :param bias: offset of their middle from the baseline, mu0 [u].
+    :param hysteresis: half width of the switching band, epsilon [y], >= 0.
+    :param extra_delay: dead time that the relay added to its command [s].
+    :param sample_period: nominal period of the samples [s]; 0: by their stamps.
+    :param reverse_acting: True if a higher command lowers the measurement.
+    """
+
+    setpoint: float
+    baseline: float
+    amplitude: float
+    bias: float = 0.0
+    hysteresis: float = 0.0
+    extra_delay: float = 0.0
+    sample_period: float = 0.0
+    reverse_acting: bool = False
+
+    @property
+    def high(self) -> float:
+        """The upper command level [u]."""
+        return self.baseline + self.bias + self.amplitude
+
+    @property
+    def low(self) -> float:
+        """The lower command level [u]."""
+        return self.baseline + self.bias - self.amplitude
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """One whole cycle, from a switch to the high level to the next such switch.
+
+    :param index: number of the cycle in its experiment, from 0.
+    :param start: time of the switch that begins it [s, on the record's time axis].
+    :param period: whole period [s].
+    :param period_high: time with the command high, T_u1 of Wang et al. [s].
+    :param period_low: time with the command low, T_u2 of Wang et al. [s].
+    :param peak_max: highest measurement [y], absolute.
+    :param peak_min: lowest measurement [y], absolute.
+    :param time_to_peak_max: from the switch that turns the measurement down to the maximum [s].
+    :param time_to_peak_min: from the switch that turns the measurement up to the minimum [s].
+    :param mean_measurement: time average of the measurement [y].
+    :param mean_command: time average of the command [u].
+    :param converged: True if it agrees with the cycles before it.
+    :param disturbed: True if it should be left out of averages.
+    """
+
+    index: int
+    start: float
+    period: float
+    period_high: float
+    period_low: float
+    peak_max: float
+    peak_min: float
+    time_to_peak_max: float
+    time_to_peak_min: float
+    mean_measurement: float
+    mean_command: float
+    converged: bool = False
+    disturbed: bool = False
+
+
+@dataclass(frozen=True)
+class PiecewiseConstant:
+    """A signal that holds ``values[k]`` from ``times[k]`` on, and ``initial`` before ``times[0]``.
+
+    :param times: instants of change, strictly increasing [s], shape (m,).
+    :param values: level from each instant on, shape (m,).
+    :param initial: level before the first instant.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    initial: float
+
+    def __post_init__(self) -> None:
+        times = np.ascontiguousarray(self.times, dtype=np.float64)
+        values = np.ascontiguousarray(self.values, dtype=np.float64)
+        if times.ndim != 1 or times.shape != values.shape:
+            raise RecordError(
+                f"a piecewise-constant signal needs times and values of one shape (m,), "
+                f"found {times.shape} and {values.shape}"
+            )
+        if times.size > 1 and not bool(np.all(np.diff(times) > 0.0)):
+            raise RecordError("the instants of a piecewise-constant signal must increase strictly")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", values)
+
+    @classmethod
+    def from_samples(cls, times: FloatArray, values: FloatArray) -> PiecewiseConstant:
+        """Keep the changes of a held signal given by all its samples.
+
+        :param times: instants of the samples, not decreasing [s], shape (n,), n >= 1; of equal
+            instants the last one counts.
+        :param values: the level from each instant on, shape (n,).
+        """
+        times = np.asarray(times, dtype=np.float64)
+        values = np.asarray(values, dtype=np.float64)
+        last = np.append(np.diff(times) > 0.0, True)
+        times, values = times[last], values[last]
+        changed = np.flatnonzero(np.diff(values) != 0.0) + 1
+        return cls(times[changed], values[changed], float(values[0]))
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        """Return the level in force at each time ``t`` [s], any shape."""
+        index = np.searchsorted(self.times, t, side="right")
+        return np.concatenate(([self.initial], self.values))[index]
+
+
+def _as_column(name: str, value: object, length: int | None) -> FloatArray:
+    array = np.array(value, dtype=np.float64)
+    if array.ndim != 1 or (length is not None and array.size != length):
+        expected = "(n,)" if length is None else f"({length},)"
+        raise RecordError(f"{name} of a record must have shape {expected}, found {array.shape}")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class Record:
+    """The immutable record of one experiment.
+
+    ``command[i]`` is the answer to ``measurement[i]``; it was sent at ``command_time[i]`` and
+    held until the next one.
+
+    :param time: when each sample was taken, on the sensor's clock [s from the first sample],
+        shape (n,), not decreasing.
+    :param measurement: the samples [y], shape (n,), finite.
+    :param command: the answers [u], shape (n,), finite.
+    :param receive_time: when each sample arrived, on the relay's clock [s], shape (n,);
+        default: ``time``.
+    :param command_time: when each answer left, on the relay's clock [s], shape (n,);
+        default: ``receive_time``.
+    :param settings: the relay's settings; None where the record is no relay experiment.
+    :param noise_std: standard deviation of the measurement noise [y]; NaN: not estimated.
+    :param cycle_start: index of the first sample of each cycle; the last entry begins the cycle
+        that was not finished, so m + 1 entries bound m whole cycles.
+    :param outcome: how the experiment ended.
+    :param reason: why it ended so, a sentence for people.
+    :param experiment_id: the id that every message of the experiment carries.
+    :param start: time of the first sample [s since the epoch]; 0: unknown.
+    :param lost_samples: samples that the middleware is known to have lost.
+    :raises RecordError: if shapes differ, a value is not finite, or the time goes backwards.
+    """
+
+    time: FloatArray
+    measurement: FloatArray
+    command: FloatArray
+    receive_time: FloatArray = field(default_factory=lambda: np.empty(0))
+    command_time: FloatArray = field(default_factory=lambda: np.empty(0))
+    settings: RelaySettings | None = None
+    noise_std: float = math.nan
+    cycle_start: tuple[int, ...] = ()
+    outcome: Outcome = Outcome.UNKNOWN
+    reason: str = ""
+    experiment_id: str = ""
+    start: float = 0.0
+    lost_samples: int = 0
+
+    def __post_init__(self) -> None:
+        time = _as_column("time", self.time, None)
+        n = time.size
+        if n == 0:
+            raise RecordError("a record needs at least one sample, found none")
+        receive = self.receive_time if len(self.receive_time) else time
+        sent = self.command_time if len(self.command_time) else receive
+        columns = {
+            "time": time,
+            "measurement": _as_column("measurement", self.measurement, n),
+            "command": _as_column("command", self.command, n),
+            "receive_time": _as_column("receive_time", receive, n),
+            "command_time": _as_column("command_time", sent, n),
+        }
+        for name, column in columns.items():
+            if not bool(np.all(np.isfinite(column))):
+                where = int(np.flatnonzero(~np.isfinite(column))[0])
+                raise RecordError(f"{name}[{where}] of the record is {column[where]}, not finite")
+            object.__setattr__(self, name, column)
+        if bool(np.any(np.diff(time) < 0.0)):
+            where = int(np.flatnonzero(np.diff(time) < 0.0)[0])
+            raise RecordError(
+                f"the time of the record goes backwards after sample {where}: "
+                f"{time[where]:g} s, then {time[where + 1]:g} s"
+            )
+        starts = tuple(int(i) for i in self.cycle_start)
+        if any(not 0 <= i < n for i in starts) or any(
+            b <= a for a, b in zip(starts, starts[1:], strict=False)
+        ):
+            raise RecordError(
+                f"cycle_start must hold increasing sample numbers below {n}, found {starts}"
+            )
+        object.__setattr__(self, "cycle_start", starts)
+
+    def __len__(self) -> int:
+        return int(self.time.size)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    def input(self) -> PiecewiseConstant:
+        """Return the command as the process saw it, on the clock of the samples.
+
+        Sensor and relay may run on different clocks, so only the relay's own interval between
+        receiving and answering is used: the smallest lag from stamp to arrival is taken as the
+        offset of the clocks. A constant transport delay thus counts as dead time of the loop,
+        which is what a controller in the relay's place would see.
+        """
+        offset = float(np.min(self.receive_time - self.time))
+        sent = np.maximum.accumulate(self.command_time - offset)
+        return PiecewiseConstant.from_samples(sent, self.command)
