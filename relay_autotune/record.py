@@ -176,6 +176,9 @@ class Record:
     :param experiment_id: the id that every message of the experiment carries.
     :param start: time of the first sample [s since the epoch]; 0: unknown.
     :param lost_samples: samples that the middleware is known to have lost.
+    :param held_input: the command at its own instants [s on the axis of ``time``], for records
+        whose commands do not answer samples (a foreign recording, an ideal relay); None: as
+        ``command`` and ``command_time`` say.
     :raises RecordError: if shapes differ, a value is not finite, or the time goes backwards.
     """
 
@@ -192,6 +195,7 @@ class Record:
     experiment_id: str = ""
     start: float = 0.0
     lost_samples: int = 0
+    held_input: PiecewiseConstant | None = None
 
     def __post_init__(self) -> None:
         time = _as_column("time", self.time, None)
@@ -243,6 +247,8 @@ class Record:
         offset of the clocks. A constant transport delay thus counts as dead time of the loop,
         which is what a controller in the relay's place would see.
         """
+        if self.held_input is not None:
+            return self.held_input
         offset = float(np.min(self.receive_time - self.time))
         sent = np.maximum.accumulate(self.command_time - offset)
         return PiecewiseConstant.from_samples(sent, self.command)
