@@ -1,0 +1,10 @@
+"""Pin the linear algebra to one thread; import this before numpy.
+
+The order in which several threads add depends on their number, and with it the last digits of
+a fit. Live and replay both import this first, so that they give the same numbers.
+"""
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
