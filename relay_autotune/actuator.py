@@ -1,0 +1,71 @@
+"""An actuator that does not do quite what it is told: limits, backlash and stiction."""
+
+from __future__ import annotations
+
+import math
+
+from relay_autotune.errors import ParameterError
+
+
+class Actuator:
+    """Turn commands into positions; it keeps the position between calls.
+
+    A command passes, in this order:
+
+    1. the limits ``minimum`` and ``maximum``;
+    2. the dead band (play): the position follows at a distance of half the dead band, so that
+       after a reversal it stays until the command has moved by the whole of it;
+    3. stiction in the one-parameter form of Stenman, Gustafsson and Forsman (2003): the position
+       sticks until the command is further away than ``stiction``, and then jumps to it.
+
+    :param initial: position at the start [u].
+    :param minimum: lower limit of the position [u]; -inf: none.
+    :param maximum: upper limit of the position [u]; inf: none.
+    :param dead_band: width of the play [u], >= 0.
+    :param stiction: width of the band in which it sticks [u], >= 0.
+    :raises ParameterError: if the limits cross, or a width is negative or not finite.
+    """
+
+    def __init__(
+        self,
+        initial: float,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+        dead_band: float = 0.0,
+        stiction: float = 0.0,
+    ) -> None:
+        if not minimum < maximum:
+            raise ParameterError(
+                f"the actuator's lower limit must be below its upper one, "
+                f"found {minimum:g} and {maximum:g}"
+            )
+        for name, width in (("dead_band", dead_band), ("stiction", stiction)):
+            if not (math.isfinite(width) and width >= 0.0):
+                raise ParameterError(f"{name} must be finite and not negative, found {width}")
+        if not minimum <= initial <= maximum:
+            raise ParameterError(
+                f"the actuator cannot start at {initial:g}, outside its limits "
+                f"{minimum:g} to {maximum:g}"
+            )
+        self._minimum = minimum
+        self._maximum = maximum
+        self._half_play = 0.5 * dead_band
+        self._stiction = stiction
+        self._follower = initial
+        self.position = initial
+
+    def move(self, command: float) -> float:
+        """Give a command and return the position it leads to.
+
+        :param command: [u]; one that is not finite is not followed.
+        """
+        if not math.isfinite(command):
+            return self.position
+        wanted = min(max(command, self._minimum), self._maximum)
+        half = self._half_play
+        follower = min(max(self._follower, wanted - half), wanted + half)
+        self._follower = follower
+        if self._stiction == 0.0 or abs(follower - self.position) > self._stiction:
+            self.position = follower
+        return self.position
