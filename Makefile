@@ -1,0 +1,35 @@
+# make setup   prepare .venv/ and install/; the other targets do it by themselves
+# make demo    tune a simulated loop over real DDS; leaves demo_output/
+# make test    lint, type check, and the tests in both environments
+# make lint    ruff and mypy alone
+# make clean   remove everything that the above have made
+
+PYTHON ?= python3
+ENTER = . ./env.sh
+SOURCES = relay_autotune test tools setup.py
+# the tests of the numeric core, which need no ROS
+CORE_TESTS = test/core
+
+.PHONY: setup demo test lint clean
+
+setup:
+	@$(PYTHON) tools/prepare.py
+
+demo: setup
+	@$(ENTER) && python3 -m relay_autotune.cli.demo
+
+test: lint
+	@$(PYTHON) tools/prepare.py oldest
+	@if [ -d .venv-oldest ]; then \
+	    .venv-oldest/bin/python -m pytest -q $(CORE_TESTS); \
+	fi
+	@$(ENTER) && python3 -m pytest test
+
+lint: setup
+	@$(ENTER) && ruff check $(SOURCES)
+	@$(ENTER) && ruff format --check $(SOURCES)
+	@$(ENTER) && mypy
+
+clean:
+	rm -rf .venv .venv-oldest build install log demo_output .hypothesis .*_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

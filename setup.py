@@ -1,0 +1,33 @@
+"""Install the package relay_autotune; colcon calls this."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "relay_autotune"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    description="Relay-feedback autotuner for ROS 2",
+    license="Apache-2.0",
+    maintainer="relay_autotune maintainers",
+    maintainer_email="maintainers@relay-autotune.example",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    python_requires=">=3.11",
+    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
+    extras_require={"test": ["pytest", "hypothesis"]},
+    zip_safe=True,
+    entry_points={
+        "console_scripts": [
+            "relay_node = relay_autotune.nodes.relay:main",
+            "identifier_node = relay_autotune.nodes.identifier:main",
+            "plant_node = relay_autotune.nodes.plant:main",
+            "replay = relay_autotune.cli.replay:main",
+            "csv_to_bag = relay_autotune.cli.csv_to_bag:main",
+        ],
+    },
+)

