@@ -1,0 +1,65 @@
+"""Tests on residuals, and covariances that stay honest where they are correlated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincc
+
+FloatArray = NDArray[np.float64]
+
+
+def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
+    """Return the autocorrelation at lags 1 to ``lags``.
+
+    :param residual: shape (n,), in the order of time.
+    :param lags: less than n.
+    """
+    e = residual - residual.mean()
+    power = float(e @ e)
+    if power == 0.0:
+        return np.zeros(lags)
+    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
+
+
+def ljung_box(residual: FloatArray, lags: int = 20) -> float:
+    """Return the probability that white noise is at least as correlated (Ljung and Box 1978).
+
+    ``Q = n (n + 2) sum_k rho_k^2/(n - k)`` is chi-squared with as many degrees of freedom as
+    lags.
+
+    :param residual: shape (n,), in the order of time.
+    :param lags: lags that are tested, at most n/5 of them.
+    :return: p; nan for fewer than 10 samples.
+    """
+    n = residual.size
+    m = min(lags, n // 5)
+    if m < 2:
+        return math.nan
+    rho = autocorrelation(residual, m)
+    q = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, m + 1))))
+    return float(gammaincc(m / 2.0, q / 2.0))
+
+
+def covariance_meat(scores: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return the long-run covariance of the scores (Newey and West 1987).
+
+    ``S = Gamma_0 + sum_l (1 - l/(L+1)) (Gamma_l + Gamma_l')``, with L twice the lag at which the
+    residual's autocorrelation has died away.
+
+    :param scores: Jacobian times residual, sample by sample, shape (p, n).
+    :param residual: shape (n,).
+    """
+    n = residual.size
+    longest = max(n // 4, 1)
+    rho = autocorrelation(residual, longest)
+    quiet = np.flatnonzero(np.abs(rho) < 2.0 / math.sqrt(n))
+    bandwidth = min(2 * (int(quiet[0]) + 1 if quiet.size else longest), longest)
+    meat = scores @ scores.T
+    for lag in range(1, bandwidth + 1):
+        weight = 1.0 - lag / (bandwidth + 1.0)
+        gamma = scores[:, lag:] @ scores[:, :-lag].T
+        meat = meat + weight * (gamma + gamma.T)
+    return np.asarray(meat)

@@ -1,0 +1,188 @@
+"""What an identification gives: model, uncertainty, quality of fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.models import TransferFunction
+from relay_autotune.ultimate import ultimate_point
+
+FloatArray = NDArray[np.float64]
+
+_DETERMINED = 0.2
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How well a model reproduces the record.
+
+    :param residual_rms: root mean square of measurement minus model [y].
+    :param noise_std: noise measured before the test [y]; NaN: not estimated.
+    :param fit: 1 - rms(residual)/rms(measurement about its mean).
+    :param whiteness_p: probability of a residual this correlated if it were white (Ljung and
+        Box); NaN: not estimated.
+    :param prediction: root mean square error over the last cycle, predicted from those
+        before [y]; NaN: not estimated.
+    """
+
+    residual_rms: float = math.nan
+    noise_std: float = math.nan
+    fit: float = math.nan
+    whiteness_p: float = math.nan
+    prediction: float = math.nan
+
+
+@dataclass(frozen=True)
+class Identification:
+    """A model identified by one method, with what is known of its accuracy.
+
+    :param method: name in the registry.
+    :param model: the transfer function.
+    :param parameters: names of the structure's parameters.
+    :param values: their values, shape (p,).
+    :param covariance: of the values, shape (p, p); NaN: not estimated.
+    :param ci95_low: lower ends of the 95 % intervals, shape (p,); NaN: not estimated.
+    :param ci95_high: upper ends, shape (p,); NaN: not estimated.
+    :param ultimate_gain: K_u [u/y], with the sign of the process; NaN: the model has none.
+    :param ultimate_gain_std: its standard deviation [u/y]; NaN: not estimated.
+    :param ultimate_frequency: w_u [rad/s]; NaN: the model has none.
+    :param ultimate_frequency_std: its standard deviation [rad/s]; NaN: not estimated.
+    :param fit: quality of the fit.
+    :param warnings: sentences that the user must read.
+    :param undetermined: parameters whose 95 % interval is wider than 20 % of the value.
+    """
+
+    method: str
+    model: TransferFunction
+    parameters: tuple[str, ...]
+    values: FloatArray
+    covariance: FloatArray
+    ci95_low: FloatArray
+    ci95_high: FloatArray
+    ultimate_gain: float = math.nan
+    ultimate_gain_std: float = math.nan
+    ultimate_frequency: float = math.nan
+    ultimate_frequency_std: float = math.nan
+    fit: FitReport = field(default_factory=FitReport)
+    warnings: tuple[str, ...] = ()
+    undetermined: tuple[str, ...] = ()
+
+    @property
+    def structure(self) -> str:
+        """Name of the model's structure."""
+        return self.model.structure
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the values, shape (p,); NaN: not estimated."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def with_uncertainty(
+    method: str,
+    build: Callable[[FloatArray], TransferFunction],
+    parameters: tuple[str, ...],
+    values: FloatArray,
+    covariance: FloatArray | None = None,
+    quantile: float = 1.96,
+    fit: FitReport | None = None,
+    warnings: tuple[str, ...] = (),
+) -> Identification:
+    """Complete an identification: intervals of the parameters and of the ultimate point.
+
+    Gains and time constants get intervals of their logarithm, since they cannot change sign; a
+    dead time gets a linear one, cut at zero. K_u and w_u follow from the covariance to first
+    order: at a fixed frequency a parameter p changes log G by d, and the point moves by
+
+        dw = -d(arg G)/dp / (d(arg G)/dw),   d(log K_u) = -d(log|G|)/dp - d(log|G|)/dw dw.
+
+    :param method: name in the registry.
+    :param build: the model as a function of the values.
+    :param parameters: names, p of them.
+    :param values: shape (p,).
+    :param covariance: shape (p, p); None: not estimated.
+    :param quantile: half width of a 95 % interval in standard deviations.
+    :param fit: quality of the fit.
+    :param warnings: sentences for the user.
+    :raises IdentificationError: if a value is not finite.
+    """
+    if not bool(np.all(np.isfinite(values))):
+        found = ", ".join(f"{n} = {v:g}" for n, v in zip(parameters, values, strict=True))
+        raise IdentificationError(f"{method} gave no finite model: {found}")
+    p = len(parameters)
+    model = build(values)
+    cov = np.full((p, p), math.nan) if covariance is None else covariance
+    std = np.sqrt(np.diag(cov))
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratio = np.exp(np.minimum(quantile * std / np.abs(values), 700.0))
+        low, high = values / ratio, values * ratio
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    for i, name in enumerate(parameters):
+        if name == "dead_time":
+            low[i] = max(values[i] - quantile * std[i], 0.0) if np.isfinite(std[i]) else math.nan
+            high[i] = values[i] + quantile * std[i]
+    wide = std * quantile > _DETERMINED * np.abs(values)
+    undetermined = tuple(n for n, w in zip(parameters, wide, strict=True) if w)
+    point = ultimate_point(model)
+    gain = frequency = gain_std = frequency_std = math.nan
+    if point is None:
+        warnings = (*warnings, "the model has no ultimate point: no gain makes it oscillate")
+    else:
+        gain, frequency = point.gain, point.frequency
+        if covariance is not None:
+            gain_std, frequency_std = _ultimate_std(build, values, covariance, gain, frequency)
+    return Identification(
+        method,
+        model,
+        parameters,
+        values,
+        cov,
+        low,
+        high,
+        gain,
+        gain_std,
+        frequency,
+        frequency_std,
+        fit or FitReport(),
+        warnings,
+        undetermined,
+    )
+
+
+def _ultimate_std(
+    build: Callable[[FloatArray], TransferFunction],
+    values: FloatArray,
+    covariance: FloatArray,
+    gain: float,
+    frequency: float,
+) -> tuple[float, float]:
+    def log_response(x: FloatArray, w: float) -> complex:
+        # At the ultimate point -K_u G is 1, so that its logarithm has no branch nearby.
+        return complex(np.log(-gain * build(x)(1j * w)))
+
+    step = 1e-6
+    by_frequency = (
+        log_response(values, frequency * (1.0 + step))
+        - log_response(values, frequency * (1.0 - step))
+    ) / (2.0 * step * frequency)
+    gradient_gain, gradient_frequency = [], []
+    for i, value in enumerate(values):
+        h = step * (abs(value) or 1.0 / frequency)
+        up, down = values.copy(), values.copy()
+        up[i], down[i] = value + h, max(value - h, 0.0) if value >= 0.0 else value - h
+        change = (log_response(up, frequency) - log_response(down, frequency)) / (up[i] - down[i])
+        dw = -change.imag / by_frequency.imag
+        gradient_frequency.append(dw)
+        gradient_gain.append(-gain * (change.real + by_frequency.real * dw))
+
+    def deviation(gradient: list[float]) -> float:
+        g = np.array(gradient)
+        return math.sqrt(max(float(g @ covariance @ g), 0.0))
+
+    return deviation(gradient_gain), deviation(gradient_frequency)
