@@ -1,0 +1,4 @@
+"""The ROS nodes: they turn messages and parameters into calls of the core, and results back."""
+
+# First of all imports, so that a live fit and a replay of it give the same last digits.
+import relay_autotune.threads  # noqa: F401

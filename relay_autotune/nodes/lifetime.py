@@ -1,0 +1,146 @@
+"""The life of a node's process: its signals, its executor, its deferred work and its end.
+
+rclpy's own signal handlers invalidate the context before any Python code runs, so that nothing
+can be published afterwards. Here the process owns its handlers; the context lives until the
+node has brought its loop to a safe state.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from relay_autotune.errors import RelayAutotuneError
+
+# With the default of 5 ms a thread that only computes keeps the measurement waiting so long.
+_SWITCH_INTERVAL = 2e-4
+
+
+class ServedNode(Node):
+    """A node with work that waits until its callbacks have returned."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._deferred: deque[Callable[[], None]] = deque()
+
+    def defer(self, work: Callable[[], None]) -> None:
+        """Do ``work`` outside of the callback that asks for it, in the order of asking."""
+        self._deferred.append(work)
+
+    def work(self) -> bool:
+        """Do one piece of deferred work; return True if there is more."""
+        if self._deferred:
+            self._deferred.popleft()()
+        return bool(self._deferred)
+
+    def work_off(self) -> None:
+        """Do all deferred work."""
+        while self.work():
+            pass
+
+    def end(self, reason: str) -> None:
+        """Bring the loop to a safe state first of all, then finish what is open.
+
+        :param reason: why the process ends, for people.
+        """
+
+
+def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM, or until a callback raises.
+
+    :param create: makes the node.
+    :param name: name of the executable, for messages on standard error.
+    :param args: command line; default: that of the process.
+    :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
+    """
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # A second signal changes nothing: the end below is bounded in time.
+        signal.signal(number, lambda n, _: stopped.append(n))
+    try:
+        rclpy.init(
+            args=None if args is None else list(args),
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # rclpy has no common base for what it raises here.
+        print(f"{name}: {_first_line(error)}", file=sys.stderr)
+        return 2
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    try:
+        node = create()
+    except RelayAutotuneError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
+    try:
+        return _serve(node, stopped)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _serve(node: ServedNode, stopped: list[int]) -> int:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    _wake_on_signal(executor)
+    # What was imported stays: the collector need not look at it again and again.
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
+    status, reason = 0, ""
+    try:
+        more = False
+        while not stopped:
+            executor.spin_once(0.0 if more else None)
+            more = node.work()
+        reason = f"the node was stopped by {signal.Signals(stopped[0]).name}"
+    except Exception as error:
+        status, reason = 1, f"the node failed: {_where(error)}"
+    # The safe command goes out before anything is said about why.
+    try:
+        node.end(reason)
+    except Exception as error:
+        status = 1
+        node.get_logger().fatal(f"could not end in order: {_where(error)}")
+    if status:
+        node.get_logger().fatal(reason)
+    executor.shutdown(timeout_sec=0.0)
+    return status
+
+
+def _wake_on_signal(executor: SingleThreadedExecutor) -> None:
+    # A Python signal handler does not interrupt the executor's wait in C. The interpreter writes
+    # the number of a signal into this pipe at once; a thread reads it and gives the executor
+    # something to do.
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def read() -> None:
+        while os.read(reader, 64):
+            executor.create_task(lambda: None)
+
+    threading.Thread(target=read, name="signals", daemon=True).start()
+
+
+def _where(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {_first_line(error)}{place}"
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__

@@ -1,0 +1,245 @@
+"""plant_node: a simulated process on a measurement and a command topic."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_msgs.msg import Float64
+
+from relay_autotune.actuator import Actuator
+from relay_autotune.errors import ParameterError
+from relay_autotune.messages import set_stamp
+from relay_autotune.models import STRUCTURES, TransferFunction
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.parameters import NodeParameter, declare, values_of
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+MODES = ("realtime", "clock", "lockstep")
+
+# In lockstep a measurement that nobody has answered is repeated after this silence [s].
+REPEAT_AFTER = 0.2
+
+# Between the command that starts a lockstep run and sample 1 [s]. The relay takes for a repeat of
+# sample 0 what was sent earlier than half of this after its first command.
+QUIET_AFTER_GO = 0.01
+
+# Simulated time begins here [s]: zero means "no time yet" to ROS.
+CLOCK_START = 1.0
+
+PARAMETERS = (
+    NodeParameter("numerator", (), "", "Coefficients of s in the numerator, highest power first."),
+    NodeParameter(
+        "denominator", (), "", "Coefficients of s in the denominator, highest power first."
+    ),
+    NodeParameter(
+        "structure",
+        "",
+        "",
+        "Named structure of the process, instead of the two polynomials.",
+        choices=("", *STRUCTURES[:-1]),
+    ),
+    NodeParameter("gain", 1.0, "y/u", "Gain of the structure."),
+    NodeParameter("time_constants", (), "s", "Lags of the structure."),
+    NodeParameter("zeros", (), "s", "Time constants of the structure's zeros."),
+    NodeParameter("order", 0, "", "Number of equal lags, for lag_n and lag_n_zero.", 0, 50),
+    NodeParameter("zeta", 0.0, "", "Damping of the structure's complex pair."),
+    NodeParameter("w0", 0.0, "rad/s", "Natural frequency of the structure's complex pair.", 0.0),
+    NodeParameter("dead_time", 0.0, "s", "Dead time of the process.", 0.0),
+    NodeParameter("sample_period", 0.1, "s", "Time between samples.", 1e-5),
+    NodeParameter("noise_std", 0.0, "y", "Standard deviation of white noise.", 0.0),
+    NodeParameter("seed", 0, "", "Seed of the noise.", 0),
+    NodeParameter("quantisation", 0.0, "y", "Resolution of the sensor; 0: none.", 0.0),
+    NodeParameter(
+        "operating_point", (), "", "Measurement [y] and command [u] at rest, y0 and u0."
+    ),
+    NodeParameter("load_time", 0.0, "s", "When a load step enters before the process.", 0.0),
+    NodeParameter("load_size", 0.0, "u", "Height of the load step; 0: none."),
+    NodeParameter("drift", 0.0, "y/s", "Slope added to the measurement."),
+    NodeParameter("command_min", -math.inf, "u", "Lower limit of the actuator."),
+    NodeParameter("command_max", math.inf, "u", "Upper limit of the actuator."),
+    NodeParameter("stiction", 0.0, "u", "Band in which the actuator sticks.", 0.0),
+    NodeParameter("dead_band", 0.0, "u", "Play of the actuator.", 0.0),
+    NodeParameter(
+        "mode",
+        "realtime",
+        "",
+        "realtime; clock: publishes /clock; lockstep: one step for each command.",
+        choices=MODES,
+    ),
+    NodeParameter(
+        "speed", 1.0, "", "Simulated seconds in a second, in the mode clock.", 1e-3, 1e4
+    ),
+)
+
+
+def process_from(values: dict[str, Any]) -> VirtualProcess:
+    """Build the process that a node's parameters describe.
+
+    :param values: the parameters by name.
+    :raises RelayAutotuneError: if they describe none.
+    """
+    point = values["operating_point"] or (0.0, 0.0)
+    if len(point) != 2:
+        raise ParameterError(
+            f"operating_point must be [measurement, command], found {list(point)}"
+        )
+    return VirtualProcess(
+        model_from(values),
+        rest_measurement=point[0],
+        rest_command=point[1],
+        actuator=Actuator(
+            point[1],
+            minimum=values["command_min"],
+            maximum=values["command_max"],
+            dead_band=values["dead_band"],
+            stiction=values["stiction"],
+        ),
+        disturbances=Disturbances(
+            noise_std=values["noise_std"],
+            quantisation=values["quantisation"],
+            load_time=values["load_time"],
+            load_size=values["load_size"],
+            drift=values["drift"],
+        ),
+        seed=values["seed"],
+    )
+
+
+def model_from(values: dict[str, Any]) -> TransferFunction:
+    """Build the model that a node's parameters describe, by polynomials or by structure.
+
+    :param values: the parameters by name.
+    :raises RelayAutotuneError: if both are given, or none, or they contradict themselves.
+    """
+    polynomials = bool(values["numerator"] or values["denominator"])
+    if polynomials == bool(values["structure"]):
+        raise ParameterError(
+            "the process is to be given by numerator and denominator or by structure, "
+            f"found {'both' if polynomials else 'neither'}"
+        )
+    if polynomials:
+        return TransferFunction.from_polynomials(
+            values["numerator"], values["denominator"], dead_time=values["dead_time"]
+        )
+    return TransferFunction.from_structure(
+        values["structure"],
+        gain=values["gain"],
+        time_constants=values["time_constants"],
+        zeros=values["zeros"],
+        dead_time=values["dead_time"],
+        order=values["order"],
+        natural_frequency=values["w0"],
+        damping=values["zeta"],
+    )
+
+
+class PlantNode(ServedNode):
+    """A simulated process.
+
+    Sample k is taken at k times the sample period. In real time a command takes effect when it
+    arrives; with /clock at the simulated time at which it arrives, that of the last sample; in
+    lockstep command k acts from sample k on and leads to sample k + 1.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("plant_node")
+        declare(self, PARAMETERS, read_only=True)
+        values = values_of(self, PARAMETERS)
+        self._process = process_from(values)
+        self._period: float = values["sample_period"]
+        self._samples = 0
+        self._message = Float64()
+        overridable = QoSOverridingOptions.with_default_policies()
+        self._measurement = self.create_publisher(
+            Float64, "measurement", quality.MEASUREMENT, qos_overriding_options=overridable
+        )
+        received = {
+            "realtime": self._on_command_in_time,
+            "clock": self._on_command_with_clock,
+            "lockstep": self._on_command_in_lockstep,
+        }[values["mode"]]
+        self._command = self.create_subscription(
+            Float64,
+            "command",
+            received,
+            QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE),
+            qos_overriding_options=overridable,
+        )
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._start = time.monotonic()
+        self._timer: Timer
+        if values["mode"] == "lockstep":
+            self._waiting = True
+            self._value = self._process.measure(0.0)
+            self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=self._steady)
+        elif values["mode"] == "clock":
+            self._clock = self.create_publisher(
+                ClockMessage, "/clock", QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+            )
+            self._timer = self.create_timer(
+                self._period / values["speed"], self._tick, clock=self._steady
+            )
+        else:
+            self._timer = self.create_timer(self._period, self._sample, clock=self._steady)
+        self.get_logger().info(
+            f"mode {values['mode']}, sample period {self._period:g} s, "
+            f"measurement on {self._measurement.topic_name}, command on {self._command.topic_name}"
+        )
+
+    # Real time: both sides act when they come.
+
+    def _sample(self) -> None:
+        self._publish(self._process.measure(time.monotonic() - self._start))
+
+    def _on_command_in_time(self, message: Float64) -> None:
+        self._process.command(message.data, time.monotonic() - self._start)
+
+    # Simulated time: it stands still between two messages of /clock.
+
+    def _tick(self) -> None:
+        now = self._samples * self._period
+        self._samples += 1
+        value = self._process.measure(now)
+        message = ClockMessage()
+        set_stamp(message.clock, round((CLOCK_START + now) * 1e9))
+        self._clock.publish(message)
+        self._publish(value)
+
+    def _on_command_with_clock(self, message: Float64) -> None:
+        self._process.command(message.data)
+
+    # Lockstep: each command is a step.
+
+    def _repeat(self) -> None:
+        if not self._waiting:
+            # Who commanded has left: whoever comes next must hear the present measurement.
+            self._waiting = self._command.get_publisher_count() == 0
+        elif self._measurement.get_subscription_count() and self._command.get_publisher_count():
+            self._publish(self._value)
+
+    def _on_command_in_lockstep(self, message: Float64) -> None:
+        self._process.command(message.data)
+        if self._waiting:
+            self._waiting = False
+            time.sleep(QUIET_AFTER_GO)
+        self._samples += 1
+        self._value = self._process.measure(self._samples * self._period)
+        self._publish(self._value)
+
+    def _publish(self, value: float) -> None:
+        self._message.data = value
+        self._measurement.publish(self._message)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run plant_node."""
+    return run(PlantNode, "plant_node", args)

@@ -1,0 +1,103 @@
+"""The quality of service of each topic, and why two ends of a topic do not find each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+
+from relay_autotune.bag.metadata import Qos
+
+FLOAT64_TYPE = "std_msgs/msg/Float64"
+
+# A sensor may burst after a stall of some milliseconds; at 1 kHz a depth of 1 loses samples.
+MEASUREMENT = QoSProfile(
+    depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
+)
+COMMAND = QoSProfile(
+    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
+)
+# A result stays for who comes late.
+RESULT = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+def cycles(depth: int) -> QoSProfile:
+    """Return the profile of `relay_cycle`, latched with room for all cycles of an experiment."""
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+def for_bag(profile: QoSProfile) -> Qos:
+    """Return a profile in the words of a recording's metadata."""
+    best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    keep_all = profile.history == HistoryPolicy.KEEP_ALL
+    return Qos(
+        reliability="best_effort" if best_effort else "reliable",
+        durability="transient_local" if latched else "volatile",
+        history="keep_all" if keep_all else "keep_last",
+        depth=int(profile.depth),
+    )
+
+
+def why_no_publisher(node: Node, topic: str, requested: QoSProfile) -> str:
+    """Say why nothing arrives on a topic, as far as the graph tells.
+
+    :param node: the node that subscribes.
+    :param topic: resolved name of the topic.
+    :param requested: what the subscription asks for.
+    """
+    ends = node.get_publishers_info_by_topic(topic)
+    if not ends:
+        return f"{topic} has no publisher"
+    problems = _problems(ends, lambda offered: qos_check_compatible(offered, requested))
+    if problems:
+        return f"{topic} has {_count(len(ends), 'publisher')}, but {'; '.join(problems)}"
+    return f"{topic} has {_count(len(ends), 'publisher')}, but nothing arrives"
+
+
+def why_no_subscriber(node: Node, topic: str, offered: QoSProfile) -> str:
+    """Say why nobody takes what is published on a topic, as far as the graph tells.
+
+    :param node: the node that publishes.
+    :param topic: resolved name of the topic.
+    :param offered: what the publisher offers.
+    """
+    ends = node.get_subscriptions_info_by_topic(topic)
+    if not ends:
+        return f"{topic} has no subscriber"
+    problems = _problems(ends, lambda wanted: qos_check_compatible(offered, wanted))
+    if problems:
+        return f"{topic} has no subscriber that can be served: {'; '.join(problems)}"
+    return f"{topic} has {_count(len(ends), 'subscriber')}, but none is connected yet"
+
+
+def _problems(ends: Sequence[Any], check: Any) -> list[str]:
+    problems = []
+    for end in ends:
+        who = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+        if end.topic_type != FLOAT64_TYPE:
+            problems.append(f"{who} has type {end.topic_type}, expected {FLOAT64_TYPE}")
+            continue
+        compatibility, reason = check(end.qos_profile)
+        if compatibility == QoSCompatibility.ERROR:
+            problems.append(f"{who} has an incompatible QoS: {reason.rstrip('; ')}")
+    return problems
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
