@@ -27,3 +27,7 @@ class TuningError(RelayAutotuneError, ValueError):
 
 class BagError(RelayAutotuneError, ValueError):
     """A recording that cannot be read or written."""
+
+
+class SelectionError(BagError):
+    """A choice of topics or columns that a recording does not offer, or offers twice."""

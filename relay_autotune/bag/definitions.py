@@ -22,11 +22,8 @@ _BUILT_IN = {
     )
 }
 
-_PRIMITIVES = frozenset(
-    "bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64 "
-    "string wstring".split()
-)
-_FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(<=\d+)?(\[(<=)?\d*\])?\s+[A-Za-z]\w*\s*(?!\s*=)")
+_PRIMITIVE = re.compile(r"bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64)")
+_FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*")
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ def _dependencies(type_name: str, text: str) -> list[str]:
     found: list[str] = []
     for line in text.splitlines():
         match = _FIELD.match(line.split("#", 1)[0])
-        if match is None or match.group(1) in _PRIMITIVES:
+        if match is None or _PRIMITIVE.fullmatch(match.group(1)):
             continue
         name = match.group(1)
         if name == "Header":

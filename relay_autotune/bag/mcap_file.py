@@ -1,25 +1,47 @@
-"""Reading MCAP files, finished or torn: channels, and the messages of those that are wanted.
+"""Reading an MCAP file, finished or torn: its channels, and the messages that are wanted.
 
-Record layout: https://mcap.dev/spec. Every length is checked against what is there before it is
-believed. A file without its footer, as a killed recorder leaves it, is read from the front up
-to the tear.
+A file without its footer, as a killed recorder leaves it, is read from its front to the tear.
 """
 
 from __future__ import annotations
 
 import contextlib
-import mmap
 import struct
 import zlib
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 import numpy as np
 
-from relay_autotune.errors import BagError
+from relay_autotune.bag.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    FOOTER_SIZE,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    METADATA,
+    RECORD,
+    SCHEMA,
+    DamageError,
+    chunk_content,
+    map_file,
+    map_of_text,
+    message_head,
+    next_record,
+    records,
+    sized_bytes,
+    text,
+    unsigned,
+)
 from relay_autotune.record import IntArray
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -62,22 +84,25 @@ class Messages:
         return len(self.payload)
 
 
-@dataclass(frozen=True)
-class _Segment:
-    """A run of bytes that holds records: a chunk, or records outside of any chunk."""
-
-    start: int
-    end: int
-    is_chunk: bool
-    channels: frozenset[int] | None = None
-
-
 @dataclass
 class _Columns:
     order: list[int] = field(default_factory=list)
     log_time: list[int] = field(default_factory=list)
     publish_time: list[int] = field(default_factory=list)
     payload: list[bytes] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """A run of bytes with messages: a chunk, or records outside of any chunk.
+
+    :param channels: those of its messages; None: not known.
+    """
+
+    start: int
+    end: int
+    is_chunk: bool
+    channels: frozenset[int] | None = None
 
 
 class McapFile:
@@ -102,7 +127,7 @@ class McapFile:
             self.close()
             raise
 
-    def __enter__(self) -> McapFile:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -122,20 +147,19 @@ class McapFile:
 
         :param channels: their ids.
         """
-        wanted = set(channels)
-        columns = {channel: _Columns() for channel in wanted}
+        columns = {channel: _Columns() for channel in channels}
         order = 0
         for segment in self._segments:
-            if segment.channels is not None and wanted.isdisjoint(segment.channels):
+            if segment.channels is not None and segment.channels.isdisjoint(columns):
                 continue
             try:
-                content, _ = self._content(segment)
-                for opcode, begin, end in records(content):
+                content, whole = self._content(segment)
+                for opcode, begin, end in records(content, strict=whole):
                     if opcode != MESSAGE:
                         continue
                     channel, _, log_time, publish_time = message_head(content, begin, end)
-                    if channel in wanted:
-                        into = columns[channel]
+                    into = columns.get(channel)
+                    if into is not None:
                         into.order.append(order)
                         into.log_time.append(log_time)
                         into.publish_time.append(publish_time)
@@ -152,6 +176,11 @@ class McapFile:
             )
             for channel, c in columns.items()
         }
+
+    def _content(self, segment: _Segment) -> tuple[bytes, bool]:
+        if segment.is_chunk:
+            return chunk_content(self._data, segment.start, segment.end)
+        return self._data[segment.start : segment.end], True
 
     def _note_damage(self, segment: _Segment, damage: DamageError) -> None:
         note = (
@@ -172,6 +201,7 @@ class McapFile:
         start, _, crc = struct.unpack_from("<QQI", data, foot + RECORD.size)
         if not len(MAGIC) <= start < foot:
             return False
+        # The checksum covers the summary and the footer up to the checksum itself.
         if crc and crc != zlib.crc32(data[start : foot + RECORD.size + 16]):
             return False
         chunks: list[_Segment] = []
@@ -182,12 +212,12 @@ class McapFile:
                     chunks.append(_chunk_of_index(summary[begin:end], start))
                 else:
                     self._declare(opcode, summary[begin:end])
-            self._check_chunks(chunks)
-            self._read_metadata(chunks, start)
+            chunks.sort(key=lambda chunk: chunk.start)
+            self._check_chunks(chunks, start)
         except DamageError:
             chunks = []
         if not chunks or not self.channels:
-            # Without chunks (or their index) the messages must be looked for.
+            # Messages outside of chunks, or no index of them: they must be looked for.
             self.channels.clear()
             self._schemas.clear()
             self.metadata.clear()
@@ -195,44 +225,31 @@ class McapFile:
         self._segments = chunks
         return True
 
-    def _check_chunks(self, chunks: list[_Segment]) -> None:
-        chunks.sort(key=lambda chunk: chunk.start)
-        for chunk in chunks:
-            if RECORD.unpack_from(self._data, chunk.start) != (
-                CHUNK,
-                chunk.end - chunk.start - RECORD.size,
-            ):
-                raise DamageError("the index does not lead to a chunk")
-
-    def _read_metadata(self, chunks: list[_Segment], end: int) -> None:
-        """Read the metadata records that lie between the chunks."""
+    def _check_chunks(self, chunks: list[_Segment], data_end: int) -> None:
+        """See that the index knows of all data, and read the metadata between the chunks."""
         position = len(MAGIC)
-        for stop in (*(chunk.start for chunk in chunks), end):
-            for opcode, begin, after in records(self._data, position, stop):
-                if opcode == METADATA:
-                    self._declare(opcode, self._data[begin:after])
-                elif opcode == CHUNK or opcode == MESSAGE:
+        for chunk in (*chunks, _Segment(data_end, data_end, is_chunk=False)):
+            for opcode, begin, end in records(self._data, position, chunk.start):
+                if opcode in (CHUNK, MESSAGE):
                     raise DamageError("data that the index does not know")
-            position = next((c.end for c in chunks if c.start == stop), stop)
+                if opcode == METADATA:
+                    self._declare(opcode, self._data[begin:end])
+            if chunk.is_chunk:
+                length = chunk.end - chunk.start - RECORD.size
+                if RECORD.unpack_from(self._data, chunk.start) != (CHUNK, length):
+                    raise DamageError("the index does not lead to a chunk")
+            position = chunk.end
 
     def _scan(self) -> None:
         """Go through the file from its front, as far as it makes sense."""
         data = self._data
         loose: int | None = None
         position = len(MAGIC)
-        torn = True
-        while True:
-            record = next_record(data, position, len(data))
-            if record is None:
-                break
+        unfinished = True
+        while (record := next_record(data, position, len(data))) is not None:
             opcode, begin, end = record
             if opcode in (SCHEMA, CHANNEL, MESSAGE):
                 loose = position if loose is None else loose
-                if opcode != MESSAGE:
-                    try:
-                        self._declare(opcode, data[begin:end])
-                    except DamageError:
-                        break
             else:
                 if loose is not None:
                     self._segments.append(_Segment(loose, position, is_chunk=False))
@@ -243,27 +260,28 @@ class McapFile:
                     with contextlib.suppress(DamageError):
                         self._declare(opcode, data[begin:end])
                 elif opcode in (DATA_END, FOOTER):
-                    torn = data[-len(MAGIC) :] != MAGIC
+                    unfinished = data[-len(MAGIC) :] != MAGIC
                     break
             position = end
         if loose is not None:
             self._segments.append(_Segment(loose, position, is_chunk=False))
-        if torn and position < len(data) and data[position] == CHUNK:
-            self._segments.append(_Segment(position, len(data), is_chunk=True))
+        if unfinished and position < len(data) and data[position] == CHUNK:
+            torn = _Segment(position, len(data), is_chunk=True)
+            with contextlib.suppress(DamageError):
+                self._content(torn)
+                self._segments.append(torn)
         count, first, last = self._look_inside()
-        if not torn:
-            return
-        until = f" until {(last - first) / 1e9:.3f} s after the first" if count else ""
-        self.notes.append(
-            f"unfinished recording: {self.path.name} ends without its footer, {count} messages"
-            f"{until} are there"
-        )
+        if unfinished:
+            until = f" until {(last - first) / 1e9:.3f} s after the first" if count else ""
+            self.notes.append(
+                f"unfinished recording: {self.path.name} ends without its footer; "
+                f"it holds {count} messages{until}"
+            )
 
     def _look_inside(self) -> tuple[int, int, int]:
-        """Learn the channels inside of each segment; return count and span of all messages."""
+        """Learn the channels of each segment; return count and span [ns] of all messages."""
         count, first, last = 0, 0, 0
-        known: list[_Segment] = []
-        for segment in self._segments:
+        for i, segment in enumerate(self._segments):
             seen: set[int] = set()
             try:
                 content, whole = self._content(segment)
@@ -274,43 +292,12 @@ class McapFile:
                         first = min(first, log_time) if count else log_time
                         last = max(last, log_time)
                         count += 1
-                    elif segment.is_chunk:
+                    else:
                         self._declare(opcode, content[begin:end])
             except DamageError as damage:
                 self._note_damage(segment, damage)
-            known.append(_Segment(segment.start, segment.end, segment.is_chunk, frozenset(seen)))
-        self._segments = known
+            self._segments[i] = replace(segment, channels=frozenset(seen))
         return count, first, last
-
-    def _content(self, segment: _Segment) -> tuple[bytes, bool]:
-        """Return the records of a segment, and whether all of them are there."""
-        data = self._data
-        if not segment.is_chunk:
-            return data[segment.start : segment.end], True
-        begin = segment.start + RECORD.size
-        declared = RECORD.unpack_from(data, segment.start)[1] if begin <= segment.end else 0
-        if segment.end - begin < _CHUNK_HEAD.size + 12:
-            raise DamageError("the head of a chunk is cut")
-        _, _, size, crc = _CHUNK_HEAD.unpack_from(data, begin)
-        compression, begin = text(data, begin + _CHUNK_HEAD.size, segment.end)
-        if segment.end - begin < 8:
-            raise DamageError("the head of a chunk is cut")
-        (stored,) = struct.unpack_from("<Q", data, begin)
-        begin += 8
-        if size > LARGEST_CHUNK:
-            raise DamageError(
-                f"a chunk declares {size} bytes, more than the {LARGEST_CHUNK} allowed"
-            )
-        whole = segment.start + RECORD.size + declared == segment.end
-        if whole and stored != segment.end - begin:
-            raise DamageError("a chunk's lengths contradict each other")
-        content = _expand(data[begin : segment.end], compression, size, whole)
-        if whole:
-            if len(content) != size:
-                raise DamageError(f"a chunk holds {len(content)} bytes, declares {size}")
-            if crc and zlib.crc32(content) != crc:
-                raise DamageError("a chunk's checksum is wrong")
-        return content, whole
 
     def _declare(self, opcode: int, body: bytes) -> None:
         """Take in a schema, channel or metadata record."""
@@ -318,21 +305,23 @@ class McapFile:
             number = unsigned(body, 0, "<H")
             name, at = text(body, 2, len(body))
             encoding, at = text(body, at, len(body))
-            text, _ = sized_bytes(body, at, len(body))
-            if number:
-                self._schemas[number] = (name, encoding, text)
+            definition, _ = sized_bytes(body, at, len(body))
+            self._schemas[number] = (name, encoding, definition)
         elif opcode == CHANNEL:
             number, schema = unsigned(body, 0, "<H"), unsigned(body, 2, "<H")
             topic, at = text(body, 4, len(body))
             encoding, at = text(body, at, len(body))
             metadata, _ = map_of_text(body, at)
-            name, schema_encoding, text = self._schemas.get(schema, ("", "", b""))
             self.channels[number] = Channel(
-                number, topic, name, encoding, schema_encoding, text, metadata
+                number, topic, *self._type(schema, encoding), metadata=metadata
             )
         elif opcode == METADATA:
             name, at = text(body, 0, len(body))
             self.metadata.append((name, map_of_text(body, at)[0]))
+
+    def _type(self, schema: int, encoding: str) -> tuple[str, str, str, bytes]:
+        name, schema_encoding, definition = self._schemas.get(schema, ("", "", b""))
+        return name, encoding, schema_encoding, definition
 
 
 def _nanoseconds(values: list[int]) -> IntArray:

@@ -18,7 +18,7 @@ MAGIC = b"\x89MCAP0\r\n"
 # The largest chunk that is decompressed, whatever the file declares.
 LARGEST_CHUNK = 1 << 30
 
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
 CHUNK_INDEX, METADATA, DATA_END = 0x08, 0x0C, 0x0F
 
 RECORD = struct.Struct("<BQ")
@@ -38,7 +38,14 @@ class DamageError(Exception):
     """Bytes that are no MCAP records."""
 
 
+Buffer = bytes | mmap.mmap
+
+
 def map_file(path: Path) -> mmap.mmap:
+    """Map a file that begins as MCAP files do into memory.
+
+    :raises BagError: if it is missing, unreadable, empty or something else.
+    """
     try:
         with path.open("rb") as file:
             start = file.read(16)
@@ -63,9 +70,8 @@ def map_file(path: Path) -> mmap.mmap:
         raise BagError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def next_record(
-    data: bytes | mmap.mmap, position: int, stop: int
-) -> tuple[int, int, int] | None:
+def next_record(data: Buffer, position: int, stop: int) -> tuple[int, int, int] | None:
+    """Return opcode, begin and end of the record at ``position``; None if it is cut."""
     if stop - position < RECORD.size:
         return None
     opcode, length = RECORD.unpack_from(data, position)
@@ -76,11 +82,12 @@ def next_record(
 
 
 def records(
-    data: bytes | mmap.mmap, position: int = 0, stop: int | None = None, *, strict: bool = True
+    data: Buffer, position: int = 0, stop: int | None = None, *, strict: bool = True
 ) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, begin and end of each record.
 
     :param strict: raise if the last one is cut; else leave it out.
+    :raises DamageError: if a record is longer than what is left.
     """
     stop = len(data) if stop is None else stop
     while position < stop:
@@ -94,6 +101,7 @@ def records(
 
 
 def message_head(data: bytes, begin: int, end: int) -> tuple[int, int, int, int]:
+    """Return channel, sequence, log time [ns] and publish time [ns] of a message."""
     if end - begin < MESSAGE_HEAD.size:
         raise DamageError("a message shorter than its head")
     channel, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, begin)
@@ -101,12 +109,14 @@ def message_head(data: bytes, begin: int, end: int) -> tuple[int, int, int, int]
 
 
 def unsigned(data: bytes, at: int, form: str) -> int:
+    """Return the number at a place of a record."""
     if at + struct.calcsize(form) > len(data):
         raise DamageError("a record is cut")
     return int(struct.unpack_from(form, data, at)[0])
 
 
-def sized_bytes(data: bytes | mmap.mmap, at: int, stop: int) -> tuple[bytes, int]:
+def sized_bytes(data: Buffer, at: int, stop: int) -> tuple[bytes, int]:
+    """Return the bytes after their length, and the place after them."""
     if stop - at < 4:
         raise DamageError("a record is cut")
     (length,) = struct.unpack_from("<I", data, at)
@@ -115,7 +125,8 @@ def sized_bytes(data: bytes | mmap.mmap, at: int, stop: int) -> tuple[bytes, int
     return data[at + 4 : at + 4 + length], at + 4 + length
 
 
-def text(data: bytes | mmap.mmap, at: int, stop: int) -> tuple[str, int]:
+def text(data: Buffer, at: int, stop: int) -> tuple[str, int]:
+    """Return the text after its length, and the place after it."""
     raw, at = sized_bytes(data, at, stop)
     try:
         return raw.decode("utf-8"), at
@@ -124,6 +135,7 @@ def text(data: bytes | mmap.mmap, at: int, stop: int) -> tuple[str, int]:
 
 
 def map_of_text(data: bytes, at: int) -> tuple[dict[str, str], int]:
+    """Return the texts by their names, and the place after them."""
     body, after = sized_bytes(data, at, len(data))
     found: dict[str, str] = {}
     at = 0
@@ -133,37 +145,74 @@ def map_of_text(data: bytes, at: int) -> tuple[dict[str, str], int]:
     return found, after
 
 
-def _expand(data: bytes, compression: str, size: int, whole: bool) -> bytes:
+def chunk_content(data: Buffer, start: int, end: int) -> tuple[bytes, bool]:
+    """Return the records inside of a chunk, and whether all of them are there.
+
+    :param start: where the chunk's record begins.
+    :param end: where it ends, or the file if that ends before.
+    :raises DamageError: if nothing of it can be used.
+    """
+    begin = start + RECORD.size
+    if end - begin < _CHUNK_HEAD.size + 12:
+        raise DamageError("the head of a chunk is cut")
+    whole = begin + RECORD.unpack_from(data, start)[1] == end
+    _, _, size, crc = _CHUNK_HEAD.unpack_from(data, begin)
+    compression, begin = text(data, begin + _CHUNK_HEAD.size, end)
+    if end - begin < 8:
+        raise DamageError("the head of a chunk is cut")
+    (stored,) = struct.unpack_from("<Q", data, begin)
+    begin += 8
+    if size > LARGEST_CHUNK:
+        raise DamageError(f"a chunk declares {size} bytes, more than the {LARGEST_CHUNK} allowed")
+    if whole and stored != end - begin:
+        raise DamageError("the lengths of a chunk contradict each other")
+    content = _expand(data[begin:end], compression, size)
+    if whole and len(content) != size:
+        raise DamageError(f"a chunk declares {size} bytes, but does not hold that many")
+    if whole and crc and zlib.crc32(content) != crc:
+        raise DamageError("the checksum of a chunk is wrong")
+    return content, whole
+
+
+def _expand(data: bytes, compression: str, size: int) -> bytes:
     """Decompress a chunk; of one that is cut, as much as there is.
 
-    :param size: declared size, never exceeded.
+    :param size: declared size; at most one byte more than that is taken.
     """
     if compression == "":
         return data
     if compression == "zstd":
-        return _expand_zstd(data, size, whole)
+        return _expand_zstd(data, size)
     if compression == "lz4":
         return _expand_lz4(data, size)
     raise DamageError(f"a chunk is compressed with {compression!r}; known are zstd and lz4")
 
 
-def _expand_zstd(data: bytes, size: int, whole: bool) -> bytes:
-    import zstandard
-
+def _expand_zstd(data: bytes, size: int) -> bytes:
     try:
-        expander = zstandard.ZstdDecompressor()
-        if not whole:
-            return expander.decompressobj().decompress(data)[:size]
-        with expander.stream_reader(data, read_across_frames=True) as stream:
+        import zstandard
+    except ImportError:
+        raise _missing("zstandard") from None
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
             return bytes(stream.read(size + 1))
     except (zstandard.ZstdError, MemoryError) as error:
         raise DamageError(f"a chunk cannot be decompressed ({error})") from None
 
 
 def _expand_lz4(data: bytes, size: int) -> bytes:
-    import lz4.frame
-
+    try:
+        import lz4.frame
+    except ImportError:
+        raise _missing("lz4") from None
     try:
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
     except (RuntimeError, EOFError, MemoryError) as error:
         raise DamageError(f"a chunk cannot be decompressed ({error})") from None
+
+
+def _missing(package: str) -> BagError:
+    return BagError(
+        f"the recording is compressed; to read it install the Python package {package}, "
+        f"with: pip install {package}"
+    )

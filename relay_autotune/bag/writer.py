@@ -6,10 +6,10 @@ import contextlib
 import os
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import relay_autotune
 from relay_autotune.bag.definitions import Definition, find_definition
@@ -53,7 +53,7 @@ class Topic:
 
     name: str
     type: str = FLOAT64
-    qos: Qos = Qos()
+    qos: Qos = field(default_factory=Qos)
     definition: Definition | None = None
 
 
@@ -176,7 +176,7 @@ class BagWriter:
         }
         return writer, channels
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -1,0 +1,149 @@
+"""Decoding messages: std_msgs/Float64 here, our own by the definition that their bag holds."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from relay_autotune.bag.mcap_file import Channel
+from relay_autotune.errors import BagError
+from relay_autotune.record import FloatArray
+
+FLOAT64 = "std_msgs/msg/Float64"
+EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
+CYCLE = "relay_autotune_msgs/msg/RelayCycle"
+
+_STAMP = {"sec": 0, "nanosec": 0}
+_HEADER: dict[str, Any] = {"stamp": _STAMP, "frame_id": ""}
+_SETTINGS: dict[str, Any] = {
+    "setpoint": 0.0,
+    "baseline": 0.0,
+    "amplitude": 0.0,
+    "bias": 0.0,
+    "hysteresis": 0.0,
+    "extra_delay": 0.0,
+    "sample_period": 0.0,
+    "reverse_acting": False,
+}
+
+# What a field means that an older definition did not have. Whoever adds a field to one of these
+# messages adds its default here, and old bags keep replaying.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    EXPERIMENT: {
+        "header": _HEADER,
+        "experiment_id": "",
+        "outcome": 0,
+        "reason": "",
+        "settings": _SETTINGS,
+        "noise_std": float("nan"),
+        "time": (),
+        "receive_time": (),
+        "command_time": (),
+        "measurement": (),
+        "command": (),
+        "cycle_start": (),
+        "lost_samples": 0,
+    },
+    CYCLE: {
+        "header": _HEADER,
+        "experiment_id": "",
+        "index": 0,
+        "lead_in": 0,
+        "settings": _SETTINGS,
+        "time": (),
+        "measurement": (),
+        "command": (),
+        "period": float("nan"),
+        "period_high": float("nan"),
+        "period_low": float("nan"),
+        "peak_max": float("nan"),
+        "peak_min": float("nan"),
+        "time_to_peak_max": float("nan"),
+        "time_to_peak_min": float("nan"),
+        "converged": False,
+        "disturbed": False,
+    },
+}
+
+
+def decode_float64(payload: Sequence[bytes]) -> FloatArray:
+    """Return the values of serialized std_msgs/Float64 messages.
+
+    :param payload: the messages, n of them, 12 bytes each.
+    :raises BagError: if one of them has another length or another encapsulation than CDR.
+    """
+    if not payload:
+        return np.empty(0)
+    if set(map(len, payload)) != {12}:
+        odd = next(len(p) for p in payload if len(p) != 12)
+        raise BagError(f"a std_msgs/msg/Float64 message has {odd} bytes; expected 12")
+    raw = np.frombuffer(b"".join(payload), dtype=np.uint8).reshape(-1, 12)
+    little = raw[:, 1] == 1
+    if bool(np.any(raw[:, 0] != 0)) or bool(np.any(raw[:, 1] > 1)):
+        raise BagError("a std_msgs/msg/Float64 message is not in plain CDR")
+    body = np.ascontiguousarray(raw[:, 4:])
+    values = body.view("<f8")[:, 0].astype(np.float64)
+    if not bool(np.all(little)):
+        values = np.where(little, values, body.view(">f8")[:, 0])
+    return values
+
+
+def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
+    """Decode messages by the definition in their bag; fields it lacks get their defaults.
+
+    :param channel: the channel of the messages.
+    :param payload: the serialized messages.
+    :return: objects with the fields as attributes, more than today's if the bag has more.
+    :raises BagError: if the definition or a message makes no sense.
+    """
+    if channel.encoding != "cdr" or channel.schema_encoding != "ros2msg":
+        raise BagError(
+            f"{channel.topic} is encoded as {channel.encoding!r} with a definition in "
+            f"{channel.schema_encoding!r}; expected 'cdr' with 'ros2msg'"
+        )
+    try:
+        from rosbags.serde import SerdeError
+        from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+    except ImportError:
+        raise BagError(
+            "reading recorded experiments needs the Python package rosbags; "
+            "install it with: pip install rosbags"
+        ) from None
+    try:
+        text = channel.definition.decode("utf-8").replace("\r\n", "\n")
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(text, channel.type))
+    except (UnicodeDecodeError, TypesysError, KeyError, ValueError, RecursionError) as error:
+        raise BagError(
+            f"the definition of {channel.type} in the recording makes no sense: "
+            f"{_first_line(error)}"
+        ) from None
+    messages = []
+    for data in payload:
+        try:
+            decoded = store.deserialize_cdr(data, channel.type)
+        except (SerdeError, KeyError, ValueError, IndexError, struct.error, MemoryError) as error:
+            raise BagError(
+                f"a message of {channel.topic} does not fit its definition: {_first_line(error)}"
+            ) from None
+        messages.append(_with_defaults(decoded, DEFAULTS.get(channel.type, {})))
+    return messages
+
+
+def _with_defaults(message: Any, defaults: Mapping[str, Any]) -> SimpleNamespace:
+    fields = dict(vars(message)) if message is not None else {}
+    for name, default in defaults.items():
+        if isinstance(default, Mapping):
+            fields[name] = _with_defaults(fields.get(name), default)
+        else:
+            fields.setdefault(name, default)
+    return SimpleNamespace(**fields)
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
