@@ -1,4 +1,4 @@
-"""Ultimate gain and frequency: where a proportional controller loses stability."""
+"""Stability by the exact phase: ultimate point, and poles of a closed loop."""
 
 from __future__ import annotations
 
@@ -63,6 +63,28 @@ def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
     return None
 
 
+def unstable_poles(loop: TransferFunction) -> int:
+    """Return how many poles of ``1/(1 + loop)`` lie in the right half plane.
+
+    The count at zero gain is carried through every crossing of the negative real axis that the
+    loop passes as its gain grows to its own value, so no frequency grid can miss one.
+
+    :param loop: controller times process, with the sign that makes its feedback negative.
+    """
+    count = _unstable_at_small_gain(loop)
+    return count + sum(c.roots_to_the_right for c in _crossings(loop, 1.0) if c.gain < 1.0)
+
+
+def phase_crossings(loop: TransferFunction) -> list[UltimatePoint]:
+    """Return the points at which the loop crosses the negative real axis.
+
+    :param loop: controller times process.
+    :return: every crossing up to the first one, and every later one of magnitude 1 or more; the
+        gain is the factor that would bring it to -1.
+    """
+    return [UltimatePoint(c.gain, c.frequency) for c in _crossings(loop, 1.0)]
+
+
 def _unstable_at_small_gain(model: TransferFunction) -> int:
     """Closed-loop poles in the right half plane as the gain leaves zero."""
     unstable = sum(1 for t in model.time_constants if t.real < 0.0)
@@ -79,7 +101,8 @@ def _unstable_at_small_gain(model: TransferFunction) -> int:
     return unstable
 
 
-def _crossings(model: TransferFunction) -> list[_Crossing]:
+def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[_Crossing]:
+    """Crossings up to the first, and later ones of at least ``magnitude`` (the first one's)."""
     found = []
     if model.integrators == 0 and model.gain * model.process_sign < 0.0:
         slope = (
@@ -94,10 +117,10 @@ def _crossings(model: TransferFunction) -> list[_Crossing]:
     if not first or model.dead_time == 0.0:
         return found
     # Later turns of the dead time matter only where the magnitude is larger again.
-    largest = min(c.gain for c in first)
+    least = 1.0 / min(c.gain for c in first) if magnitude is None else magnitude
     beyond = _logarithmic(model)
     beyond = beyond[beyond > first[-1].frequency]
-    higher = beyond[np.abs(model(1j * beyond)) * largest > 0.999]
+    higher = beyond[np.abs(model(1j * beyond)) > 0.999 * least]
     if higher.size:
         upper = float(higher[-1]) * 1.1
         found += _scan(model, _grid(model, (first[-1].frequency * (1 + 1e-9), upper)))

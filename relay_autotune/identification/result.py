@@ -44,6 +44,7 @@ class Identification:
 
     :param method: name in the registry.
     :param model: the transfer function.
+    :param build: the transfer function for any values of the parameters.
     :param parameters: names of the structure's parameters.
     :param values: their values, shape (p,).
     :param covariance: of the values, shape (p, p); NaN: not estimated.
@@ -60,6 +61,7 @@ class Identification:
 
     method: str
     model: TransferFunction
+    build: Callable[[FloatArray], TransferFunction]
     parameters: tuple[str, ...]
     values: FloatArray
     covariance: FloatArray
@@ -140,6 +142,7 @@ def with_uncertainty(
     return Identification(
         method,
         model,
+        build,
         parameters,
         values,
         cov,

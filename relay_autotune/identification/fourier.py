@@ -1,0 +1,138 @@
+"""Points of the frequency response by Fourier integrals over whole cycles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.record import PiecewiseConstant, Record
+
+FloatArray = NDArray[np.float64]
+
+_SMALL_ANGLE = 0.05
+
+
+@dataclass(frozen=True)
+class FrequencyPoint:
+    """The process at one frequency.
+
+    :param frequency: w [rad/s].
+    :param value: G(j w) [y/u].
+    """
+
+    frequency: float
+    value: complex
+
+
+def fourier_integral_held(u: PiecewiseConstant, start: float, end: float, w: float) -> complex:
+    """Return the integral of ``u(t) exp(-j w t)`` from ``start`` to ``end``, exactly.
+
+    :param u: the held signal.
+    :param start: s.
+    :param end: s.
+    :param w: rad/s; 0: the plain integral.
+    """
+    inside = u.times[(u.times > start) & (u.times < end)]
+    edges = np.concatenate(([start], inside, [end]))
+    levels = u(edges[:-1])
+    if w == 0.0:
+        return complex(np.sum(levels * np.diff(edges)))
+    turns = np.exp(-1j * w * edges)
+    return complex(np.sum(levels * np.diff(turns)) / (-1j * w))
+
+
+def fourier_integral_sampled(
+    time: FloatArray, y: FloatArray, start: float, end: float, w: float
+) -> complex:
+    """Return the integral of ``y(t) exp(-j w t)`` for samples joined by straight lines.
+
+    Exact for the polygon at any frequency, so that coarse or irregular samples cost no more than
+    their own interpolation error.
+
+    :param time: increasing [s], shape (n,).
+    :param y: shape (n,).
+    :param start: not before the first sample [s].
+    :param end: not after the last sample [s].
+    :param w: rad/s; 0: the plain integral.
+    """
+    inside = (time > start) & (time < end)
+    t = np.concatenate(([start], time[inside], [end]))
+    v = np.concatenate((np.interp([start], time, y), y[inside], np.interp([end], time, y)))
+    h = np.diff(t)
+    angle = w * h
+    # The integrals of exp(-j angle x) and x exp(-j angle x) over 0 < x < 1.
+    small = np.abs(angle) < _SMALL_ANGLE
+    a = np.where(small, 1.0, angle)
+    turn = np.exp(-1j * a)
+    level = (1.0 - turn) / (1j * a)
+    ramp = (turn * (1.0 + 1j * a) - 1.0) / (a * a)
+    terms = [(-1j * angle) ** k / math.factorial(k) for k in range(10)]
+    level = np.where(small, sum(c / (k + 1) for k, c in enumerate(terms)), level)
+    ramp = np.where(small, sum(c / (k + 2) for k, c in enumerate(terms)), ramp)
+    parts = h * np.exp(-1j * w * t[:-1]) * (v[:-1] * level + np.diff(v) * ramp)
+    return complex(np.sum(parts))
+
+
+def cycle_window(record: Record, first: int = 0) -> tuple[float, float, int]:
+    """Return start, end and number of the whole cycles of a record.
+
+    The ends are the instants at which the command switched, not the samples beside them.
+
+    :param record: with at least one whole cycle after ``first``.
+    :param first: cycles left out at the beginning.
+    :raises IdentificationError: if no whole cycle is left.
+    """
+    bounds = record.cycle_start[first:]
+    if len(bounds) < 2:
+        raise IdentificationError(
+            f"the record holds {max(len(record.cycle_start) - 1, 0)} whole cycles, of which "
+            f"{first} are left out; at least one is needed: let the relay switch longer"
+        )
+    u = record.input()
+
+    def switch_at(sample: int) -> float:
+        at = int(np.argmin(np.abs(u.times - record.time[sample])))
+        return min(float(u.times[at]), float(record.time[-1]))
+
+    return switch_at(bounds[0]), switch_at(bounds[-1]), len(bounds) - 1
+
+
+def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> FrequencyPoint:
+    """Return one point of the frequency response from a limit cycle (Wang et al. 1997, eq 23).
+
+    ``G(j k w0) = int y exp(-j k w0 t) dt / int u exp(-j k w0 t) dt`` over whole cycles; exact in
+    the limit cycle, whatever the process.
+
+    :param record: with whole cycles.
+    :param harmonic: k; odd, or the command of an unbiased relay holds nothing there.
+    :param first: cycles left out at the beginning, while the limit cycle settles.
+    :raises IdentificationError: if no whole cycle is left or the command lacks the harmonic.
+    """
+    start, end, cycles = cycle_window(record, first)
+    w = harmonic * 2.0 * math.pi * cycles / (end - start)
+    u = record.input()
+    excitation = fourier_integral_held(u, start, end, w)
+    levels = np.append(u.values, u.initial)
+    if abs(excitation) < 1e-3 * (end - start) * float(np.ptp(levels)) / (2.0 * math.pi * harmonic):
+        raise IdentificationError(
+            f"the command holds nothing at harmonic {harmonic} of its cycle; use an odd one"
+        )
+    answer = fourier_integral_sampled(record.time, record.measurement, start, end, w)
+    return FrequencyPoint(w, answer / excitation)
+
+
+def cycle_means(record: Record, first: int = 0) -> tuple[float, float]:
+    """Return the means of measurement [y] and command [u] over whole cycles.
+
+    :param record: with whole cycles.
+    :param first: cycles left out at the beginning.
+    :raises IdentificationError: if no whole cycle is left.
+    """
+    start, end, _ = cycle_window(record, first)
+    y = fourier_integral_sampled(record.time, record.measurement, start, end, 0.0).real
+    u = fourier_integral_held(record.input(), start, end, 0.0).real
+    return y / (end - start), u / (end - start)

@@ -1,0 +1,68 @@
+"""Controller design: rules by name, and what their gains do on the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from relay_autotune.errors import TuningError
+from relay_autotune.identification.result import Identification
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.analysis import analyse_loop, is_stable
+from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
+from relay_autotune.tuning.gains import Controller, Gains, Performance
+from relay_autotune.tuning.rules import imc, itae, thyagarajan, tyreus_luyben
+
+Rule = Callable[[TransferFunction], tuple[Controller, str]]
+
+RULES: dict[str, Rule] = {
+    "thyagarajan": thyagarajan,
+    "tyreus_luyben": tyreus_luyben,
+    "itae": itae,
+    "imc": imc,
+}
+DEFAULT_RULE = "thyagarajan"
+
+__all__ = [
+    "DEFAULT_RULE",
+    "RULES",
+    "Controller",
+    "Gains",
+    "Performance",
+    "analyse_loop",
+    "ensemble",
+    "is_stable",
+    "tune",
+]
+
+
+def rule_named(name: str) -> Rule:
+    """Return a rule by its name.
+
+    :raises TuningError: if there is none of that name; the message lists those there are.
+    """
+    if name not in RULES:
+        raise TuningError(f"unknown rule {name!r}; known: {', '.join(RULES)}")
+    return RULES[name]
+
+
+def tune(
+    identification: Identification, rule: str = DEFAULT_RULE, *, rng: np.random.Generator
+) -> Gains:
+    """Return the gains of a rule, judged on the model and on the models around it.
+
+    :param identification: the model and its uncertainty.
+    :param rule: one of ``RULES``.
+    :param rng: draws the models within the uncertainty.
+    :raises TuningError: if the rule does not apply, or its loop is unstable on the model or on
+        more than 5 % of the models within the uncertainty.
+    """
+    controller, reason = rule_named(rule)(identification.model)
+    performance = analyse_loop(controller, identification.model)
+    models = ensemble(identification, rng=rng)
+    if not models:
+        reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
+        return Gains(rule, controller, performance, performance.ms, reason)
+    ms_95 = max(ensemble_ms(controller, models), performance.ms)
+    return Gains(rule, controller, performance, ms_95, reason)
