@@ -85,12 +85,13 @@ class TransferFunction:
     def __call__(self, s: ArrayLike) -> ComplexArray:
         """Return G at each complex frequency ``s`` [rad/s], any shape."""
         s = np.asarray(s, dtype=np.complex128)
-        value = self.gain * np.exp(-self.dead_time * s) * s ** float(-self.integrators)
+        delay = np.exp(-self.dead_time * s)
+        value: ComplexArray = np.asarray(self.gain * delay * s ** float(-self.integrators))
         for z in self.zeros:
-            value = value * (1.0 + z * s)
+            value = np.asarray(value * (1.0 + z * s))
         for t in self.time_constants:
-            value = value / (1.0 + t * s)
-        return np.asarray(value)
+            value = np.asarray(value / (1.0 + t * s))
+        return value
 
     def phase(self, frequency: ArrayLike) -> NDArray[np.float64]:
         """Return the phase of ``process_sign * G(j w)`` without jumps [rad].

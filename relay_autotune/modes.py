@@ -62,7 +62,7 @@ def _group(eigenvalues: list[complex], horizon: float) -> list[list[complex]]:
 
 
 def _terms(group: list[complex], centre: complex, horizon: float) -> int:
-    """Number of terms after which the cluster's sum is exact to rounding."""
+    """Return the number of terms after which the cluster's sum is exact to rounding."""
     size = len(group)
     radius = max(abs(e - centre) for e in group)
     if radius == 0.0:
@@ -149,7 +149,8 @@ class Modes:
         for i in range(len(factors), 0, -1):
             quotient, remainder = np.polydiv(numerator, np.array(factors[i - 1]))
             row[i] = remainder[-1]
-            numerator = np.atleast_1d(quotient) if numerator.size > 1 else np.zeros(1)
+            shorter = quotient if numerator.size > 1 else np.zeros(1)
+            numerator = np.atleast_1d(shorter).astype(np.complex128)
         row[0] = numerator[-1]
         return row
 

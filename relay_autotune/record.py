@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import itertools
 import math
 from dataclasses import dataclass, field
 
@@ -224,7 +225,7 @@ class Record:
             )
         starts = tuple(int(i) for i in self.cycle_start)
         if any(not 0 <= i < n for i in starts) or any(
-            b <= a for a, b in zip(starts, starts[1:], strict=False)
+            b <= a for a, b in itertools.pairwise(starts)
         ):
             raise RecordError(
                 f"cycle_start must hold increasing sample numbers below {n}, found {starts}"

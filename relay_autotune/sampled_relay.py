@@ -31,7 +31,7 @@ def simulate_sampled_relay(
     :param model: the process, at rest before the first sample.
     :param settings: levels, set-point, hysteresis.
     :param period: time between samples [s], > 0.
-    :param noise: what is added to each sample [y], shape (n,); its length is the number of samples.
+    :param noise: what is added to each sample [y], shape (n,); it sets the number of samples.
     :param relay_sees_noise: False: the relay acts on the noise-free output, the record still
         holds the noisy one.
     :param operating_point: measurement at rest [y]; default: the set-point.
@@ -51,7 +51,7 @@ def simulate_sampled_relay(
     direct = not settings.reverse_acting
     is_high = direct
     command = settings.baseline
-    times = np.arange(noise.size) * period
+    times = np.arange(noise.size, dtype=np.float64) * period
     measurement, commands, starts = np.empty(noise.size), np.empty(noise.size), []
     for k, time in enumerate(times):
         y = rest + plant.advance(float(time), command)

@@ -81,9 +81,7 @@ class RelayRun:
     time: FloatArray
     measurement: FloatArray
 
-    def record(
-        self, *, noise_std: float = 0.0, rng: np.random.Generator | None = None
-    ) -> Record:
+    def record(self, *, noise_std: float = 0.0, rng: np.random.Generator | None = None) -> Record:
         """Return the samples as a record, with noise that the relay did not see.
 
         :param noise_std: standard deviation of white Gaussian noise [y].
@@ -128,7 +126,7 @@ class _Segment:
         return float(self.modes.output(self.slopes, np.array([time]))[0])
 
     def grid(self, length: float) -> FloatArray:
-        """Times dense enough that each cell holds at most one extremum."""
+        """Return times dense enough that each cell holds at most one extremum."""
         fastest, oscillation = self._corners
         parts = [np.linspace(0.0, length, 33)]
         if 1e-3 * fastest < length:
@@ -139,7 +137,7 @@ class _Segment:
         return np.unique(np.concatenate(parts))
 
     def turning_points(self, grid: FloatArray) -> FloatArray:
-        """Times of the extrema between the grid's ends."""
+        """Return the times of the extrema between the grid's ends."""
         slope = self.modes.output(self.slopes, grid)
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
         found = [brentq(self.slope, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-15) for i in cells]

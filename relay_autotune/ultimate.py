@@ -93,7 +93,7 @@ def _unstable_at_small_gain(model: TransferFunction) -> int:
         return unstable
     # The m roots of s^m = -K|g| lie at angles (pi + 2 pi k)/m; one that starts straight up
     # goes left only if the phase near zero frequency is above its limit.
-    w = 1e-6 / max((abs(c) for c in (*model.time_constants, *model.zeros, model.dead_time)))
+    w = 1e-6 / max(abs(c) for c in (*model.time_constants, *model.zeros, model.dead_time))
     lead = float(model.phase(w)) + m * math.pi / 2.0 > 0.0
     for k in range(m):
         cosine = math.cos((math.pi + 2.0 * math.pi * k) / m)

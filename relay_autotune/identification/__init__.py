@@ -1,0 +1,42 @@
+"""Identification: methods by name, from a record to a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.result import FitReport, Identification
+from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
+from relay_autotune.identification.waveform import identify_waveform
+from relay_autotune.record import Record
+
+Method = Callable[[Record], Identification]
+
+METHODS: dict[str, Method] = {
+    "waveform": identify_waveform,
+    "wang_biased": identify_biased,
+    "wang_unbiased": identify_unbiased,
+}
+DEFAULT_METHOD = "waveform"
+
+__all__ = ["DEFAULT_METHOD", "METHODS", "FitReport", "Identification", "identify", "method_named"]
+
+
+def method_named(name: str) -> Method:
+    """Return a method by its name.
+
+    :raises IdentificationError: if there is none of that name; the message lists those there are.
+    """
+    if name not in METHODS:
+        raise IdentificationError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def identify(record: Record, method: str = DEFAULT_METHOD) -> Identification:
+    """Identify a model from a record.
+
+    :param record: the experiment.
+    :param method: one of ``METHODS``.
+    :raises IdentificationError: if the method is unknown or the record does not tell a model.
+    """
+    return method_named(method)(record)

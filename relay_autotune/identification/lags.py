@@ -13,6 +13,10 @@ from relay_autotune.record import PiecewiseConstant
 FloatArray = NDArray[np.float64]
 
 
+# Dead times tried at the start, as shares of the longest one.
+_SHARES = (0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95)
+
+
 class Fopdt:
     """``K exp(-D s)/(tau s + 1)``: K is linear, tau and D are not."""
 
@@ -85,7 +89,22 @@ class Fopdt:
         :param longest: longest stretch in which the dead time must lie [s].
         """
         taus = np.geomspace(0.5 * shortest, 30.0 * longest, 14)
-        fractions = (0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95)
+        fractions = (
+            0.0,
+            0.01,
+            0.03,
+            0.06,
+            0.1,
+            0.15,
+            0.2,
+            0.27,
+            0.35,
+            0.45,
+            0.55,
+            0.67,
+            0.8,
+            0.95,
+        )
         return [np.array((tau, f * longest)) for tau in taus for f in fractions]
 
     @staticmethod

@@ -9,13 +9,15 @@ eq 10 has T_u2 where T_u1 is printed, and the first logarithm of eq 22 has ``mu 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
+from scipy.special import stdtrit
 
-from relay_autotune.cycles import LimitCycle, limit_cycle
+from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, infer_settings, limit_cycle
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.fourier import cycle_means, frequency_point
 from relay_autotune.identification.result import Identification, with_uncertainty
@@ -23,6 +25,9 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
+
+_LEAST_BIAS = 0.02
+_LEAST_CYCLES = 3
 
 PARAMETERS = ("gain", "time_constant", "dead_time")
 
@@ -63,9 +68,11 @@ def fopdt_limit_cycle(
             f"hysteresis {epsilon:g}"
         )
     rise, decay = math.exp(dead_time / t), math.exp(-dead_time / t)
+    upward = (2 * mu * k * rise + mu0 * k - mu * k + epsilon) / (mu * k + mu0 * k - epsilon)
+    downward = (2 * mu * k * rise - mu * k - mu0 * k + epsilon) / (mu * k - mu0 * k - epsilon)
     return FopdtCycle(
-        high=t * math.log((2 * mu * k * rise + mu0 * k - mu * k + epsilon) / (mu * k + mu0 * k - epsilon)),
-        low=t * math.log((2 * mu * k * rise - mu * k - mu0 * k + epsilon) / (mu * k - mu0 * k - epsilon)),
+        high=t * math.log(upward),
+        low=t * math.log(downward),
         up=(mu0 + mu) * k * (1.0 - decay) + epsilon * decay,
         down=(mu0 - mu) * k * (1.0 - decay) - epsilon * decay,
     )
@@ -167,89 +174,115 @@ def steady_state(record: Record, settings: RelaySettings) -> tuple[float, bool]:
     return settings.setpoint, False
 
 
-@dataclass(frozen=True)
-class _Features:
-    """The limit cycle in coordinates in which the gain is positive."""
-
-    cycle: FopdtCycle
-    mean_y: float
-    mean_u: float
-    shift: float
-    sign: int
-
-
-def _features(
-    cycle: LimitCycle, settings: RelaySettings, rest: float, means: tuple[float, float]
-) -> _Features:
-    sign = -1 if settings.reverse_acting else 1
-    up, down = (cycle.period_high, cycle.period_low)[::sign]
-    about = settings.setpoint
-    return _Features(
-        FopdtCycle(up, down, cycle.peak_max - about, cycle.peak_min - about),
-        means[0] - rest,
-        sign * (means[1] - settings.baseline),
-        about - rest,
-        sign,
-    )
-
-
 def identify_biased(record: Record) -> Identification:
     """Identify a FOPDT model from a biased relay test (eqs 6 to 11).
 
     Deviations are taken from the measured steady state; where the set-point lies elsewhere, the
     bias about it is ``mu0 - (setpoint - rest)/K``.
 
-    :param record: a completed relay test with a bias.
+    :param record: a relay test with a bias.
     :raises IdentificationError: if the relay was unbiased, or the numbers are no limit cycle of a
         FOPDT process.
     """
-
-    def solve(features: _Features, settings: RelaySettings) -> FloatArray:
-        if abs(features.mean_u) < 0.02 * settings.amplitude:
-            raise IdentificationError(
-                f"the mean command is only {features.mean_u:g} away from the baseline, so that "
-                "its ratio to the measurement (eq 6) tells no gain: use a biased relay, or the "
-                "method wang_unbiased; an integrating process always has a mean of zero"
-            )
-        gain = features.mean_y / features.mean_u
-        if not gain > 0.0:
-            raise IdentificationError(
-                f"the means over whole cycles give a gain of {gain:g} against the direction of "
-                "the relay: the steady state before the test was not one, or the load changed"
-            )
-        bias = features.sign * settings.bias - features.shift / gain
-        k, t, dead = fopdt_from_biased(
-            features.cycle, gain, settings.amplitude, bias, settings.hysteresis
-        )
-        return np.array((features.sign * k, t, dead))
-
-    def measure(part: Record, cycle: LimitCycle, rest: float) -> FloatArray:
-        assert part.settings is not None
-        return solve(_features(cycle, part.settings, rest, cycle_means(part)), part.settings)
-
-    return _identify("wang_biased", record, measure)
+    return _identify("wang_biased", record, _measure_biased)
 
 
 def identify_unbiased(record: Record) -> Identification:
     """Identify a FOPDT model from an unbiased relay test (eqs 22 to 25).
 
-    :param record: a completed relay test without bias.
+    :param record: a relay test without bias.
     :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
     """
+    return _identify("wang_unbiased", record, _measure_unbiased)
 
-    def measure(part: Record, cycle: LimitCycle, rest: float) -> FloatArray:
-        settings = part.settings
-        assert settings is not None
-        if abs(settings.bias) > 0.01 * settings.amplitude:
-            raise IdentificationError(
-                f"the relay had a bias of {settings.bias:g}, but eqs 19 to 25 hold for a "
-                "symmetric one: use the method wang_biased"
-            )
-        point = frequency_point(part)
-        amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
-        k, t, dead = fopdt_from_unbiased(
-            cycle.period, amplitude, abs(point.value), settings.amplitude, settings.hysteresis
+
+def _measure_biased(record: Record, settings: RelaySettings, cycle: LimitCycle) -> FloatArray:
+    # With the command turned round a reverse-acting process has a positive gain.
+    sign = -1 if settings.reverse_acting else 1
+    high, low = (cycle.period_high, cycle.period_low)[::sign]
+    about = settings.setpoint
+    rest, _ = steady_state(record, settings)
+    seen = FopdtCycle(high, low, cycle.peak_max - about, cycle.peak_min - about)
+    mean_y, mean_u = cycle_means(record)
+    excursion = sign * (mean_u - settings.baseline)
+    if abs(excursion) < _LEAST_BIAS * settings.amplitude:
+        raise IdentificationError(
+            f"the mean command is only {excursion:g} away from the baseline, so that its ratio to "
+            "the measurement (eq 6) tells no gain: use a biased relay, or the method "
+            "wang_unbiased; an integrating process always has a mean of zero"
         )
-        return np.array((-k if settings.reverse_acting else k, t, dead))
+    gain = (mean_y - rest) / excursion
+    if not gain > 0.0:
+        raise IdentificationError(
+            f"the means over whole cycles give a gain of {gain:g} against the direction of the "
+            "relay: the state before the test was not steady, or the load changed"
+        )
+    bias = sign * settings.bias - (about - rest) / gain
+    k, t, dead = fopdt_from_biased(seen, gain, settings.amplitude, bias, settings.hysteresis)
+    return np.array((sign * k, t, dead))
 
-    return _identify("wang_unbiased", record, measure)
+
+def _measure_unbiased(record: Record, settings: RelaySettings, cycle: LimitCycle) -> FloatArray:
+    if abs(settings.bias) > 0.01 * settings.amplitude:
+        raise IdentificationError(
+            f"the relay had a bias of {settings.bias:g}, but eqs 19 to 25 hold for a symmetric "
+            "one: use the method wang_biased"
+        )
+    response = abs(frequency_point(record).value)
+    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
+    k, t, dead = fopdt_from_unbiased(
+        cycle.period, amplitude, response, settings.amplitude, settings.hysteresis
+    )
+    return np.array((-k if settings.reverse_acting else k, t, dead))
+
+
+_Measure = Callable[[Record, RelaySettings, LimitCycle], FloatArray]
+
+
+def _identify(method: str, record: Record, measure: _Measure) -> Identification:
+    """Measure on the averaged limit cycle; its scatter from cycle to cycle is the uncertainty."""
+    settings = record.settings or infer_settings(record)
+    bounds = record.cycle_start or find_cycles(record)
+    if settings is None or len(bounds) < 2:
+        raise IdentificationError(
+            f"{method} needs at least one whole cycle of a relay test and the record holds none: "
+            "use the method waveform, which takes any input"
+        )
+    average = limit_cycle(record)
+    _, measured = steady_state(record, settings)
+    first, last = average.cycles[0], average.cycles[-1]
+    whole = replace(record, settings=settings, cycle_start=bounds[first : last + 2])
+    values = measure(whole, settings, average)
+    singles = []
+    for index in average.cycles:
+        one = replace(whole, cycle_start=bounds[index : index + 2])
+        try:
+            singles.append(measure(one, settings, _single(record, index)))
+        except IdentificationError:
+            # One cycle may be too noisy for the logarithms; the others still tell the scatter.
+            continue
+    covariance = None
+    if len(singles) >= _LEAST_CYCLES:
+        scatter = np.array(singles) - np.mean(singles, axis=0)
+        covariance = scatter.T @ scatter / (len(singles) * (len(singles) - 1))
+    warnings = []
+    if not average.converged:
+        warnings.append("the limit cycle had not settled: its last cycles still differ")
+    if not measured:
+        warnings.append(
+            "no samples at rest before the test: the set-point stands in for the steady state"
+        )
+    quantile = float(stdtrit(max(len(singles) - 1, 1), 0.975))
+    return with_uncertainty(
+        method,
+        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
+        PARAMETERS,
+        values,
+        covariance,
+        quantile,
+        warnings=tuple(warnings),
+    )
+
+
+def _single(record: Record, index: int) -> LimitCycle:
+    return limit_cycle(cycles_of(record)[index : index + 1])

@@ -108,7 +108,8 @@ def _refine(problem: _Problem, theta: FloatArray) -> _State:
         normal = jacobian @ jacobian.T
         gradient = jacobian @ state.residual
         diagonal = np.diag(np.maximum(np.diag(normal), 1e-300))
-        step = np.linalg.lstsq(normal + damping * diagonal, gradient, rcond=None)[0]
+        damped = normal + damping * diagonal
+        step: FloatArray = np.asarray(np.linalg.lstsq(damped, gradient, rcond=None)[0])
         trial = _evaluate(problem, problem.structure.move(state.theta, step))
         if not trial.cost < state.cost:
             damping *= 10.0

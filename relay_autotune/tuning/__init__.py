@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numpy as np
+from collections.abc import Callable, Sequence
 
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
@@ -48,21 +46,20 @@ def rule_named(name: str) -> Rule:
 
 
 def tune(
-    identification: Identification, rule: str = DEFAULT_RULE, *, rng: np.random.Generator
+    identification: Identification, rule: str, models: Sequence[TransferFunction] = ()
 ) -> Gains:
     """Return the gains of a rule, judged on the model and on the models around it.
 
     :param identification: the model and its uncertainty.
     :param rule: one of ``RULES``.
-    :param rng: draws the models within the uncertainty.
+    :param models: models within the uncertainty, from :func:`ensemble`.
     :raises TuningError: if the rule does not apply, or its loop is unstable on the model or on
-        more than 5 % of the models within the uncertainty.
+        more than 5 % of ``models``.
     """
     controller, reason = rule_named(rule)(identification.model)
     performance = analyse_loop(controller, identification.model)
-    models = ensemble(identification, rng=rng)
     if not models:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
-        return Gains(rule, controller, performance, performance.ms, reason)
+        return Gains.of(rule, controller, performance, ms_95=performance.ms, reason=reason)
     ms_95 = max(ensemble_ms(controller, models), performance.ms)
-    return Gains(rule, controller, performance, ms_95, reason)
+    return Gains.of(rule, controller, performance, ms_95=ms_95, reason=reason)

@@ -53,6 +53,15 @@ def frequencies(loop: TransferFunction) -> FloatArray:
     return np.unique(np.concatenate(parts))
 
 
+def sensitivity_on(loop: TransferFunction, grid: FloatArray) -> FloatArray:
+    """Return the magnitude of ``1/(1 + L)`` on a grid of frequencies.
+
+    :param loop: L, controller times process.
+    :param grid: rad/s, shape (n,).
+    """
+    return np.asarray(np.abs(1.0 / (1.0 + loop(1j * grid))))
+
+
 def sensitivity_peaks(loop: TransferFunction, grid: FloatArray) -> tuple[float, float]:
     """Return (Ms, Mt), the largest magnitudes of ``1/(1 + L)`` and ``L/(1 + L)``.
 
@@ -112,7 +121,7 @@ def load_response(
     transform = transform * np.sinc(np.arange(points) / points)
     padded = np.concatenate((transform, np.zeros(points)))
     padded[0] *= 0.5
-    time = np.arange(2 * points) * (period / (2 * points))
+    time = np.arange(2 * points, dtype=np.float64) * (period / (2 * points))
     series = np.fft.ifft(padded).real * (2 * points)
     error = 2.0 / period * np.exp(sigma * time) * series
     inside = time <= duration
@@ -157,12 +166,12 @@ def analyse_loop(controller: Controller, model: TransferFunction) -> Performance
     above = [c.gain for c in phase_crossings(loop) if c.gain > 1.0]
     crossovers = _gain_crossovers(loop, grid)
     lag = [math.remainder(float(loop.phase(w)) + math.pi, 2.0 * math.pi) for w in crossovers]
-    margins = [m % (2.0 * math.pi) for m in lag]
+    delays = [m % (2.0 * math.pi) / w for m, w in zip(lag, crossovers, strict=True)]
     return Performance(
         ms=ms,
         mt=mt,
         gain_margin=min(above) if above else math.inf,
         phase_margin=min((abs(m) for m in lag), default=math.pi),
-        delay_margin=min((m / w for m, w in zip(margins, crossovers, strict=True)), default=math.inf),
+        delay_margin=min(delays, default=math.inf),
         iae_load=load_iae(controller, model),
     )

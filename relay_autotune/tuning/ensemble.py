@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
 from relay_autotune.models import TransferFunction
-from relay_autotune.tuning.analysis import frequencies, is_stable, sensitivity_peaks
+from relay_autotune.tuning.analysis import frequencies, is_stable, sensitivity_on
 from relay_autotune.tuning.gains import Controller
 
 _MODELS = 100
@@ -40,13 +41,15 @@ def ensemble(
     models = []
     for draw in draws:
         with np.errstate(over="ignore"):
-            drawn = np.where(logarithmic, values * np.exp(np.clip(draw, -20.0, 20.0)), values + draw)
+            drawn = np.where(
+                logarithmic, values * np.exp(np.clip(draw, -20.0, 20.0)), values + draw
+            )
         drawn = np.where(logarithmic, drawn, np.maximum(drawn, 0.0))
         models.append(identification.build(drawn))
     return tuple(models)
 
 
-def ensemble_ms(controller: Controller, models: tuple[TransferFunction, ...]) -> float:
+def ensemble_ms(controller: Controller, models: Sequence[TransferFunction]) -> float:
     """Return the Ms below which 95 % of the models stay with one controller.
 
     :param controller: the gains.
@@ -59,7 +62,7 @@ def ensemble_ms(controller: Controller, models: tuple[TransferFunction, ...]) ->
             peaks.append(math.inf)
             continue
         loop = controller.loop(model)
-        peaks.append(sensitivity_peaks(loop, frequencies(loop))[0])
+        peaks.append(float(sensitivity_on(loop, frequencies(loop)).max()))
     rank = math.ceil(_SHARE * len(peaks)) - 1
     value = sorted(peaks)[rank]
     if math.isinf(value):

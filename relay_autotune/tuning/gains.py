@@ -76,7 +76,7 @@ class Controller:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Performance:
     """What a controller does on a model.
 
@@ -97,20 +97,38 @@ class Performance:
     iae_load: float
 
 
-@dataclass(frozen=True)
-class Gains:
-    """Gains that one rule gives, judged on the identified model.
+@dataclass(frozen=True, kw_only=True)
+class Gains(Controller, Performance):
+    """The controller that one rule gives, with what it does on the identified model.
+
+    The fields are those of :class:`Controller` and :class:`Performance`, and
 
     :param rule: name in the registry.
-    :param controller: the gains.
-    :param performance: what they do on the model.
     :param ms_95: Ms that 95 % of the models within the uncertainty stay below.
     :param reason: why this rule and these gains, a sentence for people.
     """
 
     rule: str
-    controller: Controller
-    performance: Performance
     ms_95: float
     reason: str
     form: str = "isa"
+
+    @classmethod
+    def of(
+        cls,
+        rule: str,
+        controller: Controller,
+        performance: Performance,
+        *,
+        ms_95: float,
+        reason: str,
+    ) -> Gains:
+        """Join a controller and its performance.
+
+        :param rule: name in the registry.
+        :param controller: the gains.
+        :param performance: what they do on the model.
+        :param ms_95: Ms that 95 % of the models within the uncertainty stay below.
+        :param reason: why this rule and these gains.
+        """
+        return cls(**vars(controller), **vars(performance), rule=rule, ms_95=ms_95, reason=reason)

@@ -1,0 +1,148 @@
+"""From a record to models and gains: the one path that live nodes and replay share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from relay_autotune.cycles import cycles_of
+from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
+from relay_autotune.identification import (
+    DEFAULT_METHOD,
+    METHODS,
+    Identification,
+    identify,
+    method_named,
+)
+from relay_autotune.record import Cycle, Outcome, Record
+from relay_autotune.tuning import DEFAULT_RULE, RULES, Gains, ensemble, rule_named, tune
+
+_NO_GAINS = {
+    Outcome.ABORTED: "the experiment was aborted",
+    Outcome.FAILED: "the experiment failed",
+}
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What one record gave.
+
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param models: every method's model that could be had, the chosen method's first.
+    :param selected: index of the model that counts; None: nothing was identified.
+    :param gains: every rule's gains that apply to the selected model, the chosen rule's first.
+    :param recommended: index of the gains that count; None: there are none.
+    :param reason: why there is no model or no gains; empty where there are both.
+    """
+
+    record: Record
+    cycles: tuple[Cycle, ...] = ()
+    models: tuple[Identification, ...] = ()
+    selected: int | None = None
+    gains: tuple[Gains, ...] = ()
+    recommended: int | None = None
+    reason: str = ""
+
+    @property
+    def model(self) -> Identification | None:
+        """The identification that counts."""
+        return None if self.selected is None else self.models[self.selected]
+
+    @property
+    def best_gains(self) -> Gains | None:
+        """The gains that count."""
+        return None if self.recommended is None else self.gains[self.recommended]
+
+
+def check_names(method: str, rule: str) -> None:
+    """Refuse unknown names before any work is done.
+
+    :raises RelayAutotuneError: if there is no such method or rule; the message lists the known.
+    """
+    method_named(method)
+    rule_named(rule)
+
+
+def analyse(
+    record: Record,
+    *,
+    method: str = DEFAULT_METHOD,
+    rule: str = DEFAULT_RULE,
+    final: bool = True,
+    rng: np.random.Generator | None = None,
+) -> Analysis:
+    """Identify a record and, where the experiment was completed, tune.
+
+    Data that tell no model are a result, not an exception: the reason says what was found and
+    what to do. Only a completed experiment, or data that carry no outcome at all, yield gains.
+
+    :param record: the experiment.
+    :param method: the method whose model counts.
+    :param rule: the rule whose gains count.
+    :param final: False while the experiment still runs: only the chosen model, no gains.
+    :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
+        that equal records give equal numbers.
+    :raises RelayAutotuneError: if method or rule are unknown.
+    """
+    check_names(method, rule)
+    cycles: tuple[Cycle, ...] = ()
+    try:
+        cycles = cycles_of(record)
+        chosen = _guarded(record, method)
+    except RelayAutotuneError as error:
+        return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
+    models = [chosen]
+    if final:
+        models += _others(record, method)
+    found = Analysis(record, cycles, tuple(models), 0)
+    if not final:
+        return found
+    refused = _NO_GAINS.get(record.outcome)
+    if refused:
+        return Analysis(
+            record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
+        )
+    around = ensemble(chosen, rng=rng or np.random.default_rng(0))
+    try:
+        first = tune(chosen, rule, around)
+    except TuningError as error:
+        return Analysis(record, cycles, found.models, 0, reason=f"no gains: {error}")
+    gains = [first]
+    for name in RULES:
+        if name == rule:
+            continue
+        try:
+            gains.append(tune(chosen, name, around))
+        except TuningError:
+            # A rule that does not apply has nothing to compare.
+            continue
+    return Analysis(record, cycles, found.models, 0, tuple(gains), 0)
+
+
+def _guarded(record: Record, method: str) -> Identification:
+    try:
+        return identify(record, method)
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise IdentificationError(
+            f"{method} broke down on this record ({error}): it holds no usable response"
+        ) from error
+
+
+def _others(record: Record, method: str) -> list[Identification]:
+    """Models of the other methods, for comparison; one that does not apply is left out."""
+    found = []
+    for name in METHODS:
+        if name == method:
+            continue
+        try:
+            found.append(_guarded(record, name))
+        except RelayAutotuneError:
+            continue
+    return found
+
+
+def _with_outcome(record: Record, reason: str) -> str:
+    refused = _NO_GAINS.get(record.outcome)
+    return f"{refused} ({record.reason}); {reason}" if refused else reason
