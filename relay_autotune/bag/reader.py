@@ -71,6 +71,8 @@ def read_experiments(path: Path | str, selection: Selection | None = None) -> Re
         columns = (wanted.measurement, wanted.command, wanted.time)
         measured, commanded, dated = read_csv(path, *columns)
         records, notes = [join(measured, commanded, dated=dated)], list[str]()
+    elif wanted.time is not None:
+        raise SelectionError(f"--time names a column of a CSV file, but {path} is none")
     else:
         with ExitStack() as opened:
             files = [opened.enter_context(McapFile(file)) for file in _data_files(path)]

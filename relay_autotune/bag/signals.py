@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.messages import start_seconds
 from relay_autotune.record import FloatArray, IntArray, PiecewiseConstant, Record
 
@@ -83,7 +83,7 @@ def window(record: Record, start: float | None, end: float | None) -> Record:
     :param record: the record.
     :param start: first time to keep [s from the first sample]; None: the beginning.
     :param end: last time to keep [s from the first sample]; None: the end.
-    :raises BagError: if no sample lies between them.
+    :raises SelectionError: if no sample lies between them.
     """
     if start is None and end is None:
         return record
@@ -91,7 +91,7 @@ def window(record: Record, start: float | None, end: float | None) -> Record:
     low = 0 if start is None else int(np.searchsorted(time, start, side="left"))
     high = time.size if end is None else int(np.searchsorted(time, end, side="right"))
     if high <= low:
-        raise BagError(
+        raise SelectionError(
             f"no sample lies between --start {0.0 if start is None else start:g} s and "
             f"--end {time[-1] if end is None else end:g} s; the recording is {time[-1]:g} s long"
         )

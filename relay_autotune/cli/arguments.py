@@ -1,0 +1,53 @@
+"""What the commands have in common: arguments, messages and the way they end."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Callable
+
+from relay_autotune.errors import RelayAutotuneError, SelectionError
+
+DONE, NOTHING_FOUND, USAGE = 0, 1, 2
+
+
+def finite(text: str) -> float:
+    """Return a finite number given on the command line."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a finite number, found {text}")
+    return value
+
+
+def say(program: str, text: str) -> None:
+    """Tell the user something that is no result."""
+    print(f"{program}: {text}", file=sys.stderr)
+
+
+def guarded(program: str, work: Callable[[], int]) -> int:
+    """Return the exit status of a command's work; an error becomes one line.
+
+    :param program: name of the command.
+    :param work: does it, and returns its exit status.
+    """
+    try:
+        status = work()
+        sys.stdout.flush()
+    except SelectionError as error:
+        say(program, str(error))
+        return USAGE
+    except RelayAutotuneError as error:
+        say(program, str(error))
+        return NOTHING_FOUND
+    except BrokenPipeError:
+        # Whoever read the results has seen enough; nothing may be flushed to it at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOTHING_FOUND
+    except KeyboardInterrupt:
+        return 130
+    return status

@@ -1,0 +1,112 @@
+"""Make a rosbag2 bag of two columns of a CSV file: `csv_to_bag CSV BAG`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from relay_autotune.bag.csv_file import read_csv
+from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
+from relay_autotune.cli.arguments import DONE, finite, guarded, say
+from relay_autotune.errors import BagError, SelectionError
+
+PROGRAM = "csv_to_bag"
+
+_EPILOG = """\
+The bag gets two topics of std_msgs/Float64, named for their columns without the unit: the column
+"Heater 1 (%)" becomes /heater_1.  Measurement and command of a row carry the time of that row.
+
+Example:
+  csv_to_bag heater.csv heater_bag --time 'Time (sec)' \\
+      --measurement 'Temperature 1 (degC)' --command 'Heater 1 (%)'
+  replay heater_bag --measurement /temperature_1 --command /heater_1
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    :param arguments: those of the command line; default: the process's own.
+    :return: the exit status.
+    """
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Make a rosbag2 bag of two columns of a CSV file.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("csv", metavar="CSV", type=Path, help="file with a header line")
+    parser.add_argument("bag", metavar="BAG", type=Path, help="directory to make")
+    parser.add_argument("--measurement", metavar="NAME", help="column of the measurement")
+    parser.add_argument("--command", metavar="NAME", help="column of the command")
+    parser.add_argument("--time", metavar="NAME", help="column of the time [s]")
+    parser.add_argument("--measurement-topic", metavar="TOPIC", help="name of its topic")
+    parser.add_argument("--command-topic", metavar="TOPIC", help="name of its topic")
+    parser.add_argument(
+        "--epoch",
+        type=finite,
+        default=0.0,
+        metavar="S",
+        help="what the time counts from [s since 1970-01-01 UTC] (%(default)s)",
+    )
+    options = parser.parse_args(arguments)
+    return guarded(PROGRAM, lambda: _convert(options))
+
+
+def _convert(options: argparse.Namespace) -> int:
+    measurement, command, _ = read_csv(
+        options.csv, options.measurement, options.command, options.time
+    )
+    topics = (
+        options.measurement_topic or topic_name(measurement.name),
+        options.command_topic or topic_name(command.name),
+    )
+    for topic in topics:
+        if not re.fullmatch(r"(/[A-Za-z_]\w*)+", topic):
+            raise SelectionError(
+                f"{topic!r} is no topic name; expected one like /tank/level, "
+                f"given with --measurement-topic and --command-topic"
+            )
+    epoch_ns = round(options.epoch * 1e9)
+    if epoch_ns + int(measurement.time_ns[0]) < 0:
+        raise BagError(
+            f"{options.csv} begins at {measurement.time_ns[0] / 1e9:g} s, but a bag has no time "
+            f"before 1970; name the date that its time counts from with --epoch"
+        )
+    facts = {
+        "source": options.csv.name,
+        "measurement column": measurement.name,
+        "command column": command.name,
+    }
+    with BagWriter(
+        options.bag,
+        [Topic(name) for name in topics],
+        start_ns=epoch_ns + int(measurement.time_ns[0]),
+        custom=facts,
+    ) as bag:
+        rows = zip(
+            (measurement.time_ns + epoch_ns).tolist(),
+            measurement.values.tolist(),
+            command.values.tolist(),
+            strict=True,
+        )
+        for time_ns, measured, commanded in rows:
+            bag.write(topics[0], time_ns, time_ns, encode_float64(measured))
+            bag.write(topics[1], time_ns, time_ns, encode_float64(commanded))
+    say(PROGRAM, f"{options.bag}: {len(measurement)} messages on each of {' and '.join(topics)}")
+    return DONE
+
+
+def topic_name(column: str) -> str:
+    """Return the topic for a column: its name in lower case, without a unit in brackets."""
+    bare = re.sub(r"[(\[].*?[)\]]", "", column).lower()
+    words = re.findall(r"[a-z0-9]+", bare)
+    name = "_".join(words)
+    return f"/{name}" if name[:1].isalpha() else f"/_{name}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,229 @@
+"""The result of a recording as plain text for people."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from relay_autotune.cycles import limit_cycle
+from relay_autotune.record import Outcome, Record
+
+if TYPE_CHECKING:
+    from relay_autotune.autotune import Analysis
+    from relay_autotune.identification import Identification
+    from relay_autotune.models import TransferFunction
+    from relay_autotune.tuning import Gains
+
+_WIDTH = 99
+_INDENT = "  "
+_LABEL = 16
+
+_UNITS = {"gain": "y/u", "ultimate_gain": "u/y"}
+
+
+def table(bag: str, analyses: Sequence[Analysis]) -> str:
+    """Return what was made of each experiment of a recording.
+
+    :param bag: the recording, as it was given.
+    :param analyses: one for each experiment.
+    """
+    blocks = [bag]
+    for number, analysis in enumerate(analyses, start=1):
+        which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
+        blocks.append("\n".join(_experiment(analysis, which)))
+    return "\n\n".join(blocks) + "\n"
+
+
+def process_text(model: TransferFunction) -> str:
+    """Return a transfer function on one line, such as ``1.65 e^(-10 s) / (1 + 20 s)``."""
+    above = [digits(model.gain), *_factors(model.zeros)]
+    if model.dead_time:
+        above.append(f"e^(-{digits(model.dead_time)} s)")
+    below = _factors(model.time_constants)
+    if model.integrators:
+        below.insert(0, "s" if model.integrators == 1 else f"s^{model.integrators}")
+    if not below:
+        return " ".join(above)
+    return f"{' '.join(above)} / {below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
+
+
+def digits(value: float, count: int = 4) -> str:
+    """Return a number with ``count`` significant digits; a dash for none."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:#.{count}g}".rstrip(".") if value else "0"
+
+
+def _factors(time_constants: Iterable[complex]) -> list[str]:
+    factors = []
+    for value in time_constants:
+        if value.imag > 0.0:
+            # With its conjugate: (1 + z s)(1 + z* s) = 1 + 2 Re(z) s + |z|^2 s^2.
+            factors.append(f"(1 + {digits(2.0 * value.real)} s + {digits(abs(value) ** 2)} s^2)")
+        elif value.imag == 0.0:
+            sign = "-" if value.real < 0.0 else "+"
+            factors.append(f"(1 {sign} {digits(abs(value.real))} s)")
+    return factors
+
+
+def _experiment(analysis: Analysis, which: str) -> list[str]:
+    record = analysis.record
+    lines = [_line(f"experiment{which}", _outcome(record))]
+    if record.reason and record.outcome != Outcome.COMPLETED:
+        lines += _wrapped("", record.reason)
+    lines.append(_line("recorded", _span(record)))
+    lines += _limit_cycle(analysis)
+    if analysis.model is not None:
+        lines += ["", *_model(analysis.model)]
+        lines += _others(analysis)
+    if analysis.best_gains is not None:
+        lines += ["", *_gains(analysis.best_gains)]
+        lines += _other_gains(analysis)
+    if analysis.reason:
+        lines += ["", *_wrapped("gains" if analysis.models else "process", analysis.reason)]
+    return lines
+
+
+def _outcome(record: Record) -> str:
+    name = f"  ({record.experiment_id})" if record.experiment_id else ""
+    if record.outcome == Outcome.UNKNOWN:
+        return f"recorded elsewhere{name}"
+    return record.outcome.name.lower() + name
+
+
+def _span(record: Record) -> str:
+    text = f"{digits(record.duration)} s, {len(record)} samples"
+    if record.lost_samples:
+        text += f", {record.lost_samples} lost"
+    if record.start:
+        text += f", from {_date(record.start)}"
+    return text
+
+
+def _date(start: float) -> str:
+    try:
+        return f"{datetime.fromtimestamp(start, tz=UTC):%Y-%m-%d %H:%M:%S} UTC"
+    except (OverflowError, ValueError, OSError):
+        return f"{start:g} s after 1970"
+
+
+def _limit_cycle(analysis: Analysis) -> list[str]:
+    if not analysis.cycles:
+        return []
+    cycle = limit_cycle(analysis.cycles)
+    state = "converged" if cycle.converged else "not converged"
+    return [
+        _line(
+            "limit cycle",
+            f"period {digits(cycle.period)} s (high {digits(cycle.period_high)} s, "
+            f"low {digits(cycle.period_low)} s), {len(cycle.cycles)} cycles, {state}",
+        ),
+        _line("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)}"),
+    ]
+
+
+def _model(found: Identification) -> list[str]:
+    name = f"{found.structure}, {found.method}"
+    lines = [_line("process", f"{process_text(found.model)}   ({name})")]
+    rows = list(zip(found.parameters, found.values, found.ci95_low, found.ci95_high, strict=True))
+    for label, value, low, high in rows:
+        interval = f"95 %: {digits(low)} to {digits(high)}" if np.isfinite(low) else ""
+        doubt = "   not determined" if label in found.undetermined else ""
+        unit = _UNITS.get(label, "s")
+        lines.append(_row(label.replace("_", " "), value, unit, interval + doubt))
+    for label, value, std, unit in (
+        ("ultimate gain", found.ultimate_gain, found.ultimate_gain_std, "u/y"),
+        ("ultimate freq.", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
+    ):
+        if math.isfinite(value):
+            interval = f"± {digits(1.96 * std, 2)}" if math.isfinite(std) else ""
+            lines.append(_row(label, value, unit, interval))
+    lines.append(_line("fit", _fit(found)))
+    for warning in found.warnings:
+        lines += _wrapped("warning", warning)
+    return lines
+
+
+def _others(analysis: Analysis) -> list[str]:
+    """Return what the other methods found, a line for each."""
+    others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
+    return [
+        _line("also" if i == 0 else "", f"{process_text(m.model)}   ({m.structure}, {m.method})")
+        for i, m in enumerate(others)
+    ]
+
+
+def _fit(found: Identification) -> str:
+    fit = found.fit
+    parts = []
+    if math.isfinite(fit.fit):
+        parts.append(f"{100.0 * fit.fit:.2f} %")
+    if math.isfinite(fit.residual_rms):
+        parts.append(f"residual {digits(fit.residual_rms, 3)} y rms")
+    if math.isfinite(fit.noise_std):
+        parts.append(f"noise {digits(fit.noise_std, 3)} y")
+    if math.isfinite(fit.prediction):
+        parts.append(f"prediction {digits(fit.prediction, 3)} y rms")
+    if math.isfinite(fit.whiteness_p):
+        parts.append(f"whiteness p = {digits(fit.whiteness_p, 2)}")
+    return ", ".join(parts) or "not estimated"
+
+
+def _other_gains(analysis: Analysis) -> list[str]:
+    """Return what the other rules say, a line for each."""
+    others = [gains for i, gains in enumerate(analysis.gains) if i != analysis.recommended]
+    return [
+        _line(
+            "also" if i == 0 else "",
+            f"kc {digits(g.kc)} u/y   ti {digits(g.ti)} s   td {digits(g.td)} s   "
+            f"Ms {digits(g.ms, 3)}   ({g.rule})",
+        )
+        for i, g in enumerate(others)
+    ]
+
+
+def _gains(gains: Gains) -> list[str]:
+    lines = [
+        _line("gains", gains.rule),
+        _line(
+            "  ISA form",
+            f"kc {digits(gains.kc)} u/y   ti {digits(gains.ti)} s   td {digits(gains.td)} s"
+            + (f"   tf {digits(gains.tf)} s" if gains.tf else "")
+            + f"   b {gains.b:g}",
+        ),
+        _line(
+            "  parallel form",
+            f"p {digits(gains.p)} u/y   i {digits(gains.i)} u/(y s)   d {digits(gains.d)} u s/y",
+        ),
+        _line(
+            "  predicted",
+            f"Ms {digits(gains.ms, 3)} (95 %: {digits(gains.ms_95, 3)})   "
+            f"Mt {digits(gains.mt, 3)}   gain margin {digits(gains.gain_margin, 3)}   "
+            f"phase margin {digits(math.degrees(gains.phase_margin), 3)} deg",
+        ),
+        _line(
+            "",
+            f"delay margin {digits(gains.delay_margin, 3)} s   "
+            f"IAE of a unit load step {digits(gains.iae_load, 3)} y s/u",
+        ),
+    ]
+    return lines + (_wrapped("  because", gains.reason) if gains.reason else [])
+
+
+def _row(label: str, value: float, unit: str, interval: str) -> str:
+    return _line("  " + label, f"{digits(value):>9} {unit:<6} {interval}".rstrip())
+
+
+def _line(label: str, text: str) -> str:
+    return f"{_INDENT}{label:<{_LABEL}} {text}".rstrip()
+
+
+def _wrapped(label: str, text: str) -> list[str]:
+    width = _WIDTH - len(_line("x", "")) - _LABEL
+    parts = textwrap.wrap(text, width) or [""]
+    return [_line(label if i == 0 else "", part) for i, part in enumerate(parts)]

@@ -1,0 +1,133 @@
+"""The result of a recording as one JSON document, as `replay --json` prints it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.cycles import limit_cycle
+
+if TYPE_CHECKING:
+    from relay_autotune.autotune import Analysis
+    from relay_autotune.identification import Identification
+    from relay_autotune.models import TransferFunction
+    from relay_autotune.tuning import Gains
+
+_LIMIT_CYCLE = (
+    *("period", "period_high", "period_low", "peak_max", "peak_min"),
+    *("time_to_peak_max", "time_to_peak_min", "mean_measurement", "mean_command"),
+)
+_GAINS = (
+    *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
+    *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
+)
+
+
+def document(
+    bag: str, analyses: Sequence[Analysis] = (), *, error: str | None = None
+) -> dict[str, Any]:
+    """Return the document of one recording.
+
+    :param bag: the recording, as it was given.
+    :param analyses: what was made of its experiments.
+    :param error: why the recording could not be read.
+    """
+    found: dict[str, Any] = {"bag": bag, "experiments": [_experiment(a) for a in analyses]}
+    if error is not None:
+        found["error"] = error
+    return found
+
+
+def to_json(value: dict[str, Any]) -> str:
+    """Return a document on one line; every number has the digits that give it back exactly."""
+    return json.dumps(value, allow_nan=False, ensure_ascii=False)
+
+
+def model_fields(model: TransferFunction) -> dict[str, Any]:
+    """Return a transfer function as it appears in documents."""
+    return {
+        "gain": _number(model.gain),
+        "zeros": _numbers(model.zeros),
+        "time_constants": _numbers(model.time_constants),
+        "dead_time": _number(model.dead_time),
+        "numerator": _numbers(model.numerator),
+        "denominator": _numbers(model.denominator),
+    }
+
+
+def _experiment(analysis: Analysis) -> dict[str, Any]:
+    record = analysis.record
+    return {
+        "start": _number(record.start),
+        "duration": _number(record.duration),
+        "outcome": record.outcome.name.lower(),
+        "reason": record.reason or analysis.reason,
+        "experiment_id": record.experiment_id,
+        "limit_cycle": _limit_cycle(analysis),
+        "models": [_model(identification) for identification in analysis.models],
+        "selected": analysis.selected,
+        "gains": [_gains(gains) for gains in analysis.gains],
+        "recommended": analysis.recommended,
+    }
+
+
+def _limit_cycle(analysis: Analysis) -> dict[str, Any] | None:
+    if not analysis.cycles:
+        return None
+    cycle = limit_cycle(analysis.cycles)
+    return {
+        **{name: _number(getattr(cycle, name)) for name in _LIMIT_CYCLE},
+        "cycles": len(cycle.cycles),
+        "converged": cycle.converged,
+    }
+
+
+def _model(identification: Identification) -> dict[str, Any]:
+    names = identification.parameters
+    intervals = zip(identification.ci95_low, identification.ci95_high, strict=True)
+    return {
+        "method": identification.method,
+        "structure": identification.structure,
+        **model_fields(identification.model),
+        "std": _named(names, identification.std),
+        "ci95": {n: _numbers(ends) for n, ends in zip(names, intervals, strict=True)},
+        "fit": {
+            name: _number(getattr(identification.fit, name))
+            for name in ("residual_rms", "noise_std", "fit", "whiteness_p", "prediction")
+        },
+        "ultimate_gain": _number(identification.ultimate_gain),
+        "ultimate_gain_std": _number(identification.ultimate_gain_std),
+        "ultimate_frequency": _number(identification.ultimate_frequency),
+        "ultimate_frequency_std": _number(identification.ultimate_frequency_std),
+        "warnings": list(identification.warnings),
+        "undetermined": list(identification.undetermined),
+    }
+
+
+def _gains(gains: Gains) -> dict[str, Any]:
+    return {
+        "rule": gains.rule,
+        "form": gains.form,
+        **{name: _number(getattr(gains, name)) for name in _GAINS},
+        "reason": gains.reason,
+    }
+
+
+def _named(names: Sequence[str], values: Iterable[float]) -> dict[str, Any]:
+    return {name: _number(value) for name, value in zip(names, values, strict=True)}
+
+
+def _numbers(values: Iterable[complex]) -> list[Any]:
+    return [_number(value) for value in values]
+
+
+def _number(value: Any) -> Any:
+    """Return what JSON has for a number: null for none, [re, im] for a complex one."""
+    if isinstance(value, bool | int):
+        return value
+    number = complex(value)
+    if number.imag != 0.0:
+        return [_number(number.real), _number(number.imag)]
+    return number.real if math.isfinite(number.real) else None
