@@ -159,7 +159,7 @@ def fill_cycle(
     message: Any,
     cycle: Cycle,
     *,
-    settings: RelaySettings,
+    settings: RelaySettings | None,
     experiment_id: str,
     start_ns: int,
     time: FloatArray,

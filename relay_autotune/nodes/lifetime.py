@@ -18,7 +18,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import (
+    ConditionReachedException,
+    ShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -34,20 +39,31 @@ class ServedNode(Node):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self._deferred: deque[Callable[[], None]] = deque()
+        self._when_idle: deque[Callable[[], None]] = deque()
 
     def defer(self, work: Callable[[], None]) -> None:
         """Do ``work`` outside of the callback that asks for it, in the order of asking."""
         self._deferred.append(work)
 
-    def work(self) -> bool:
-        """Do one piece of deferred work; return True if there is more."""
+    def defer_until_idle(self, work: Callable[[], None]) -> None:
+        """Do ``work`` once no message, timer or request waits any more."""
+        self._when_idle.append(work)
+
+    def work(self, *, idle: bool) -> bool:
+        """Do one piece of deferred work; return True if there is more.
+
+        :param idle: True if nothing else is to be done now.
+        """
         if self._deferred:
             self._deferred.popleft()()
-        return bool(self._deferred)
+        elif idle and self._when_idle:
+            self._when_idle.popleft()()
+        return bool(self._deferred or self._when_idle)
 
     def work_off(self) -> None:
-        """Do all deferred work."""
-        while self.work():
+        """Do all deferred work, except what waits for an idle moment."""
+        self._when_idle.clear()
+        while self.work(idle=False):
             pass
 
     def end(self, reason: str) -> None:
@@ -55,6 +71,25 @@ class ServedNode(Node):
 
         :param reason: why the process ends, for people.
         """
+
+
+class Executor(SingleThreadedExecutor):
+    """rclpy's single-threaded executor, which also tells whether there was something to do."""
+
+    def turn(self, timeout_sec: float | None) -> bool:
+        """Wait for a callback and run it; return False if none became ready.
+
+        :param timeout_sec: how long to wait [s]; None: as long as it takes.
+        """
+        try:
+            handler, _, _ = self.wait_for_ready_callbacks(timeout_sec)
+        except (ConditionReachedException, ShutdownException, TimeoutException):
+            return False
+        handler()
+        error = handler.exception()
+        if error is not None:
+            raise error
+        return True
 
 
 def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None = None) -> int:
@@ -92,7 +127,7 @@ def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None 
 
 
 def _serve(node: ServedNode, stopped: list[int]) -> int:
-    executor = SingleThreadedExecutor()
+    executor = Executor()
     executor.add_node(node)
     _wake_on_signal(executor)
     # What was imported stays: the collector need not look at it again and again.
@@ -103,8 +138,8 @@ def _serve(node: ServedNode, stopped: list[int]) -> int:
     try:
         more = False
         while not stopped:
-            executor.spin_once(0.0 if more else None)
-            more = node.work()
+            busy = executor.turn(0.0 if more else None)
+            more = node.work(idle=not busy)
         reason = f"the node was stopped by {signal.Signals(stopped[0]).name}"
     except Exception as error:
         status, reason = 1, f"the node failed: {_where(error)}"
@@ -120,7 +155,7 @@ def _serve(node: ServedNode, stopped: list[int]) -> int:
     return status
 
 
-def _wake_on_signal(executor: SingleThreadedExecutor) -> None:
+def _wake_on_signal(executor: Executor) -> None:
     # A Python signal handler does not interrupt the executor's wait in C. The interpreter writes
     # the number of a signal into this pipe at once; a thread reads it and gives the executor
     # something to do.

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -18,6 +18,41 @@ from relay_autotune.errors import ParameterError
 _LARGEST_INTEGER = 2**62
 
 
+class Entry(Protocol):
+    """A row of a table of parameters: a `NodeParameter`, or one of the experiment's own table."""
+
+    @property
+    def name(self) -> str:
+        """Name of the parameter."""
+
+    @property
+    def default(self) -> Any:
+        """Its default, which also tells its type."""
+
+    @property
+    def unit(self) -> str:
+        """Its unit."""
+
+    @property
+    def description(self) -> str:
+        """What it does."""
+
+    @property
+    def lower(self) -> float:
+        """Smallest value allowed."""
+
+    @property
+    def upper(self) -> float:
+        """Largest value allowed."""
+
+    @property
+    def range_text(self) -> str:
+        """The range in words."""
+
+    def problem(self, value: Any) -> str | None:
+        """Say what is wrong with a value, None if nothing is."""
+
+
 @dataclass(frozen=True)
 class NodeParameter:
     """A parameter of a node.
@@ -26,9 +61,9 @@ class NodeParameter:
     :param default: its default, which also tells its type; NaN: not given; (): an array of
         numbers that is not given.
     :param unit: y of the measurement, u of the command, s seconds; "": none.
-    :param description: what it does, one sentence without the unit.
-    :param minimum: least value, inclusive.
-    :param maximum: greatest value, inclusive.
+    :param description: what it does, one sentence.
+    :param lower: smallest value allowed.
+    :param upper: largest value allowed.
     :param choices: the words it may be, for a string; (): any.
     """
 
@@ -36,83 +71,79 @@ class NodeParameter:
     default: float | int | bool | str | tuple[float, ...]
     unit: str
     description: str
-    minimum: float = -math.inf
-    maximum: float = math.inf
+    lower: float = -math.inf
+    upper: float = math.inf
     choices: tuple[str, ...] = ()
 
-    def check(self, value: Any) -> None:
-        """Refuse a value that is out of range.
-
-        :raises ParameterError: with a sentence that names value and range.
-        """
-        if self.choices and value not in self.choices:
-            raise ParameterError(
-                f"{self.name} must be one of {', '.join(self.choices)}, found {value!r}"
-            )
-        if isinstance(value, (str, bool)) or value is None:
-            return
-        if isinstance(value, (int, float)):
-            self._check_number(float(value))
-            return
-        for number in value:
-            if not math.isfinite(number):
-                raise ParameterError(f"{self.name} needs finite numbers, found {list(value)}")
-
-    def _check_number(self, value: float) -> None:
-        not_given = isinstance(self.default, float) and math.isnan(self.default)
-        if math.isnan(value) and not_given:
-            return
-        # An infinite limit is given as the default of a parameter that may be infinite.
-        if math.isinf(value) and value == self.default:
-            return
-        if not (math.isfinite(value) and self.minimum <= value <= self.maximum):
-            raise ParameterError(f"{self.name} must be {self.range_text()}, found {value:g}")
-
+    @property
     def range_text(self) -> str:
-        """Say the range in words, such as "finite and at least 0"."""
-        unit = f" {self.unit}" if self.unit else ""
-        match math.isfinite(self.minimum), math.isfinite(self.maximum):
-            case True, True:
-                return f"from {self.minimum:g} to {self.maximum:g}{unit}"
-            case True, False:
-                return f"finite and at least {self.minimum:g}{unit}"
-            case False, True:
-                return f"finite and at most {self.maximum:g}{unit}"
-        return "finite"
-
-    def descriptor(self, *, read_only: bool = False) -> ParameterDescriptor:
-        """Return the descriptor that `ros2 param describe` shows.
-
-        :param read_only: True if the value is fixed once the node runs.
-        """
-        description = self.description if not self.unit else f"{self.description} [{self.unit}]"
-        descriptor = ParameterDescriptor(description=description, read_only=read_only)
-        bounded = math.isfinite(self.minimum) or math.isfinite(self.maximum)
-        if isinstance(self.default, bool) or not bounded:
-            pass
-        elif isinstance(self.default, int):
-            descriptor.integer_range = [
-                IntegerRange(
-                    from_value=int(max(self.minimum, -_LARGEST_INTEGER)),
-                    to_value=int(min(self.maximum, _LARGEST_INTEGER)),
-                )
-            ]
-        elif isinstance(self.default, float) and math.isfinite(self.default):
-            # A range would refuse a default that means "not given"; such are checked by `check`.
-            descriptor.floating_point_range = [
-                FloatingPointRange(
-                    from_value=max(self.minimum, -sys.float_info.max),
-                    to_value=min(self.maximum, sys.float_info.max),
-                )
-            ]
+        """The range in words, such as "a finite number of at least 0 s"."""
         if self.choices:
-            descriptor.additional_constraints = f"one of {', '.join(self.choices)}"
-        elif isinstance(self.default, (int, float)) and not isinstance(self.default, bool):
-            descriptor.additional_constraints = self.range_text()
+            return f"one of {', '.join(filter(None, self.choices))}"
+        if isinstance(self.default, str):
+            return "a text"
+        unit = f" {self.unit}" if self.unit else ""
+        text = "finite numbers" if isinstance(self.default, tuple) else "a finite number"
+        if math.isfinite(self.lower) and math.isfinite(self.upper):
+            text += f" from {self.lower:g} to {self.upper:g}{unit}"
+        elif math.isfinite(self.lower):
+            text += f" of at least {self.lower:g}{unit}"
+        if isinstance(self.default, float) and math.isnan(self.default):
+            text += ", or NaN where it is not given"
+        return text
+
+    def problem(self, value: Any) -> str | None:
+        """Return a sentence on what is wrong with a value, or None if it may be taken."""
+        if self.choices:
+            fine = value in self.choices
+        elif isinstance(self.default, tuple):
+            fine = all(math.isfinite(number) for number in value)
+        elif isinstance(self.default, (str, bool)):
+            fine = True
+        else:
+            # An infinite default says that the parameter may be infinite: a limit that is none.
+            fine = math.isfinite(value) and self.lower <= value <= self.upper
+            fine = fine or value == self.default
+            fine = fine or (math.isnan(value) and math.isnan(self.default))
+        return None if fine else f"{self.name} is {value!r}, expected {self.range_text}"
+
+
+def descriptor_of(entry: Entry, *, read_only: bool = False) -> ParameterDescriptor:
+    """Return the descriptor that `ros2 param describe` shows.
+
+    :param entry: the parameter.
+    :param read_only: True if its value is fixed once the node runs.
+    """
+    unit = f" [{entry.unit}]" if entry.unit else ""
+    descriptor = ParameterDescriptor(
+        description=entry.description + unit,
+        additional_constraints=entry.range_text,
+        read_only=read_only,
+    )
+    number = isinstance(entry.default, (int, float)) and not isinstance(entry.default, bool)
+    # A range would refuse a default that means "not given" or "unlimited"; `problem` knows it.
+    if not number or not math.isfinite(entry.default):
         return descriptor
+    if not math.isfinite(entry.lower) and not math.isfinite(entry.upper):
+        return descriptor
+    if isinstance(entry.default, int):
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=int(max(entry.lower, -_LARGEST_INTEGER)),
+                to_value=int(min(entry.upper, _LARGEST_INTEGER)),
+            )
+        ]
+    else:
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=max(entry.lower, -sys.float_info.max),
+                to_value=min(entry.upper, sys.float_info.max),
+            )
+        ]
+    return descriptor
 
 
-def declare(node: Node, table: Iterable[NodeParameter], *, read_only: bool = False) -> None:
+def declare(node: Node, table: Iterable[Entry], *, read_only: bool = False) -> None:
     """Declare the parameters of a table on a node.
 
     :param node: the node.
@@ -123,35 +154,33 @@ def declare(node: Node, table: Iterable[NodeParameter], *, read_only: bool = Fal
     for entry in table:
         default = Parameter.Type.DOUBLE_ARRAY if entry.default == () else entry.default
         try:
-            node.declare_parameter(entry.name, default, entry.descriptor(read_only=read_only))
+            node.declare_parameter(entry.name, default, descriptor_of(entry, read_only=read_only))
         except InvalidParameterTypeException as error:
             raise ParameterError(_wrong_type(entry, error)) from error
         except InvalidParameterValueException as error:
-            given = node.get_parameter_or(entry.name, None)
-            value = getattr(given, "value", None)
-            found = _overridden(error) if value is None else value
+            found = str(error).rsplit("value: ", maxsplit=1)[-1].split(":")[0]
             raise ParameterError(
-                f"{entry.name} must be {entry.range_text()}, found {found}"
+                f"{entry.name} is {found}, expected {entry.range_text}"
             ) from error
-        entry.check(value_of(node, entry))
+        problem = entry.problem(value_of(node, entry))
+        if problem is not None:
+            raise ParameterError(problem)
 
 
-def value_of(node: Node, entry: NodeParameter) -> Any:
+def value_of(node: Node, entry: Entry) -> Any:
     """Return the present value of a parameter, () for an array that is not given."""
     if entry.default == ():
-        value = node.get_parameter_or(entry.name, None)
-        return () if value is None or value.value is None else tuple(value.value)
+        given = node.get_parameter_or(entry.name, None)
+        return () if given is None or given.value is None else tuple(given.value)
     return node.get_parameter(entry.name).value
 
 
-def values_of(node: Node, table: Iterable[NodeParameter]) -> dict[str, Any]:
+def values_of(node: Node, table: Iterable[Entry]) -> dict[str, Any]:
     """Return the present values of a table's parameters by name."""
     return {entry.name: value_of(node, entry) for entry in table}
 
 
-def merged(
-    node: Node, table: Sequence[NodeParameter], changes: Iterable[Parameter]
-) -> dict[str, Any]:
+def merged(node: Node, table: Sequence[Entry], changes: Iterable[Parameter]) -> dict[str, Any]:
     """Return a table's values as they would be after changes.
 
     :param node: the node.
@@ -163,19 +192,20 @@ def merged(
     by_name = {entry.name: entry for entry in table}
     for change in changes:
         entry = by_name.get(change.name)
-        if entry is not None:
-            entry.check(change.value)
-            values[change.name] = change.value
+        if entry is None:
+            continue
+        problem = entry.problem(change.value)
+        if problem is not None:
+            raise ParameterError(problem)
+        values[change.name] = change.value
     return values
 
 
-def _wrong_type(entry: NodeParameter, error: InvalidParameterTypeException) -> str:
-    wanted = "numbers" if entry.default == () else type(entry.default).__name__
-    hint = ""
-    if isinstance(entry.default, (float, tuple)):
-        hint = "; write numbers with a decimal point, such as 2.0"
-    return f"{entry.name} has the wrong type, expected {wanted}{hint} ({error})"
-
-
-def _overridden(error: InvalidParameterValueException) -> str:
-    return str(error).rsplit("value: ", maxsplit=1)[-1].strip(" .'\"")
+def _wrong_type(entry: Entry, error: InvalidParameterTypeException) -> str:
+    found = str(error).split("' of type '")[0].rsplit("'", maxsplit=1)[-1]
+    if entry.default == ():
+        return f"{entry.name} is {found}, expected numbers with a decimal point, such as [2.0]"
+    if isinstance(entry.default, float):
+        return f"{entry.name} is {found}, expected a number with a decimal point, such as 2.0"
+    kind = {int: "a whole number", bool: "true or false", str: "a text"}[type(entry.default)]
+    return f"{entry.name} is {found}, expected {kind}"

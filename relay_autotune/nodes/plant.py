@@ -20,17 +20,11 @@ from relay_autotune.messages import set_stamp
 from relay_autotune.models import STRUCTURES, TransferFunction
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.nodes.parameters import NodeParameter, declare, values_of
 from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 MODES = ("realtime", "clock", "lockstep")
-
-# In lockstep a measurement that nobody has answered is repeated after this silence [s].
-REPEAT_AFTER = 0.2
-
-# Between the command that starts a lockstep run and sample 1 [s]. The relay takes for a repeat of
-# sample 0 what was sent earlier than half of this after its first command.
-QUIET_AFTER_GO = 0.01
 
 # Simulated time begins here [s]: zero means "no time yet" to ROS.
 CLOCK_START = 1.0

@@ -1,0 +1,165 @@
+"""identifier_node: models and gains from the cycles and records of relay_node."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+
+from relay_autotune.autotune import Analysis, analyse, check_names
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification import DEFAULT_METHOD, METHODS
+from relay_autotune.messages import (
+    fill_gains,
+    fill_transfer_function,
+    record_from_cycles,
+    record_from_message,
+    start_nanoseconds,
+)
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
+from relay_autotune.record import Record
+from relay_autotune.tuning import DEFAULT_RULE, RULES
+from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
+
+PARAMETERS = (
+    NodeParameter(
+        "method",
+        DEFAULT_METHOD,
+        "",
+        "Method whose model is published.",
+        choices=tuple(METHODS),
+    ),
+    NodeParameter(
+        "rule", DEFAULT_RULE, "", "Rule whose gains are published.", choices=tuple(RULES)
+    ),
+)
+
+# Latched cycles that may wait for an identifier that comes late.
+CYCLE_DEPTH = 1000
+
+
+class IdentifierNode(ServedNode):
+    """Fits a model at each cycle, and model and gains at the end of an experiment.
+
+    A message only notes what is to be done. The fit follows once no message waits any more, so
+    that of several cycles that came during a fit only the newest one leads to another.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("identifier_node")
+        declare(self, PARAMETERS)
+        self._cycles: dict[int, Any] = {}
+        self._cycles_of = ""
+        self._ended = ""
+        self._fit_asked_for = False
+        self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
+        self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
+        self.create_subscription(
+            RelayCycle, "relay_cycle", self._on_cycle, quality.cycles(CYCLE_DEPTH)
+        )
+        self.create_subscription(
+            RelayExperiment, "relay_experiment", self._on_experiment, quality.RESULT
+        )
+        self.add_on_set_parameters_callback(self._on_set)
+
+    def _on_cycle(self, message: Any) -> None:
+        if message.experiment_id == self._ended:
+            return
+        if message.experiment_id != self._cycles_of:
+            self._cycles_of = message.experiment_id
+            self._cycles.clear()
+        self._cycles[int(message.index)] = message
+        if not self._fit_asked_for:
+            self._fit_asked_for = True
+            self.defer_until_idle(self._fit_cycles)
+
+    def _fit_cycles(self) -> None:
+        self._fit_asked_for = False
+        if not self._cycles:
+            return
+        try:
+            record = record_from_cycles(self._cycles.values())
+        except RelayAutotuneError as error:
+            self.get_logger().warning(f"cycles of {self._cycles_of} cannot be used: {error}")
+            return
+        analysis = self._analyse(record, final=False)
+        if analysis is not None and analysis.model is not None:
+            self._publish_model(analysis, final=False)
+
+    def _on_experiment(self, message: Any) -> None:
+        self._ended = message.experiment_id
+        self._cycles.clear()
+        try:
+            record = record_from_message(message)
+        except RelayAutotuneError as error:
+            self.get_logger().error(f"experiment {self._ended} cannot be used: {error}")
+            return
+        analysis = self._analyse(record, final=True)
+        if analysis is None:
+            return
+        if analysis.model is not None:
+            self._publish_model(analysis, final=True)
+        gains = analysis.best_gains
+        if gains is None:
+            self.get_logger().warning(f"experiment {self._ended}: {analysis.reason}")
+            return
+        message = PidGains()
+        fill_gains(
+            message, gains, experiment_id=record.experiment_id, stamp_ns=_last_stamp(record)
+        )
+        self._gains.publish(message)
+        self.get_logger().info(
+            f"experiment {self._ended}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
+            f"ti {gains.ti:.6g} s, td {gains.td:.6g} s"
+        )
+
+    def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
+        values = values_of(self, PARAMETERS)
+        try:
+            return analyse(record, method=values["method"], rule=values["rule"], final=final)
+        except Exception as error:  # noqa: BLE001  one bad record must not end the node
+            self.get_logger().error(
+                f"experiment {record.experiment_id} could not be analysed: "
+                f"{type(error).__name__}: {error}"
+            )
+            return None
+
+    def _publish_model(self, analysis: Analysis, *, final: bool) -> None:
+        identification = analysis.model
+        assert identification is not None
+        message = TransferFunction()
+        fill_transfer_function(
+            message,
+            identification,
+            experiment_id=analysis.record.experiment_id,
+            final=final,
+            stamp_ns=_last_stamp(analysis.record),
+        )
+        self._models.publish(message)
+        if final:
+            self.get_logger().info(
+                f"experiment {self._ended}: {identification.structure} by "
+                f"{identification.method}, gain {identification.model.gain:.6g}, "
+                f"dead time {identification.model.dead_time:.6g} s"
+            )
+
+    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            values = merged(self, PARAMETERS, changes)
+            check_names(values["method"], values["rule"])
+        except RelayAutotuneError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def _last_stamp(record: Record) -> int:
+    return start_nanoseconds(record.start) + math.floor(float(record.time[-1]) * 1e9 + 0.5)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run identifier_node."""
+    return run(IdentifierNode, "identifier_node", args)

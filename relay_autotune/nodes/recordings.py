@@ -1,0 +1,156 @@
+"""The bags of experiments: opened at the start, closed once model and gains are in them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.timer import Timer
+
+from relay_autotune.bag.writer import Topic
+from relay_autotune.nodes.quality import for_bag
+from relay_autotune.nodes.recorder import Recorder
+
+MESSAGES = {
+    "relay_cycle": "relay_autotune_msgs/msg/RelayCycle",
+    "relay_experiment": "relay_autotune_msgs/msg/RelayExperiment",
+    "transfer_function": "relay_autotune_msgs/msg/TransferFunction",
+    "pi_gains": "relay_autotune_msgs/msg/PidGains",
+}
+RESULTS = ("transfer_function", "pi_gains")
+
+# How long a start waits for the recording's folder [s].
+OPEN_WITHIN = 0.3
+
+
+class _Recording:
+    def __init__(self, recorder: Recorder) -> None:
+        self.recorder = recorder
+        self.missing = list(RESULTS)
+        self.waiting = False
+        self.timer: Timer | None = None
+
+
+class Recordings:
+    """The recordings of a node's experiments.
+
+    :param node: the node, whose timers and log are used.
+    :param ends: the publisher or subscription of each topic, by the topic's unresolved name:
+        ``measurement``, ``command`` and those of ``MESSAGES``.
+    """
+
+    def __init__(self, node: Node, ends: dict[str, Any]) -> None:
+        self._node = node
+        self._names = {name: end.topic_name for name, end in ends.items()}
+        self._topics = [
+            Topic(end.topic_name, MESSAGES.get(name, "std_msgs/msg/Float64"), _offered(end))
+            for name, end in ends.items()
+        ]
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._open: dict[str, _Recording] = {}
+        self._last: Recorder | None = None
+        self._reported = ""
+
+    def begin(self, experiment_id: str, directory: str) -> tuple[Callable[[Any], None], str]:
+        """Open the recording of an experiment.
+
+        :param experiment_id: its id, which names the folder.
+        :param directory: where the folder is made.
+        :return: what takes each sample, and a sentence on where it is recorded, or why not.
+        """
+        recorder = Recorder(
+            Path(directory).expanduser() / experiment_id,
+            self._topics,
+            start_ns=time.time_ns(),
+            facts={name: self._names[name] for name in ("measurement", "command")}
+            | {"experiment_id": experiment_id},
+        )
+        recorder.wait_until_open(OPEN_WITHIN)
+        self._open[experiment_id] = _Recording(recorder)
+        self._last = recorder
+        said = self.problem() or f"recorded in {recorder.path}"
+        return recorder.sample, said
+
+    def problem(self) -> str:
+        """Say what is wrong with the newest recording, "" if nothing; logged when it is new."""
+        problem = self._last.failure if self._last is not None else None
+        if problem and problem != self._reported:
+            self._reported = problem
+            self._node.get_logger().error(f"the tune goes on, but {problem}")
+        return problem or ""
+
+    def message(self, experiment_id: str, name: str, time_ns: int, message: Any) -> None:
+        """Record a message of an experiment; one of none that is open is left alone.
+
+        :param experiment_id: the id of the experiment.
+        :param name: unresolved name of the topic.
+        :param time_ns: when it was sent or came [ns since the epoch].
+        :param message: the message, not to be changed afterwards.
+        """
+        recording = self._open.get(experiment_id)
+        if recording is None:
+            return
+        recording.recorder.message(self._names[name], time_ns, message)
+        if name in recording.missing and message.final:
+            recording.missing.remove(name)
+            if recording.waiting and not recording.missing:
+                self.close(experiment_id, "with model and gains")
+
+    def close_with_results(self, experiment_id: str, timeout: float) -> None:
+        """Close a recording once model and gains are in it, or after a time without them.
+
+        :param experiment_id: the id of the experiment.
+        :param timeout: how long to wait [s].
+        """
+        recording = self._open.get(experiment_id)
+        if recording is None:
+            return
+        recording.waiting = True
+        if not recording.missing:
+            self.close(experiment_id, "with model and gains")
+            return
+
+        def late() -> None:
+            missing = " and ".join(recording.missing)
+            self.close(experiment_id, f"without {missing}, not come within {timeout:g} s")
+
+        recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=self._steady)
+
+    def close(self, experiment_id: str, why: str) -> None:
+        """Close a recording; its thread finishes it.
+
+        :param experiment_id: the id of the experiment.
+        :param why: end of the sentence "the recording is closed ...".
+        """
+        recording = self._open.pop(experiment_id, None)
+        if recording is None:
+            return
+        if recording.timer is not None:
+            self._node.destroy_timer(recording.timer)
+        recording.recorder.close()
+        if recording.recorder.failure is None:
+            log = self._node.get_logger()
+            say = log.warning if recording.waiting and recording.missing else log.info
+            say(f"the recording {recording.recorder.path} is closed {why}")
+
+    def close_all(self, why: str, timeout: float) -> None:
+        """Close all recordings and wait for the newest to be finished.
+
+        :param why: end of the sentence "the recording is closed ...".
+        :param timeout: how long to wait at most [s].
+        """
+        for experiment_id in list(self._open):
+            self.close(experiment_id, why)
+        if self._last is not None and not self._last.join(timeout):
+            self._node.get_logger().error(
+                f"the recording {self._last.path} could not be finished within {timeout:g} s"
+            )
+
+
+def _offered(end: Any) -> Any:
+    return for_bag(end.qos_profile)
