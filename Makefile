@@ -10,6 +10,9 @@ SOURCES = relay_autotune test tools setup.py
 # the tests of the numeric core, which need no ROS
 CORE_TESTS = test/core
 
+# neither the demo nor a test shall meet the nodes of another machine
+export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
+
 .PHONY: setup demo test lint clean
 
 setup:
@@ -20,9 +23,7 @@ demo: setup
 
 test: lint
 	@$(PYTHON) tools/prepare.py oldest
-	@if [ -d .venv-oldest ]; then \
-	    .venv-oldest/bin/python -m pytest -q $(CORE_TESTS); \
-	fi
+	@if [ -d .venv-oldest ]; then .venv-oldest/bin/python -m pytest -q $(CORE_TESTS); fi
 	@$(ENTER) && python3 -m pytest test
 
 lint: setup
@@ -31,5 +32,5 @@ lint: setup
 	@$(ENTER) && mypy
 
 clean:
-	rm -rf .venv .venv-oldest build install log demo_output .hypothesis .*_cache *.egg-info
+	rm -rf .venv .venv-* build install log demo_output .hypothesis .*_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

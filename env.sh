@@ -24,6 +24,11 @@ if [ -d "$relay_autotune_root/.venv/share/rclpy" ]; then
     case ":$AMENT_PREFIX_PATH:" in
     *":$relay_autotune_root/.venv:"*) ;;
     *)
+        if [ -n "$ROS_DISTRO" ] && [ -n "$AMENT_PREFIX_PATH" ]; then
+            echo "env.sh: a ROS is sourced, and another one was set up: run \`make setup\`" >&2
+            unset relay_autotune_root
+            return 1
+        fi
         export AMENT_PREFIX_PATH="$relay_autotune_root/.venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
         export CMAKE_PREFIX_PATH="$relay_autotune_root/.venv${CMAKE_PREFIX_PATH:+:$CMAKE_PREFIX_PATH}"
         ;;

@@ -27,8 +27,12 @@ VENV = ROOT / ".venv"
 VENV_OLDEST = ROOT / ".venv-oldest"
 INSTALL = ROOT / "install"
 REQUIREMENTS = ROOT / "requirements"
+# what each package is built from; the Python files of the second are linked, not copied
 PACKAGES = {
-    "relay_autotune_msgs": ["relay_autotune_msgs"],
+    "relay_autotune_msgs": [
+        f"relay_autotune_msgs/{name}"
+        for name in ("package.xml", "CMakeLists.txt", "msg", "srv", "action")
+    ],
     "relay_autotune": ["package.xml", "setup.py", "setup.cfg", "resource"],
 }
 OWN_VARIABLES = ("PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")
@@ -88,6 +92,10 @@ def prepare_main() -> None:
 
 def prepare_oldest() -> None:
     """Make the environment that holds the oldest numeric libraries, and no ROS."""
+    if sys.version_info[:2] > (3, 12):
+        shutil.rmtree(VENV_OLDEST, ignore_errors=True)
+        say(f"numpy 1.26 is older than Python {platform.python_version()}: its tests are skipped")
+        return
     stamp = digest([REQUIREMENTS / "noble.txt", REQUIREMENTS / "tools.txt"], base_python())
     if not is_current(VENV_OLDEST, stamp):
         pins = (REQUIREMENTS / "tools.txt").read_text()
@@ -120,8 +128,8 @@ def check_build_tools() -> None:
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     header = Path(sysconfig.get_path("include"), "Python.h")
     tools = {
-        "a C++ compiler": (shutil.which(os.environ.get("CXX", "c++")), "g++"),
-        "a C compiler": (shutil.which(os.environ.get("CC", "cc")), "gcc"),
+        "a C++ compiler": (shutil.which(os.environ.get("CXX", "c++").split()[0]), "g++"),
+        "a C compiler": (shutil.which(os.environ.get("CC", "cc").split()[0]), "gcc"),
         "CMake": (shutil.which("cmake"), "cmake"),
         "make": (shutil.which("make"), "make"),
         "Python's header files": (header.is_file(), f"python{version}-dev"),
@@ -163,11 +171,13 @@ def repair_exports() -> None:
 
     :raises SystemExit: if a file still names the machine that built the wheels.
     """
-    code = "import numpy, sysconfig; print(sysconfig.get_path('include'), numpy.get_include())"
+    code = (
+        "import numpy, sysconfig\n"
+        "print(sysconfig.get_path('include'), numpy.get_include(), sep='\\n')"
+    )
     command = [str(VENV / "bin/python"), "-c", code]
-    include, numpy_include = subprocess.check_output(
-        command, env=clean_environment(), text=True
-    ).split()
+    answer = subprocess.check_output(command, env=clean_environment(), text=True)
+    include, numpy_include = answer.splitlines()
     for file in VENV.glob("share/*/cmake/*.cmake"):
         text = file.read_text()
         fixed = re.sub(r"/opt/python/[^;\"]*/numpy/_core/include", numpy_include, text)
@@ -255,4 +265,7 @@ def fail(text: str) -> NoReturn:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        fail("interrupted; the next `make setup` begins again where it must")
