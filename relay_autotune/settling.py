@@ -1,0 +1,130 @@
+"""Judge whether the measurement is at rest, and how noisy it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from relay_autotune.record import FloatArray
+
+# A constant is known from few samples; a noise band is known to 10 % from 50, since the relative
+# standard error of a standard deviation is 1/sqrt(2 n).
+CONSTANT_SAMPLES = 20
+NOISE_SAMPLES = 50
+
+# A transient of which no more than this is left is over, where there is no noise to measure by.
+_REMAINDER = 0.01
+
+# Rounding of a constant: differences below this many units in the last place are no signal.
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True)
+class RestState:
+    """What the measurement did while the command was at the baseline.
+
+    :param mean: mean measurement over the window [y].
+    :param slope: slope of the straight line through the window [y/s].
+    :param noise_std: standard deviation about that line [y]; 0 for a constant.
+    :param span: duration of the window [s].
+    :param samples: number of samples in the window.
+    :param range_seen: largest minus smallest measurement since the start of the settling [y].
+    """
+
+    mean: float
+    slope: float
+    noise_std: float
+    span: float
+    samples: int
+    range_seen: float
+
+    def __str__(self) -> str:
+        return (
+            f"its slope {self.slope:.3g} y/s over {self.span:.3g} s against a noise standard "
+            f"deviation of {self.noise_std:.3g} y"
+        )
+
+    @property
+    def drift(self) -> float:
+        """How far the straight line moves over the window [y]."""
+        return abs(self.slope) * self.span
+
+    @property
+    def is_steady(self) -> bool:
+        """True if the drift over the window is none, or none that matters.
+
+        That is: within three standard errors of what noise alone does to the line, or within one
+        standard deviation of the noise (a third of the hysteresis), or within 1 % of all that
+        was seen since the settling began (the end of a transient without noise).
+        """
+        if self.span <= 0.0:
+            return False
+        by_chance = 3.0 * self.noise_std * math.sqrt(12.0 / self.samples)
+        return self.drift <= max(by_chance, self.noise_std, _REMAINDER * self.range_seen)
+
+
+NOT_SETTLED = RestState(math.nan, math.nan, math.nan, 0.0, 0, 0.0)
+"""The state of rest before it is known."""
+
+
+def rest_state(time: FloatArray, measurement: FloatArray, window: int) -> RestState:
+    """Fit a straight line to the last samples.
+
+    :param time: instants of the samples since the settling began [s], shape (n,).
+    :param measurement: the samples [y], shape (n,), n >= 1.
+    :param window: number of samples at the end to which the line is fitted, from 1 to n.
+    """
+    t, y = time[-window:], measurement[-window:]
+    range_seen = float(np.max(measurement) - np.min(measurement))
+    span = float(t[-1] - t[0])
+    rounding = _ROUNDING * float(np.max(np.abs(y)))
+    if float(np.max(y) - np.min(y)) <= rounding:
+        # The mean of equal numbers may differ from them in the last place, which would put the
+        # set-point beside a constant measurement and not on it.
+        return RestState(float(y[-1]), 0.0, 0.0, span, window, range_seen)
+    mean = float(np.mean(y))
+    if span <= 0.0 or window < 3:
+        return RestState(mean, 0.0, float(np.std(y)), span, window, range_seen)
+    # Scaled to the window, so that the squares neither overflow nor vanish.
+    x = (t - t[0]) / span
+    x = x - np.mean(x)
+    rise = float(np.sum(x * (y - mean)) / np.sum(x * x))
+    residual = y - mean - rise * x
+    noise = math.sqrt(float(np.sum(residual * residual)) / (window - 2))
+    if noise <= rounding:
+        noise = 0.0
+    return RestState(mean, rise / span, noise, span, window, range_seen)
+
+
+class Settling:
+    """Decide when to look at the measurement, so that each look costs little in the long run.
+
+    The window is the later half of all samples, or the last :data:`NOISE_SAMPLES` where that is
+    more: a transient at the start leaves it in time. It is looked at again when there are a
+    quarter more samples than at the last look.
+    """
+
+    def __init__(self) -> None:
+        self._next_look = CONSTANT_SAMPLES
+
+    def is_due(self, samples: int) -> bool:
+        """Return True if it is worth looking now.
+
+        :param samples: number of samples since the settling began.
+        """
+        return samples >= self._next_look
+
+    def look(self, time: FloatArray, measurement: FloatArray) -> tuple[RestState, bool]:
+        """Return the state of rest, and whether it is steady and the noise band known.
+
+        :param time: instants of all samples since the settling began [s], shape (n,).
+        :param measurement: the samples [y], shape (n,).
+        """
+        samples = len(time)
+        self._next_look = samples + max(1, samples // 4)
+        window = min(samples, max(NOISE_SAMPLES, (samples + 1) // 2))
+        rest = rest_state(time, measurement, window)
+        known = rest.noise_std == 0.0 or samples >= NOISE_SAMPLES
+        return rest, known and rest.is_steady
