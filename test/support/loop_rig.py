@@ -1,0 +1,214 @@
+"""A loop of installed executables as processes over DDS, and a node that looks on."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_domain import mapped_segments, remove_leftovers
+
+from relay_autotune_msgs.srv import StartTune
+
+LATCHED = QoSProfile(
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+RELIABLE = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
+
+# A machine that is busy with other things needs patience; a passing test does not wait for it.
+PATIENCE = 30.0
+
+
+class Process:
+    """One executable, its log, and what it leaves behind."""
+
+    def __init__(self, name: str, command: list[str], environment: dict[str, str], log: Path):
+        self.name = name
+        self.log_path = log
+        self.segments: set[Path] = set()
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(
+                command, env=environment, stdout=file, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def log(self) -> str:
+        return self.log_path.read_text(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def signal(self, number: int) -> None:
+        if number == signal.SIGKILL:
+            self.segments |= mapped_segments(self._process.pid)
+        self._process.send_signal(number)
+
+    def wait(self, timeout: float = PATIENCE) -> int:
+        return self._process.wait(timeout)
+
+    def end(self) -> None:
+        if self.running:
+            self.signal(signal.SIGTERM)
+        try:
+            self.wait(6.0)
+        except subprocess.TimeoutExpired:
+            self.signal(signal.SIGKILL)
+            self.wait()
+
+
+class Rig:
+    """Starts executables in a domain of its own, and ends all that it started."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self.domain = domain
+        self.folder = folder
+        self.records = folder / "records"
+        self.processes: list[Process] = []
+        self.environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(folder / "ros_log"),
+            "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
+        }
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node("onlooker", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    # Processes.
+
+    def start(self, executable: str, *arguments: str, **parameters: Any) -> Process:
+        """Start an installed executable with parameters and further ROS arguments."""
+        path = shutil.which(executable)
+        if path is None:
+            raise RuntimeError(f"{executable} is not on the PATH; source env.sh")
+        return self._launch(executable, [path], arguments, parameters)
+
+    def start_python(self, name: str, code: str, **parameters: Any) -> Process:
+        """Start a Python text in the place of an executable."""
+        return self._launch(name, [sys.executable, "-c", code], (), parameters)
+
+    def _launch(
+        self, name: str, command: list[str], arguments: tuple[str, ...], parameters: dict[str, Any]
+    ) -> Process:
+        ros = ["--ros-args", *arguments]
+        for key, value in parameters.items():
+            ros += ["-p", f"{key}:={_yaml(value)}"]
+        log = self.folder / f"{len(self.processes)}_{name}.log"
+        process = Process(name, [*command, *ros], self.environment, log)
+        self.processes.append(process)
+        return process
+
+    def plant(self, **parameters: Any) -> Process:
+        return self.start("plant_node", **parameters)
+
+    def relay(self, *arguments: str, **parameters: Any) -> Process:
+        parameters.setdefault("record_directory", str(self.records))
+        return self.start("relay_node", *arguments, **parameters)
+
+    def identifier(self, **parameters: Any) -> Process:
+        return self.start("identifier_node", **parameters)
+
+    # Looking on.
+
+    def listen(self, topic: str, kind: Any, qos: QoSProfile = LATCHED) -> list[Any]:
+        """Return a list into which the messages of a topic come."""
+        messages: list[Any] = []
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def until(self, condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> Any:
+        """Spin until a condition holds and return its value; fail at the deadline."""
+        deadline = time.monotonic() + timeout
+        while True:
+            value = condition()
+            if value:
+                return value
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{what}: not within {timeout:g} s\n{self.logs()}")
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """Call a service and return its answer."""
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready, f"service {name}")
+        future = client.call_async(request)
+        self.until(future.done, f"answer of {name}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def ask_for_tune(self, **request: Any) -> Any:
+        return self.call(StartTune, "relay_node/start_tune", StartTune.Request(**request))
+
+    def tune(self, **request: Any) -> Any:
+        """Start a tune as soon as the processes have found each other; return the answer."""
+
+        def accepted() -> Any:
+            answer = self.ask_for_tune(**request)
+            if answer.accepted:
+                return answer
+            # Nothing else may keep a tune from starting here.
+            assert answer.reason.startswith(("no measurement", "no command", "use_sim_time")), (
+                answer.reason
+            )
+            return None
+
+        return self.until(accepted, "start of a tune")
+
+    def run_for(self, seconds: float) -> None:
+        """Take messages for a while, where the absence of something is to be seen."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def bag(self, answer: Any) -> Path:
+        return self.records / answer.experiment_id
+
+    def logs(self) -> str:
+        return "\n".join(f"--- {p.log_path.name}\n{p.log[-4000:]}" for p in self.processes)
+
+    def close(self) -> None:
+        """End every process, then the onlooker, and remove what killed ones left behind."""
+        for process in self.processes:
+            if process.running:
+                process.signal(signal.SIGTERM)
+        for process in self.processes:
+            process.end()
+        self.executor.shutdown(timeout_sec=0.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        killed = {path for process in self.processes for path in process.segments}
+        if killed:
+            remove_leftovers(self.domain, killed)
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        if math.isnan(value):
+            return ".nan"
+        if math.isinf(value):
+            return ".inf" if value > 0 else "-.inf"
+        text = repr(value)
+        return text if "." in text else text.replace("e", ".0e")
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_yaml(v) for v in value)}]"
+    return str(value)

@@ -1,0 +1,30 @@
+"""A rig for each test, in a ROS domain that nobody else uses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from loop_rig import Rig
+from ros_domain import free_domain
+
+
+@pytest.fixture
+def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with free_domain() as domain:
+        made = Rig(domain, tmp_path)
+        request.node.rig = made
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]):
+    report = yield
+    made = getattr(item, "rig", None)
+    if report.failed and made is not None:
+        report.sections.append(("logs of the processes", made.logs()))
+    return report
