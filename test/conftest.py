@@ -1,0 +1,6 @@
+"""Make property tests repeatable, and deaf to how busy the machine is."""
+
+from hypothesis import settings
+
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
