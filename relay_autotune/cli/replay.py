@@ -90,9 +90,10 @@ def _replay(bag: str, selection: Selection, options: argparse.Namespace) -> int:
     try:
         recording = read_experiments(bag, selection)
     except RelayAutotuneError as error:
-        say(PROGRAM, str(error))
+        text = str(error) if bag in str(error) else f"{bag}: {error}"
+        say(PROGRAM, text)
         if options.json:
-            _print_document(bag, error=str(error))
+            _print_document(bag, error=text)
         return USAGE if isinstance(error, SelectionError) else NOTHING_FOUND
     for note in recording.notes:
         say(PROGRAM, f"{bag}: {note}")

@@ -1,0 +1,419 @@
+"""The command `replay` as its users meet it."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from made_bags import (
+    REPOSITORY,
+    START,
+    definition,
+    experiment_message,
+    serialize,
+    write_pair,
+    write_samples,
+)
+
+from relay_autotune.autotune import analyse
+from relay_autotune.bag.decode import CYCLE, EXPERIMENT
+from relay_autotune.bag.definitions import Definition
+from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
+from relay_autotune.cli import csv_to_bag, replay
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.sampled_relay import simulate_sampled_relay
+
+MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
+
+
+def relay_test(*, outcome=Outcome.COMPLETED, samples=1400, name="run-1") -> Record:
+    """Record a biased relay on 1.65 e^(-10 s)/(1 + 20 s)."""
+    levels = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
+    noise = np.random.default_rng(5).normal(0.0, 0.02, samples)
+    found = simulate_sampled_relay(MODEL, levels, period=0.2, noise=noise)
+    return Record(
+        time=found.time,
+        measurement=found.measurement,
+        command=found.command,
+        settings=levels,
+        noise_std=0.02,
+        cycle_start=found.cycle_start,
+        outcome=outcome,
+        reason="" if outcome == Outcome.COMPLETED else "the operator pressed the button",
+        experiment_id=name,
+        start=START / 1e9,
+    )
+
+
+def write_bag(path, folder, *records):
+    text = definition(EXPERIMENT, folder).text
+    topics = [
+        Topic("/measurement"),
+        Topic("/command"),
+        Topic("/relay_experiment", EXPERIMENT, definition=Definition(text)),
+    ]
+    with BagWriter(path, topics, start_ns=START) as bag:
+        for record in records:
+            write_samples(bag, record)
+            data = serialize(EXPERIMENT, text, experiment_message(record))
+            bag.write("/relay_experiment", START, START, data)
+    return path
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    status = replay.main([str(a) for a in arguments])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def documents(text):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
+
+
+def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, capsys):
+    record = relay_test()
+    write_bag(tmp_path / "bag", tmp_path, record)
+    status, out, err = run(capsys, "--json", tmp_path / "bag")
+    assert (status, err) == (0, "")
+    (found,) = documents(out)
+    assert found["bag"] == str(tmp_path / "bag")
+    (experiment,) = found["experiments"]
+    expected = analyse(record)
+    model, gains = expected.model, expected.best_gains
+    selected = experiment["models"][experiment["selected"]]
+    assert selected["method"] == "waveform"
+    assert selected["structure"] == "fopdt"
+    assert selected["gain"] == model.model.gain
+    assert selected["time_constants"] == [float(t.real) for t in model.model.time_constants]
+    assert selected["dead_time"] == model.model.dead_time
+    assert selected["numerator"] == list(model.model.numerator)
+    assert selected["denominator"] == list(model.model.denominator)
+    assert list(selected["std"].values()) == [float(s) for s in model.std]
+    assert selected["ci95"]["gain"] == [model.ci95_low[0], model.ci95_high[0]]
+    assert selected["ultimate_gain"] == model.ultimate_gain
+    assert selected["ultimate_frequency"] == model.ultimate_frequency
+    assert set(selected["fit"]) == {
+        "residual_rms",
+        "noise_std",
+        "fit",
+        "whiteness_p",
+        "prediction",
+    }
+    best = experiment["gains"][experiment["recommended"]]
+    for name in ("kc", "ti", "td", "tf", "b", "p", "i", "d", "ms", "mt", "iae_load"):
+        assert best[name] == getattr(gains, name)
+    for name in ("gain_margin", "phase_margin", "delay_margin"):
+        assert best[name] == getattr(gains, name)
+    assert experiment["outcome"] == "completed"
+    assert experiment["start"] == record.start
+    assert experiment["duration"] == record.duration
+    cycle = experiment["limit_cycle"]
+    assert cycle["converged"] is True
+    assert cycle["period"] == pytest.approx(cycle["period_high"] + cycle["period_low"])
+    assert cycle["cycles"] >= 3
+
+
+def test_the_process_is_found(tmp_path, capsys):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    _, out, _ = run(capsys, "--json", tmp_path / "bag")
+    model = documents(out)[0]["experiments"][0]["models"][0]
+    assert model["gain"] == pytest.approx(1.65, rel=0.02)
+    assert model["time_constants"][0] == pytest.approx(20.0, rel=0.03)
+    assert model["dead_time"] == pytest.approx(10.0, rel=0.02)
+
+
+def test_the_table_says_what_a_person_needs(tmp_path, capsys):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    status, out, err = run(capsys, tmp_path / "bag")
+    assert (status, err) == (0, "")
+    for word in (
+        "completed  (run-1)",
+        "1400 samples",
+        "limit cycle",
+        "converged",
+        "process ",
+        "time constant",
+        "95 %:",
+        "ultimate gain",
+        "thyagarajan",
+        "ISA form",
+        "parallel form",
+        "Ms ",
+        "gain margin",
+    ):
+        assert word in out, word
+    assert max(map(len, out.splitlines())) < 110
+
+
+def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
+    write_bag(tmp_path / "bag", tmp_path, relay_test(name="a"), relay_test(name="b"))
+    _, out, _ = run(capsys, "--json", tmp_path / "bag")
+    (found,) = documents(out)
+    assert [e["experiment_id"] for e in found["experiments"]] == ["a", "b"]
+    _, out, _ = run(capsys, tmp_path / "bag")
+    assert "experiment 1 of 2" in out
+    assert "experiment 2 of 2" in out
+
+
+@pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
+def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, capsys, outcome):
+    write_bag(tmp_path / "bag", tmp_path, relay_test(outcome=outcome))
+    status, out, _ = run(capsys, "--json", tmp_path / "bag")
+    (experiment,) = documents(out)[0]["experiments"]
+    assert status == 0
+    assert experiment["models"]
+    assert experiment["gains"] == []
+    assert experiment["recommended"] is None
+    assert experiment["outcome"] == outcome.name.lower()
+    assert experiment["reason"] == "the operator pressed the button"
+    _, out, _ = run(capsys, tmp_path / "bag")
+    assert "the operator pressed the button" in out
+    assert "ISA form" not in out
+
+
+def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
+    record = relay_test()
+    text = definition(CYCLE, tmp_path).text
+    topics = [
+        Topic("/measurement"),
+        Topic("/command"),
+        Topic("/relay_cycle", CYCLE, definition=Definition(text)),
+    ]
+    facts = {"experiment_id": "run-1", "measurement": "/measurement", "command": "/command"}
+    bag = BagWriter(tmp_path / "bag", topics, start_ns=START, custom=facts)
+    write_samples(bag, record)
+    bag.flush()
+    status, out, err = run(capsys, "--json", tmp_path / "bag")
+    (experiment,) = documents(out)[0]["experiments"]
+    assert status == 0
+    assert "unfinished recording" in err
+    assert experiment["outcome"] == "aborted"
+    assert experiment["reason"].startswith("the recording ends without the experiment's end")
+    assert experiment["gains"] == []
+    assert experiment["models"][0]["gain"] == pytest.approx(1.65, rel=0.03)
+
+
+def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
+    record = relay_test()
+    write_pair(
+        tmp_path / "bag",
+        list(zip(record.time, record.measurement, strict=True)),
+        list(zip(record.time, record.command, strict=True)),
+        ("/tank/level", "/tank/valve"),
+    )
+    status, out, err = run(capsys, "--json", tmp_path / "bag")
+    (experiment,) = documents(out)[0]["experiments"]
+    assert status == 0
+    assert "using --measurement /tank/level --command /tank/valve" in err
+    assert experiment["outcome"] == "unknown"
+    assert experiment["models"][0]["gain"] == pytest.approx(1.65, rel=0.03)
+    assert experiment["gains"]
+
+
+def test_other_methods_and_rules(tmp_path, capsys):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    _, out, _ = run(capsys, "--json", "--method", "wang_biased", "--rule", "imc", tmp_path / "bag")
+    (experiment,) = documents(out)[0]["experiments"]
+    assert experiment["models"][experiment["selected"]]["method"] == "wang_biased"
+    assert experiment["gains"][experiment["recommended"]]["rule"] == "imc"
+
+
+def test_one_bad_bag_does_not_stop_the_others(tmp_path, capsys):
+    good = write_bag(tmp_path / "good", tmp_path, relay_test())
+    status, out, err = run(capsys, "--json", tmp_path / "none", good)
+    bad, fine = documents(out)
+    assert status == 1
+    assert bad["experiments"] == []
+    assert "does not exist" in bad["error"]
+    assert fine["experiments"][0]["models"]
+    assert err.count("\n") == 1
+
+
+def step_csv(path, count=400):
+    rng = np.random.default_rng(1)
+    t = np.arange(count) * 0.5
+    y = 1.65 * np.where(t > 30.0, 1.0 - np.exp(-(t - 30.0) / 20.0), 0.0)
+    u = np.where(t >= 20.0, 1.0, 0.0)
+    rows = zip(t, y + rng.normal(0.0, 0.005, count), u, t, strict=True)
+    text = "Time (s),Level [m],Valve (%),Extra\n" + "".join(
+        ",".join(map(repr, map(float, row))) + "\n" for row in rows
+    )
+    path.write_text(text)
+    return path
+
+
+def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
+    path = step_csv(tmp_path / "step.csv")
+    columns = ("--time", "Time (s)", "--measurement", "Level [m]", "--command", "Valve (%)")
+    status, from_csv, _ = run(capsys, "--json", path, *columns)
+    assert status == 0
+    assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns]) == 0
+    assert "400 messages on each of /level and /valve" in capsys.readouterr().err
+    topics = ("--measurement", "/level", "--command", "/valve")
+    status, from_bag, _ = run(capsys, "--json", tmp_path / "bag", *topics)
+    assert status == 0
+    (a,), (b,) = documents(from_csv), documents(from_bag)
+    assert a["experiments"] == b["experiments"]
+    model = a["experiments"][0]["models"][0]
+    assert model["gain"] == pytest.approx(1.65, rel=0.02)
+    assert model["dead_time"] == pytest.approx(10.0, abs=0.3)
+
+
+def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):
+    path = step_csv(tmp_path / "step.csv")
+    columns = ("--measurement", "Level [m]", "--command", "Valve (%)")
+    assert csv_to_bag.main([str(path), str(tmp_path / "bag")]) == 2
+    assert "name two of them" in capsys.readouterr().err
+    bad = ("--measurement-topic", "no topic")
+    assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, *bad]) == 2
+    assert "'no topic' is no topic name" in capsys.readouterr().err
+    assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, "--epoch", "-9"]) == 1
+    assert "no time before 1970" in capsys.readouterr().err
+    assert csv_to_bag.main([str(path), str(tmp_path), *columns]) == 1
+    assert "exists already, not overwriting" in capsys.readouterr().err
+
+
+BAD_FILES = {
+    "empty.mcap": b"",
+    "text.mcap": b"this is no recording at all",
+    "short.mcap": b"\x89MCAP0\r\n\x01",
+    "empty.csv": b"",
+    "constant.csv": b"t,y,u\n0,1,0\n1,1,1\n2,1,0\n",
+    "still.csv": b"t,y,u\n0,1,4\n1,2,4\n2,1,4\n",
+    "nan.csv": b"t,y,u\n0,1,0\n1,nan,1\n2,1,0\n",
+    "short.csv": b"t,y,u\n0,1,0\n1,2,1\n",
+}
+
+
+@pytest.mark.parametrize("name", [*BAD_FILES, "missing", "missing.csv", "folder"])
+def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
+    path = tmp_path / name
+    if name in BAD_FILES:
+        path.write_bytes(BAD_FILES[name])
+    if name == "folder":
+        path.mkdir()
+    status, _, err = run(capsys, path)
+    assert status == 1
+    assert err.startswith("replay: ")
+    assert str(path) in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--measurement", "/x", "--command", "/command"], "no topic '/x' for the measurement"),
+        (["--command", "/nothing"], "no topic '/nothing' for the command"),
+        (["--method", "guess"], "unknown method 'guess'; known: waveform"),
+        (["--rule", "thumb"], "unknown rule 'thumb'; known: thyagarajan"),
+        (["--start", "5", "--end", "5"], "--start 5 is not before --end 5"),
+        (["--start", "1e9"], "no sample lies between"),
+        (["--time", "t"], "--time names a column of a CSV file"),
+    ],
+)
+def test_choices_that_do_not_fit_end_with_status_2(tmp_path, capsys, options, sentence):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    status, out, err = run(capsys, tmp_path / "bag", *options)
+    assert (status, out) == (2, "")
+    assert sentence in err
+    assert err.count("\n") == 1
+
+
+def test_several_pairs_are_listed_with_status_2(tmp_path, capsys):
+    names = ("/level", "/valve", "/pump")
+    with BagWriter(tmp_path / "bag", [Topic(n) for n in names], start_ns=START) as bag:
+        for k in range(50):
+            for name, value in zip(names, (k % 23, k // 10 % 2, k // 7 % 2), strict=True):
+                bag.write(name, START + k, START + k, encode_float64(float(value)))
+    status, out, err = run(capsys, tmp_path / "bag")
+    assert (status, out) == (2, "")
+    assert "--measurement /level --command /pump" in err
+    assert "--measurement /level --command /valve" in err
+    assert "two levels, 4 switches in 50 messages" in err
+
+
+@pytest.mark.parametrize("arguments", [[], ["--start", "nan", "x"], ["--start", "soon", "x"]])
+def test_wrong_usage_has_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        replay.main(arguments)
+    assert caught.value.code == 2
+    assert "usage: replay" in capsys.readouterr().err
+
+
+def test_a_constant_measurement_in_an_experiment_is_said(tmp_path, capsys):
+    record = relay_test()
+    flat = Record(
+        time=record.time,
+        measurement=np.full(len(record), 3.0),
+        command=record.command,
+        settings=record.settings,
+        outcome=Outcome.FAILED,
+        reason="no response to the kick",
+        experiment_id="flat",
+    )
+    write_bag(tmp_path / "bag", tmp_path, flat)
+    status, out, err = run(capsys, "--json", tmp_path / "bag")
+    assert status == 1
+    assert "nothing identified" in err
+    assert documents(out)[0]["experiments"][0]["models"] == []
+
+
+def process(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "relay_autotune.cli.replay", *map(str, arguments)],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        **options,
+    )
+
+
+def test_two_processes_print_the_same_bytes(tmp_path):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    first, second = (process("--json", tmp_path / "bag") for _ in range(2))
+    assert first.returncode == 0
+    assert first.stdout == second.stdout
+    assert first.stderr == ""
+
+
+def test_neither_ros_nor_figures_are_imported(tmp_path):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    code = (
+        "import sys; from relay_autotune.cli.replay import main; "
+        f"status = main([{str(tmp_path / 'bag')!r}]); "
+        "import os; assert os.environ['OPENBLAS_NUM_THREADS'] == '1'; "
+        "unwanted = {'rclpy', 'matplotlib', 'std_msgs'} & set(sys.modules); "
+        "sys.exit(f'{status} {unwanted}' if status or unwanted else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
+    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    command = f"{sys.executable} -m relay_autotune.cli.replay {tmp_path / 'bag'} | true"
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
+    )
+    assert done.stderr == ""
+
+
+def test_numbers_that_json_lacks_are_null():
+    from relay_autotune.document import _number
+
+    assert _number(math.nan) is None
+    assert _number(math.inf) is None
+    assert _number(1.0 + 0.0j) == 1.0
+    assert _number(1.0 - 2.0j) == [1.0, -2.0]
+    assert _number(np.float64(0.1)) == 0.1
