@@ -7,13 +7,10 @@
 PYTHON ?= python3
 ENTER = . ./env.sh
 SOURCES = relay_autotune test tools setup.py
-# the tests of the numeric core, which need no ROS
-CORE_TESTS = test/core
-
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test test-oldest lint clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
@@ -21,10 +18,14 @@ setup:
 demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
-test: lint
+test: setup
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint test-oldest
+	@$(ENTER) && python3 -m pytest
+
+# the numeric core with the oldest numeric libraries, without ROS
+test-oldest:
 	@$(PYTHON) tools/prepare.py oldest
-	@if [ -d .venv-oldest ]; then .venv-oldest/bin/python -m pytest -q $(CORE_TESTS); fi
-	@$(ENTER) && python3 -m pytest test
+	@if [ -d .venv-oldest ]; then .venv-oldest/bin/python -m pytest -q test/core; fi
 
 lint: setup
 	@$(ENTER) && ruff check $(SOURCES)
