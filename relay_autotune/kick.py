@@ -11,14 +11,15 @@ from relay_autotune.settling import RestState
 _BAND = 3.0
 _RUN = 3
 
-# The watch looks no earlier than after so many intervals, and decides at the latest after so many.
+# The watch looks no earlier than after so many intervals, and decides at the latest after so many,
+# or so many samples where that is later: without noise a process without dead time is seen to
+# respond at the first sample, and an interval then says nothing of how fast it is.
 _FIRST_LOOK = 5
 _LAST_LOOK = 20
+_LAST_LOOK_SAMPLES = 200
 
-# Fractions: of the largest deviation that is still there; of growth since half the time; of the
-# largest deviation, so near to the rest that it counts as there.
-_STILL_THERE = 0.75
-_GROWN = 1.5
+# Parts of the largest deviation: differing by less is level, being nearer to the rest is back.
+_LEVEL = 0.05
 _BACK = 0.15
 
 
@@ -73,31 +74,34 @@ class ResponseDetector:
 class DirectionWatch:
     """Find the sign of the process gain from the response to a short pulse.
 
-    The command is high for two intervals (an interval is the time that the process took to
-    respond) and then rests at the baseline. The side on which the response began is not the
-    answer for a process with inverse response; what remains after the pulse is: a process that
-    answers straight keeps its deviation or goes back to rest from the side where it was, one with
-    inverse response goes through the rest to the other side. While the command rests the process
-    is moved no further than by the pulse, so looking on costs time and no excursion.
+    The command was high until the process responded, stays so for as long again, and then rests
+    at the baseline; time is counted in intervals as long as the process took to respond. The side
+    on which the response began is not the answer for a process with inverse response. What
+    remains after the pulse is: a process that answers straight keeps its deviation, or goes back
+    to rest from the side where it was; one with inverse response goes through the rest to the
+    other side. While the command rests, the pulse is all that moves the process, so looking on
+    costs time and little excursion.
 
-    From the fifth interval on, with m the mean deviations of the intervals so far:
+    From the fifth interval on, with m the mean deviations of the intervals so far (0 in the first,
+    before the response), counted positive on the first side:
 
-    - the sum of m has the other side: that is the answer;
-    - the last m is still at least 0.75 of the largest, and grew by less than half since half the
-      time (a slow or integrating process), or grows ever faster with the command at rest (an
-      unstable process or a high order): the first side is the answer;
-    - m goes back ever more slowly, and its geometric continuation ends at the rest or before;
-      or it was within 0.15 of the largest for a quarter of the time: the first side is the
-      answer;
-    - after 20 intervals the sum of m decides.
+    - the sum of m is negative: the other side is the answer;
+    - m was level for half of the time (an integrating or very slow process); or it goes back ever
+      more slowly and its geometric continuation ends at the rest, or before; or it was at rest
+      for a quarter of the time: the first side is the answer;
+    - after 20 intervals, and 200 samples, the sum of m decides.
+
+    An unstable process runs away meanwhile: its sign has to be given.
 
     :param interval: length of an interval [s], > 0.
-    :param start: instant of the kick [s].
+    :param start: instant at which the response was seen [s].
     :param rest: the measurement at rest.
     :param side: side on which the response began, 1 or -1.
     """
 
     def __init__(self, interval: float, start: float, rest: RestState, side: int) -> None:
+        self.sign = 0
+        """Sign of the process gain, 0 while it is not clear."""
         self._interval = interval
         self._rest = rest.mean
         self._noise_std = rest.noise_std
@@ -105,65 +109,63 @@ class DirectionWatch:
         self._end = start + interval
         self._sum = 0.0
         self._count = 0
-        self._means: list[float] = []
-        self._errors: list[float] = []
-
-    def add(self, time: float, measurement: float) -> None:
-        """Take one sample; the samples since the kick, in order."""
-        if time >= self._end and self._count > 0:
-            self._close()
-            # A gap in the samples must not leave intervals without any.
-            self._end = max(self._end, time - self._interval) + self._interval
-        self._sum += measurement - self._rest
-        self._count += 1
-
-    def _close(self) -> None:
-        # Counted positive on the side on which the response began.
-        self._means.append(self._side * self._sum / self._count)
-        self._errors.append(self._noise_std / math.sqrt(self._count))
-        self._sum, self._count = 0.0, 0
-
-    @property
-    def intervals(self) -> int:
-        """Number of whole intervals seen."""
-        return len(self._means)
+        self._samples = 0
+        self._means = [0.0]
+        self._errors = [0.0]
 
     @property
     def largest(self) -> float:
         """The largest mean deviation of an interval to either side [y]."""
-        return max((abs(m) for m in self._means), default=0.0)
+        return max(abs(m) for m in self._means)
 
-    def verdict(self) -> int:
-        """Return the sign of the process gain, 1 or -1, or 0 while it is not clear."""
-        m = self._means
-        n = len(m)
-        if n < _FIRST_LOOK:
+    def add(self, time: float, measurement: float) -> int:
+        """Take one sample, from the one on at which the response was seen; return the sign."""
+        if time >= self._end and self._count > 0:
+            self._means.append(self._side * self._sum / self._count)
+            self._errors.append(self._noise_std / math.sqrt(self._count))
+            self.sign = self._verdict()
+            self._sum, self._count = 0.0, 0
+            # A gap in the samples must not leave intervals without any.
+            self._end = max(self._end, time - self._interval) + self._interval
+        self._sum += measurement - self._rest
+        self._count += 1
+        self._samples += 1
+        return self.sign
+
+    def _verdict(self) -> int:
+        if len(self._means) < _FIRST_LOOK:
             return 0
-        total = sum(m)
+        total = sum(self._means)
         uncertainty = math.sqrt(sum(e * e for e in self._errors))
         if total < -3.0 * uncertainty:
             return -self._side
-        if self._stays() or self._tends_back() or self._is_back():
+        if self._is_level() or self._tends_back() or self._is_back():
             return self._side
-        if n >= _LAST_LOOK:
+        if len(self._means) >= _LAST_LOOK and self._samples >= _LAST_LOOK_SAMPLES:
             return self._side if total >= 0.0 else -self._side
         return 0
 
-    def _stays(self) -> bool:
-        m = self._means
-        half = m[(len(m) + 1) // 2 - 1]
-        if m[-1] < _STILL_THERE * max(m):
-            return False
-        speeds_up = m[-1] - m[-2] > m[-2] - m[-3] > 0.0
-        return m[-1] <= _GROWN * half or speeds_up
+    def _is_level(self) -> bool:
+        half = len(self._means) // 2
+        least = (1.0 - _LEVEL) * self.largest
+        return all(
+            mean >= least - 3.0 * error
+            for mean, error in zip(self._means[half:], self._errors[half:], strict=True)
+        )
 
     def _tends_back(self) -> bool:
-        before, after = self._means[-3] - self._means[-2], self._means[-2] - self._means[-1]
-        slowing = before - after
-        # The variance of slowing is that of m - 2 m' + m'', six times that of one mean.
-        if not 0.0 < after < before or slowing <= 3.0 * math.sqrt(6.0) * max(self._errors[-3:]):
+        """Continue the way back from the largest deviation, in three equal parts."""
+        size = (len(self._means) - self._means.index(max(self._means))) // 3
+        if size == 0:
             return False
-        end = self._means[-1] - after * after / slowing
+        tail = self._means[-3 * size :]
+        first, second, third = (sum(tail[k * size : (k + 1) * size]) / size for k in range(3))
+        slowing = (first - second) - (second - third)
+        # The variance of slowing is that of m - 2 m' + m'', six times that of one part.
+        uncertainty = math.sqrt(6.0 / size) * max(self._errors[-3 * size :])
+        if not first > second > third or slowing <= 3.0 * uncertainty:
+            return False
+        end = third - (second - third) ** 2 / slowing
         return end >= -_BACK * self.largest
 
     def _is_back(self) -> bool:
