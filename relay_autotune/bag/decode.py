@@ -125,13 +125,29 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
     messages = []
     for data in payload:
         try:
-            decoded = store.deserialize_cdr(data, channel.type)
+            decoded = _decoded(store, channel.type, data)
         except (SerdeError, KeyError, ValueError, IndexError, struct.error, MemoryError) as error:
             raise BagError(
                 f"a message of {channel.topic} does not fit its definition: {_first_line(error)}"
             ) from None
         messages.append(_with_defaults(decoded, DEFAULTS.get(channel.type, {})))
     return messages
+
+
+def _decoded(store: Any, type_name: str, data: bytes) -> Any:
+    """Decode one message; bytes after its end are allowed.
+
+    ROS 2's own serialization leaves some there: it makes room for the alignment of a sequence's
+    elements even if the sequence is empty. `Typestore.deserialize_cdr` refuses such messages.
+    """
+    if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < 4:
+        raise ValueError("it is not in plain CDR")
+    definition = store.get_msgdef(type_name)
+    decode = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
+    message, end = decode(memoryview(data)[4:], 0, definition.cls, store)
+    if end > len(data) - 4:
+        raise ValueError(f"it has {len(data)} bytes, fewer than its fields take")
+    return message
 
 
 def _with_defaults(message: Any, defaults: Mapping[str, Any]) -> SimpleNamespace:

@@ -140,6 +140,29 @@ def test_a_definition_of_nonsense_is_a_sentence(tmp_path):
             read_experiments(tmp_path / "bag")
 
 
+@pytest.mark.parametrize("extra", [1, 8, 12])
+def test_bytes_after_a_message_do_not_matter(tmp_path, extra):
+    """ROS 2 serializes empty sequences with room for elements that are not there."""
+    record = relay_record()
+    text = definition(EXPERIMENT, tmp_path).text
+    data = serialize(EXPERIMENT, text, experiment_message(record)) + bytes(extra)
+    topics = [Topic("/x", EXPERIMENT, definition=Definition(text))]
+    with BagWriter(tmp_path / "bag", topics, start_ns=START) as bag:
+        bag.write("/x", START, START, data)
+    assert_same_record(read_experiments(tmp_path / "bag").experiments[0], record)
+
+
+@pytest.mark.parametrize("missing", [1, 4, 100, 5000])
+def test_a_message_that_is_cut_is_a_sentence(tmp_path, missing):
+    text = definition(EXPERIMENT, tmp_path).text
+    data = serialize(EXPERIMENT, text, experiment_message(relay_record()))[:-missing]
+    topics = [Topic("/x", EXPERIMENT, definition=Definition(text))]
+    with BagWriter(tmp_path / "bag", topics, start_ns=START) as bag:
+        bag.write("/x", START, START, data)
+    with pytest.raises(BagError, match="does not fit its definition"):
+        read_experiments(tmp_path / "bag")
+
+
 # --- recordings that were cut short
 
 
