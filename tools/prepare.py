@@ -162,8 +162,8 @@ def make_venv(
     environment = environment_without_ours() if system_packages else clean_environment()
     run([base_python(), "-m", "venv", *options, str(path)], environment)
     files = [option for name in requirements for option in ("-r", str(REQUIREMENTS / name))]
-    pip = [str(path / "bin/python"), "-m", "pip", "install", "--quiet"]
-    run([*pip, *files, *(extra or [])], environment)
+    pip = [str(path / "bin/python"), "-m", "pip", "--disable-pip-version-check", "install"]
+    run([*pip, "--quiet", *files, *(extra or [])], environment)
 
 
 def repair_exports() -> None:
