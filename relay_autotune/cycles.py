@@ -123,30 +123,33 @@ def agree(cycles: Sequence[Cycle], noise_std: float, interval: float, tolerance:
 
     Between the largest and the smallest of each are allowed
 
-    - half periods: ``tolerance`` of their mean, plus two sample intervals (each switch is late by
-      up to one), plus three standard deviations of the noise, divided by the mean slope of the
-      measurement, 2 (peak_max - peak_min) / period;
+    - half periods: ``tolerance`` of their mean, plus two sample intervals, plus three standard
+      deviations of the noise divided by the slope of the measurement on its slower way;
     - peaks: ``tolerance`` of the amplitude (half of peak to peak), plus what the measurement moves
-      in one sample interval at that slope, plus three standard deviations of the noise.
+      in two sample intervals on its faster way, plus three standard deviations of the noise.
+
+    A sampled relay switches late by up to one interval, and by another up to one the time before;
+    so the limit cycle itself wanders within these two intervals, and never settles further. The
+    slopes are peak to peak over the shorter and the longer half period.
 
     :param cycles: the cycles to compare, at least one.
     :param noise_std: standard deviation of the measurement noise [y]; NaN: not known, as 0.
     :param interval: sample interval [s].
     :param tolerance: relative difference allowed.
     """
-    noise = 0.0 if math.isnan(noise_std) else _NOISE_MARGIN * noise_std
     count = len(cycles)
     swing = sum(c.peak_max - c.peak_min for c in cycles) / count
-    period = sum(c.period for c in cycles) / count
-    if swing <= 0.0 or period <= 0.0:
+    highs, lows = [c.period_high for c in cycles], [c.period_low for c in cycles]
+    shorter, longer = sorted((sum(highs) / count, sum(lows) / count))
+    if swing <= 0.0 or shorter <= 0.0:
         return False
-    slope = 2.0 * swing / period
-    allowed_time = 2.0 * interval + noise / slope
-    allowed_peak = 0.5 * tolerance * swing + slope * interval + noise
-    for half in ([c.period_high for c in cycles], [c.period_low for c in cycles]):
-        if max(half) - min(half) > allowed_time + tolerance * sum(half) / count:
-            return False
+    noise = 0.0 if math.isnan(noise_std) else _NOISE_MARGIN * noise_std
+    allowed_time = 2.0 * interval + noise * longer / swing
+    allowed_peak = 0.5 * tolerance * swing + 2.0 * interval * swing / shorter + noise
     return all(
+        max(half) - min(half) <= allowed_time + tolerance * sum(half) / count
+        for half in (highs, lows)
+    ) and all(
         max(peak) - min(peak) <= allowed_peak
         for peak in ([c.peak_max for c in cycles], [c.peak_min for c in cycles])
     )
