@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cycles import limit_cycle
+from relay_autotune.record import Outcome
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
@@ -63,7 +64,7 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "start": _number(record.start),
         "duration": _number(record.duration),
         "outcome": record.outcome.name.lower(),
-        "reason": record.reason or analysis.reason,
+        "reason": _reason(analysis),
         "experiment_id": record.experiment_id,
         "limit_cycle": _limit_cycle(analysis),
         "models": [_model(identification) for identification in analysis.models],
@@ -71,6 +72,14 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "gains": [_gains(gains) for gains in analysis.gains],
         "recommended": analysis.recommended,
     }
+
+
+def _reason(analysis: Analysis) -> str:
+    """Return why the experiment ended as it did; if it ended well, why nothing came of it."""
+    record = analysis.record
+    if record.outcome in (Outcome.ABORTED, Outcome.FAILED):
+        return record.reason or analysis.reason
+    return analysis.reason or record.reason
 
 
 def _limit_cycle(analysis: Analysis) -> dict[str, Any] | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +11,15 @@ from relay_autotune.bag.decode import CYCLE, EXPERIMENT, FLOAT64, decode_float64
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import EXPERIMENT_METADATA
 from relay_autotune.errors import BagError, RecordError
-from relay_autotune.messages import record_from_message, settings_from_message, start_seconds
-from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.messages import (
+    record_from_message,
+    settings_from_message,
+    stamp_nanoseconds,
+    start_seconds,
+)
+from relay_autotune.record import IntArray, Outcome, Record
+
+_STAMP_ERROR_NS = 1000
 
 
 def recorded_experiments(topics: Topics) -> tuple[list[Record], list[str]]:
@@ -66,6 +74,7 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
     answer = answer[answered]
     taken = samples.publish_time[answered]
     origin = int(taken[0])
+    cycles = _unbroken(topics.decoded(CYCLE))
     try:
         return Record(
             time=(taken - origin) / 1e9,
@@ -73,7 +82,8 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
             command=decode_float64(answers.payload)[answer],
             receive_time=(samples.log_time[answered] - origin) / 1e9,
             command_time=(answers.publish_time[answer] - origin) / 1e9,
-            settings=_last_settings(topics),
+            settings=settings_from_message(cycles[-1].settings) if cycles else None,
+            cycle_start=_cycle_start(cycles, taken),
             outcome=Outcome.ABORTED,
             reason="the recording ends without the experiment's end "
             f"(after {(taken[-1] - origin) / 1e9:.3f} s)",
@@ -84,6 +94,33 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
         raise BagError(f"the samples in {topics.path} are of no use: {error}") from error
 
 
-def _last_settings(topics: Topics) -> RelaySettings | None:
-    cycles = topics.decoded(CYCLE)
-    return settings_from_message(cycles[-1].settings) if cycles else None
+def _unbroken(cycles: Sequence[Any]) -> list[Any]:
+    """Return the cycles without a gap in their numbers up to the newest, in order."""
+    by_index = {int(cycle.index): cycle for cycle in cycles}
+    run: list[Any] = []
+    index = max(by_index, default=-1)
+    while index in by_index:
+        run.insert(0, by_index[index])
+        index -= 1
+    return run
+
+
+def _cycle_start(cycles: Sequence[Any], taken: IntArray) -> tuple[int, ...]:
+    """Return the samples that bound the cycles.
+
+    :param cycles: their messages, in order and without a gap.
+    :param taken: time of each sample [ns], shape (n,).
+    """
+    bounds: list[int] = []
+    for cycle in cycles:
+        stamp = stamp_nanoseconds(cycle.header.stamp)
+        lead_in = min(int(cycle.lead_in), max(len(cycle.time) - 1, 0))
+        bounds += [stamp + round(float(t) * 1e9) for t in cycle.time[lead_in:][:1]]
+    bounds += [
+        stamp_nanoseconds(cycle.header.stamp) + round(float(cycle.time[-1]) * 1e9)
+        for cycle in cycles[-1:]
+        if len(cycle.time)
+    ]
+    # The stamps went through seconds in double precision.
+    near = np.searchsorted(taken, np.array(bounds, dtype=np.int64) - _STAMP_ERROR_NS)
+    return tuple(sorted({int(i) for i in near if i < taken.size}))

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_bags import REPOSITORY
-from rosbags.rosbag2 import Reader
+from made_bags import REPOSITORY, assert_same_record
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from relay_autotune.autotune import analyse
 from relay_autotune.bag.decode import decode_messages
+from relay_autotune.bag.experiments import interrupted_experiment
 from relay_autotune.bag.mcap_file import McapFile
-from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.topics import Topics
 from relay_autotune.record import Outcome, Record, RelaySettings
 
 BAGS = REPOSITORY / "bags"
@@ -86,6 +88,19 @@ def test_replay_says_what_the_live_identifier_said(name):
         assert getattr(gains, field) == pytest.approx(getattr(found.best_gains, field), rel=1e-9)
 
 
+@pytest.mark.parametrize("name", ["biased_relay", "unbiased_relay_with_noise"])
+def test_the_samples_alone_tell_the_experiment(name):
+    """So does a bag of a killed node, which lacks the record at the end."""
+    expected = the_record(name)
+    (path,) = (BAGS / name).glob("*.mcap")
+    with McapFile(path) as file:
+        found = interrupted_experiment(Topics(BAGS / name, [file]))
+    assert_same_record(found, expected, stamps=1e-12)
+    assert found.settings == expected.settings
+    assert found.cycle_start == expected.cycle_start
+    assert found.start == expected.start
+
+
 def test_settings_and_outcome_of_the_biased_relay():
     record = the_record("biased_relay")
     assert record.settings == RelaySettings(40.0, 2.0, 1.0, bias=0.3, sample_period=0.2)
@@ -110,3 +125,26 @@ def test_others_can_read_them(bag: Path):
         assert reader.message_count == sum(counts.values())
         assert min(counts.values()) > 0
         assert all(c.msgdef.data for c in reader.connections)
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.STORAGE])
+def test_a_users_own_recording_of_the_loop_replays_too(tmp_path, mode):
+    """Written by another program, in another namespace, beside other topics."""
+    name = "unbiased_relay_with_noise"
+    writer = Writer(tmp_path / "mine", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with Reader(BAGS / name) as reader, writer:
+        to = {
+            c.id: writer.add_connection(
+                f"/tank{c.topic}", c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest
+            )
+            for c in reader.connections
+        }
+        for connection, log_time, data in reader.messages():
+            writer.write(to[connection.id], log_time, data)
+    (found,) = read_experiments(tmp_path / "mine").experiments
+    assert_same_record(found, the_record(name))
+    pair = Selection("/tank/measurement", "/tank/command")
+    (alone,) = read_experiments(tmp_path / "mine", pair).experiments
+    np.testing.assert_array_equal(alone.measurement, found.measurement)
+    assert alone.settings is None
