@@ -169,7 +169,14 @@ class TransferFunction:
             integrators = c.size - stripped.size - integrators
             lows.append(float(stripped[-1]))
             # With 1/s as the variable the roots are minus the time constants.
-            roots.append(tuple(complex(-r) for r in np.roots(stripped[::-1])))
+            try:
+                with np.errstate(over="raise"):
+                    roots.append(tuple(complex(-r) for r in np.roots(stripped[::-1])))
+            except (FloatingPointError, np.linalg.LinAlgError) as error:
+                raise ModelError(
+                    f"the coefficients {list(c)} of the {name} span too many powers of ten; "
+                    "choose another unit of time"
+                ) from error
         return cls(lows[0] / lows[1], roots[0], roots[1], integrators, dead_time, structure)
 
     @classmethod

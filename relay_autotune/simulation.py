@@ -108,6 +108,11 @@ class RelayRun:
         )
 
 
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    # Relative to the cell, since a root may lie at its very beginning, which may be zero.
+    return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15))
+
+
 class _Segment:
     """The motion between two changes of the delayed input."""
 
@@ -140,8 +145,7 @@ class _Segment:
         """Return the times of the extrema between the grid's ends."""
         slope = self.modes.output(self.slopes, grid)
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
-        found = [brentq(self.slope, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-15) for i in cells]
-        return np.array(found)
+        return np.array([_root(self.slope, grid[i], grid[i + 1]) for i in cells])
 
     def first_rise(self, excess: Callable[[FloatArray], FloatArray], grid: FloatArray) -> float:
         """First time at which ``excess(y)`` passes zero upwards; nan if it does not."""
@@ -157,7 +161,7 @@ class _Segment:
         def crossing(time: float) -> float:
             return float(excess(self.output(time))[0])
 
-        return float(brentq(crossing, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-15))
+        return _root(crossing, grid[i], grid[i + 1])
 
 
 @dataclass

@@ -89,16 +89,23 @@ def _unstable_at_small_gain(model: TransferFunction) -> int:
     """Closed-loop poles in the right half plane as the gain leaves zero."""
     unstable = sum(1 for t in model.time_constants if t.real < 0.0)
     m = model.integrators
-    if m < 2:
+    if m < 1:
         return unstable
-    # The m roots of s^m = -K|g| lie at angles (pi + 2 pi k)/m; one that starts straight up
-    # goes left only if the phase near zero frequency is above its limit.
-    w = 1e-6 / max(abs(c) for c in (*model.time_constants, *model.zeros, model.dead_time))
-    lead = float(model.phase(w)) + m * math.pi / 2.0 > 0.0
+    # The poles at s = 0 leave along s^m = -K g; one that starts straight up goes left only if
+    # the phase near zero frequency is above its limit.
+    start = math.pi if model.gain * model.process_sign > 0.0 else 0.0
+    w = 1e-6 / max((abs(c) for c in _constants(model)), default=1.0)
+    lead = float(model.phase(w)) - float(model.phase(0.0)) > 0.0
     for k in range(m):
-        cosine = math.cos((math.pi + 2.0 * math.pi * k) / m)
+        cosine = math.cos((start + 2.0 * math.pi * k) / m)
         unstable += cosine > 1e-9 or (abs(cosine) <= 1e-9 and not lead)
     return unstable
+
+
+def _constants(model: TransferFunction) -> tuple[complex, ...]:
+    constants = (*model.time_constants, *model.zeros)
+    # A dead time beyond all proportion is none.
+    return (*constants, model.dead_time) if model.dead_time > 1e-30 else constants
 
 
 def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[_Crossing]:
@@ -128,10 +135,7 @@ def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[
 
 
 def _corners(model: TransferFunction) -> list[float]:
-    corners = [1.0 / abs(c) for c in (*model.time_constants, *model.zeros)]
-    if model.dead_time > 0.0:
-        corners.append(1.0 / model.dead_time)
-    return corners or [1.0]
+    return [1.0 / abs(c) for c in _constants(model)] or [1.0]
 
 
 def _logarithmic(model: TransferFunction) -> FloatArray:

@@ -18,10 +18,19 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     :param lags: less than n.
     """
     e = residual - residual.mean()
-    power = float(e @ e)
-    if power == 0.0:
+    if not bool(np.any(e)):
         return np.zeros(lags)
-    return np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
+    products = _products(e[None, :], lags)[0, 0]
+    return np.asarray(products[1:] / products[0])
+
+
+def _products(x: FloatArray, lags: int) -> FloatArray:
+    """Return ``sum_t x_i(t + lag) x_j(t)`` for lags 0 to ``lags``, shape (p, p, lags + 1)."""
+    # By Fourier transforms, padded so that the ends do not meet: a million samples take no
+    # longer than the fit itself.
+    transform = np.fft.rfft(x, 2 ** math.ceil(math.log2(x.shape[1] + lags + 1)))
+    spectrum = transform[:, None, :] * transform.conj()[None, :, :]
+    return np.asarray(np.fft.irfft(spectrum)[..., : lags + 1])
 
 
 def ljung_box(residual: FloatArray, lags: int = 20) -> float:
@@ -57,9 +66,6 @@ def covariance_meat(scores: FloatArray, residual: FloatArray) -> FloatArray:
     rho = autocorrelation(residual, longest)
     quiet = np.flatnonzero(np.abs(rho) < 2.0 / math.sqrt(n))
     bandwidth = min(2 * (int(quiet[0]) + 1 if quiet.size else longest), longest)
-    meat = scores @ scores.T
-    for lag in range(1, bandwidth + 1):
-        weight = 1.0 - lag / (bandwidth + 1.0)
-        gamma = scores[:, lag:] @ scores[:, :-lag].T
-        meat = meat + weight * (gamma + gamma.T)
-    return np.asarray(meat)
+    weight = 1.0 - np.arange(bandwidth + 1) / (bandwidth + 1.0)
+    weighted = _products(scores, bandwidth) @ weight
+    return np.asarray(weighted + weighted.T - scores @ scores.T)

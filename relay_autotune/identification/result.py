@@ -121,7 +121,7 @@ def with_uncertainty(
     model = build(values)
     cov = np.full((p, p), math.nan) if covariance is None else covariance
     std = np.sqrt(np.diag(cov))
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.exp(np.minimum(quantile * std / np.abs(values), 700.0))
         low, high = values / ratio, values * ratio
     low, high = np.minimum(low, high), np.maximum(low, high)

@@ -190,9 +190,10 @@ def identify_waveform(record: Record, structure: str = "fopdt") -> Identificatio
     u = record.input()
     time, y = record.time, record.measurement
     _require_content(time, y, u)
-    problem = _Problem(time, y, u, STRUCTURES[structure])
+    # In units of its own range, so that no unit of measurement is too large or too small.
     scale = max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6)
-    floor = y.size * (_NEGLIGIBLE * scale) ** 2
+    problem = _Problem(time, (y - y[0]) / scale, u, STRUCTURES[structure])
+    floor = y.size * _NEGLIGIBLE**2
     chosen, state = _select(problem, _start(problem), floor)
     if chosen.relaxation:
         # What the process was fed before the record is unknown, and acts for one dead time.
@@ -200,7 +201,7 @@ def identify_waveform(record: Record, structure: str = "fopdt") -> Identificatio
         if np.count_nonzero(after) > 4 * _parameters(state):
             known = chosen.part(after)
             chosen, state = known, _refine(known, state.theta)
-            floor = known.y.size * (_NEGLIGIBLE * scale) ** 2
+            floor = known.y.size * _NEGLIGIBLE**2
     _require_response(chosen, state, floor)
     return _report(record, chosen, state, floor, scale)
 
@@ -241,7 +242,7 @@ def _report(
     record: Record, problem: _Problem, state: _State, floor: float, scale: float
 ) -> Identification:
     n, k = state.residual.size, _parameters(state)
-    rms = math.sqrt(state.cost / n)
+    rms = scale * math.sqrt(state.cost / n)
     exact = state.cost <= floor
     whiteness = math.nan if exact else ljung_box(state.residual)
     jacobian = np.concatenate((state.columns[:1], state.derivative, state.columns[1:]))
@@ -258,21 +259,23 @@ def _report(
     else:
         covariance = inverse * (state.cost / degrees)
     p = len(problem.structure.parameters)
-    values = np.concatenate((state.coefficients[:1], state.theta))
-    spread = math.sqrt(float(np.mean((problem.y - problem.y.mean()) ** 2)))
+    values = np.concatenate((scale * state.coefficients[:1], state.theta))
+    units = np.ones(p)
+    units[0] = scale
+    spread = scale * math.sqrt(float(np.mean((problem.y - problem.y.mean()) ** 2)))
     fit = FitReport(
         residual_rms=rms,
         noise_std=record.noise_std,
         fit=1.0 - rms / spread if spread > 0.0 else math.nan,
         whiteness_p=whiteness,
-        prediction=_prediction(record, problem, state),
+        prediction=scale * _prediction(record, problem, state),
     )
     return with_uncertainty(
         "waveform",
         problem.structure.model,
         problem.structure.parameters,
         values,
-        np.ascontiguousarray(covariance[:p, :p]),
+        covariance[:p, :p] * np.outer(units, units),
         quantile=float(stdtrit(degrees, 0.975)),
         fit=fit,
         warnings=_warnings(record, fit, coloured, scale, problem),

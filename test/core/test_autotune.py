@@ -1,0 +1,117 @@
+"""The one path from a record to gains: never an exception, gains only where they are due."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relay_autotune.autotune import analyse
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.sampled_relay import simulate_sampled_relay
+
+
+def _record(seed: int = 0, noise: float = 0.02) -> Record:
+    model = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.1)
+    draws = noise * np.random.default_rng(seed).standard_normal(900)
+    return simulate_sampled_relay(model, relay, period=0.2, noise=draws)
+
+
+def test_a_completed_experiment_yields_models_and_gains():
+    found = analyse(_record())
+    assert found.reason == ""
+    assert found.model.method == "waveform"
+    assert [m.method for m in found.models] == ["waveform", "wang_biased"]
+    assert found.best_gains.rule == "thyagarajan"
+    assert {g.rule for g in found.gains} == {"thyagarajan", "tyreus_luyben", "itae", "imc"}
+    assert len(found.cycles) >= 3
+
+
+def test_the_chosen_method_and_rule_come_first():
+    found = analyse(_record(), method="wang_biased", rule="imc")
+    assert found.model.method == "wang_biased"
+    assert found.best_gains.rule == "imc"
+
+
+@pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
+def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
+    found = analyse(replace(_record(), outcome=outcome, reason="the operator said stop"))
+    assert found.model is not None
+    assert found.gains == ()
+    assert found.best_gains is None
+    assert "the operator said stop" in found.reason
+
+
+def test_while_it_runs_there_is_a_model_and_no_gains():
+    found = analyse(_record(), final=False)
+    assert found.model is not None
+    assert len(found.models) == 1
+    assert found.gains == ()
+
+
+def test_equal_records_give_equal_numbers():
+    one, two = analyse(_record()), analyse(_record())
+    assert one.model.values.tolist() == two.model.values.tolist()
+    assert one.model.covariance.tolist() == two.model.covariance.tolist()
+    assert one.gains == two.gains
+
+
+def test_data_that_tell_nothing_are_a_reason():
+    record = _record()
+    constant = replace(record, measurement=np.full(len(record), 5.0))
+    found = analyse(constant)
+    assert found.selected is None
+    assert found.gains == ()
+    assert "constant" in found.reason
+
+
+def test_a_rule_that_does_not_apply_says_so():
+    found = analyse(_record(), rule="itae")
+    assert found.best_gains.rule == "itae"
+    short = simulate_sampled_relay(
+        TransferFunction.fopdt(1.0, 10.0, 0.3),
+        RelaySettings(0.0, 0.0, 1.0, 0.2, 0.0),
+        period=0.01,
+        noise=np.zeros(900),
+    )
+    refused = analyse(short, rule="itae")
+    assert refused.model is not None
+    assert refused.gains == ()
+    assert "ITAE" in refused.reason
+
+
+def test_unknown_names_are_refused_at_once():
+    with pytest.raises(RelayAutotuneError, match="unknown method"):
+        analyse(_record(), method="magic")
+    with pytest.raises(RelayAutotuneError, match="unknown rule"):
+        analyse(_record(), rule="magic")
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 1000),
+    samples=st.integers(1, 60),
+    kind=st.sampled_from(["noise", "ramp", "constant", "two level", "huge"]),
+    outcome=st.sampled_from(list(Outcome)),
+)
+def test_no_record_raises(seed, samples, kind, outcome):
+    rng = np.random.default_rng(seed)
+    time = np.sort(rng.uniform(0.0, 10.0, samples))
+    y = {
+        "noise": rng.standard_normal(samples),
+        "ramp": time * 3.0,
+        "constant": np.full(samples, 2.0),
+        "two level": np.sign(rng.standard_normal(samples)),
+        "huge": 1e150 * rng.standard_normal(samples),
+    }[kind]
+    command = np.sign(np.sin(3.0 * time))
+    found = analyse(Record(time, y, command, outcome=outcome))
+    assert found.reason or found.gains
+    if outcome in (Outcome.ABORTED, Outcome.FAILED):
+        assert found.gains == ()

@@ -1,0 +1,130 @@
+"""Ultimate points and closed-loop stability against worked cases and Pade approximations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from worked_cases import PROCESSES, cases
+
+from relay_autotune.models import TransferFunction
+from relay_autotune.ultimate import ultimate_point, unstable_poles
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T1"))
+def test_equal_lags(name, inputs, exact, tol):
+    model = TransferFunction.lag_n(inputs["K"], inputs["tau"], inputs["n"], inputs["D"])
+    point = ultimate_point(model)
+    assert point.gain == pytest.approx(exact["true_Ku"], rel=tol)
+    assert point.period == pytest.approx(exact["true_Pu"], rel=tol)
+
+
+def test_first_order_and_inverse_response():
+    point = ultimate_point(PROCESSES["Chang 1.65e-10s/(20s+1)"])
+    assert point.gain == pytest.approx(2.3072017362581048, rel=1e-12)
+    assert point.frequency == pytest.approx(0.18365972031521258, rel=1e-12)
+    point = ultimate_point(PROCESSES["Luyben int+inv"])
+    assert point.gain == pytest.approx(3.5553946647732815, rel=1e-9)
+    assert point.frequency == pytest.approx(1.2999974797731686, rel=1e-9)
+
+
+@pytest.mark.parametrize("case", cases("chang.fig3")[0][2], ids=lambda c: f"D={c['D']}")
+def test_any_dead_time(case):
+    point = ultimate_point(TransferFunction.fopdt(1.65, 20.0, case["D"]))
+    assert point.gain == pytest.approx(case["Ku_true"], rel=1e-9)
+    assert point.frequency == pytest.approx(case["wu_true"], rel=1e-9)
+
+
+def test_a_reverse_acting_process_has_a_negative_ultimate_gain():
+    direct = ultimate_point(TransferFunction.fopdt(1.65, 20.0, 10.0))
+    reverse = ultimate_point(TransferFunction.fopdt(-1.65, 20.0, 10.0))
+    assert reverse.gain == -direct.gain
+    assert reverse.frequency == direct.frequency
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        TransferFunction.fopdt(1.0, 1.0, 0.0),
+        TransferFunction.lag_n(1.0, 1.0, 2, 0.0),
+        TransferFunction.unstable_fopdt(1.0, 1.0, 1.3),
+        TransferFunction(1.0, (), (1.0,), 2, 0.1),
+    ],
+    ids=["first order", "second order", "delay beyond tau", "double integrator"],
+)
+def test_a_process_without_ultimate_point_has_none(model):
+    assert ultimate_point(model) is None
+
+
+def test_an_unstable_process_has_the_upper_limit():
+    model = TransferFunction.unstable_fopdt(1.0, 1.0, 0.3)
+    point = ultimate_point(model)
+    assert point.gain > 1.0
+    assert abs(complex(point.gain * model(1j * point.frequency)) + 1.0) < 1e-12
+
+
+def test_a_resonance_beyond_the_first_crossing_is_found():
+    # The slow lag crosses first with a small gain, the resonance later with a large one.
+    model = TransferFunction(1.0, (), (10.0, *_pair(3.0, 0.002)), 0, 2.0)
+    point = ultimate_point(model)
+    assert point.frequency == pytest.approx(3.0, rel=0.05)
+
+
+def _pair(w0: float, zeta: float) -> tuple[complex, complex]:
+    root = 1j * math.sqrt(1.0 - zeta**2)
+    return (zeta + root) / w0, (zeta - root) / w0
+
+
+@given(
+    tau=st.floats(0.05, 50.0),
+    order=st.integers(1, 6),
+    dead_time=st.floats(0.01, 20.0),
+    gain=st.floats(0.1, 10.0),
+)
+def test_at_the_ultimate_point_the_loop_is_minus_one_and_stability_ends(
+    tau, order, dead_time, gain
+):
+    model = TransferFunction.lag_n(gain, tau, order, dead_time)
+    point = ultimate_point(model)
+    assert abs(complex(point.gain * model(1j * point.frequency)) + 1.0) < 1e-9
+    for factor, stable in ((0.999, True), (1.001, False)):
+        loop = TransferFunction.lag_n(gain * point.gain * factor, tau, order, dead_time)
+        assert (unstable_poles(loop) == 0) is stable
+
+
+def _pade(dead_time: float, order: int) -> tuple[np.ndarray, np.ndarray]:
+    c = np.ones(order + 1)
+    for k in range(1, order + 1):
+        c[k] = c[k - 1] * (order - k + 1) / (k * (2 * order - k + 1))
+    powers = dead_time ** np.arange(order + 1)
+    return (c * (-1.0) ** np.arange(order + 1) * powers)[::-1], (c * powers)[::-1]
+
+
+def _away_from_zero(least: float, most: float) -> st.SearchStrategy[float]:
+    return st.floats(least, most) | st.floats(-most, -least)
+
+
+@given(
+    zeros=st.lists(_away_from_zero(0.2, 3.0), max_size=1),
+    constants=st.lists(_away_from_zero(0.2, 5.0), min_size=2, max_size=3),
+    integrators=st.integers(0, 1),
+    dead_time=st.just(0.0) | st.floats(1e-3, 1.0),
+    gain=st.floats(0.05, 4.0),
+)
+def test_unstable_poles_are_counted_like_the_roots_of_a_pade_approximation(
+    zeros, constants, integrators, dead_time, gain
+):
+    sign = TransferFunction(gain, tuple(zeros), tuple(constants), integrators).process_sign
+    loop = TransferFunction(sign * gain, tuple(zeros), tuple(constants), integrators, dead_time)
+    top, bottom = _pade(dead_time, 7)
+    roots = np.roots(
+        np.polyadd(np.polymul(loop.numerator, top), np.polymul(loop.denominator, bottom))
+    )
+    # Roots near the axis, or so fast that the approximation does not hold there, decide nothing.
+    assume(np.abs(roots.real).min() > 0.02)
+    fast = np.abs(roots) * dead_time > 6.0
+    assume(not np.any(fast & (roots.real > -1.0)))
+    assert unstable_poles(loop) == int(np.sum(roots.real > 0.0))

@@ -1,0 +1,140 @@
+"""Wang's methods against the paper's worked cases and on exact records."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worked_cases import cases
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.fourier import cycle_means, frequency_point
+from relay_autotune.identification.wang1997 import (
+    FopdtCycle,
+    fopdt_from_biased,
+    fopdt_from_unbiased,
+    fopdt_limit_cycle,
+    identify_biased,
+    identify_unbiased,
+)
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Record, RelaySettings
+from relay_autotune.sampled_relay import simulate_sampled_relay
+from relay_autotune.simulation import simulate_relay
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T1"))
+def test_equations_2_to_5(name, inputs, exact, tol):
+    p = inputs
+    cycle = fopdt_limit_cycle(p["K"], p["T"], p["L"], p["mu"], p["mu0"], p["eps"])
+    found = (cycle.high, cycle.low, cycle.up, cycle.down)
+    assert found == pytest.approx([exact[k] for k in ("Tu1", "Tu2", "Au", "Ad")], rel=tol)
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T2"))
+def test_biased_relay(name, inputs, exact, tol):
+    p = inputs
+    cycle = FopdtCycle(p["Tu1"], p["Tu2"], p["Au"], p["Ad"])
+    found = fopdt_from_biased(cycle, p["K"], p["mu"], p["mu0"], p["eps"])
+    assert found == pytest.approx((exact["K"], exact["T"], exact["L"]), rel=tol)
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T3"))
+def test_biased_relay_on_higher_order(name, inputs, exact, tol):
+    p, relay = inputs, inputs["relay"]
+    cycle = FopdtCycle(p["Tu1"], p["Tu2"], p["Au"], p["Ad"])
+    found = fopdt_from_biased(cycle, 1.0, relay["mu"], relay["mu0"], relay["eps"])
+    assert found == pytest.approx(exact["m,m"], rel=tol)
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T4"))
+def test_unbiased_relay(name, inputs, exact, tol):
+    p = inputs
+    found = fopdt_from_unbiased(p["Tu"], p["A"], p["A0"], p["mu"], p["eps"])
+    assert found == pytest.approx((exact["K"], exact["T"], exact["L"]), rel=tol)
+
+
+def test_no_limit_cycle_is_refused():
+    with pytest.raises(IdentificationError, match="hysteresis"):
+        fopdt_limit_cycle(1.0, 1.0, 1.0, 1.0, 0.5, 0.5)
+    with pytest.raises(IdentificationError, match="eq 7"):
+        fopdt_from_biased(FopdtCycle(1.0, 1.0, 5.0, -0.1), 1.0, 1.0, 0.3, 0.1)
+    with pytest.raises(IdentificationError, match="no stable FOPDT"):
+        fopdt_from_unbiased(1.0, 10.0, 0.1, 1.0, 0.0)
+
+
+def _record(gain: float, bias: float, samples: int = 20_001) -> Record:
+    model = TransferFunction.fopdt(gain, 20.0, 10.0)
+    relay = RelaySettings(5.0, 40.0, 1.0, bias, 0.1, reverse_acting=gain < 0.0)
+    end = simulate_relay(model, relay, cycles=5).command.times[-1]
+    return simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, samples)).record()
+
+
+@pytest.mark.parametrize("gain", [1.65, -1.65])
+@pytest.mark.parametrize("bias", [0.3, -0.2])
+def test_a_dense_record_of_a_biased_relay(gain, bias):
+    found = identify_biased(_record(gain, bias))
+    assert found.values == pytest.approx([gain, 20.0, 10.0], rel=2e-3)
+    assert found.ultimate_gain == pytest.approx(np.sign(gain) * 2.3072017362581048, rel=2e-3)
+    assert found.structure == "fopdt"
+
+
+@pytest.mark.parametrize("gain", [1.65, -1.65])
+def test_a_dense_record_of_an_unbiased_relay(gain):
+    found = identify_unbiased(_record(gain, 0.0))
+    assert found.values == pytest.approx([gain, 20.0, 10.0], rel=1e-2)
+
+
+def test_each_relay_refuses_the_other():
+    with pytest.raises(IdentificationError, match="biased relay"):
+        identify_biased(_record(1.65, 0.0, 2001))
+    with pytest.raises(IdentificationError, match="wang_biased"):
+        identify_unbiased(_record(1.65, 0.3, 2001))
+
+
+def test_eight_cycles_average_the_noise():
+    model = TransferFunction.fopdt(1.0, 2.0, 1.0)
+    relay = RelaySettings(3.0, 1.0, 1.0, 0.3, 0.1)
+    noise = 0.02 * np.random.default_rng(7).standard_normal(3600)
+    record = simulate_sampled_relay(model, relay, period=0.01, noise=noise)
+    found = identify_biased(record)
+    assert found.values == pytest.approx([1.0, 2.0, 1.0], rel=0.1)
+    assert np.all(np.isfinite(found.std))
+    assert np.all(found.std > 0.0)
+
+
+def test_a_record_that_is_no_relay_test_is_refused():
+    time = np.linspace(0.0, 10.0, 100)
+    step = Record(time, np.minimum(time, 5.0), np.where(time > 1.0, 1.0, 0.0))
+    for method in (identify_biased, identify_unbiased):
+        with pytest.raises(IdentificationError, match="whole cycle"):
+            method(step)
+
+
+@pytest.mark.parametrize("harmonic", [1, 3, 5])
+def test_frequency_points_of_any_process(harmonic):
+    model = TransferFunction.lag_n(2.0, 1.0, 3, 0.7)
+    relay = RelaySettings(0.0, 0.0, 1.0, 0.1, 0.05)
+    cycles = 14
+    end = simulate_relay(model, relay, cycles=cycles).command.times[-1]
+    record = simulate_relay(
+        model, relay, cycles=cycles, time=np.linspace(0.0, end, 40_001)
+    ).record()
+    point = frequency_point(record, harmonic, first=9)
+    # A harmonic is small beside the fundamental, and so is what the samples tell of it.
+    assert point.value == pytest.approx(
+        complex(model(1j * point.frequency)), rel=1e-5 * harmonic**4
+    )
+
+
+def test_means_over_whole_cycles_give_the_static_gain():
+    record = _record(1.65, 0.3)
+    y, u = cycle_means(record)
+    assert (y - 5.0) / (u - 40.0) == pytest.approx(1.65, rel=1e-5)
+
+
+def test_without_whole_cycles_there_is_no_point():
+    record = replace(_record(1.65, 0.3, 501), cycle_start=())
+    with pytest.raises(IdentificationError, match="whole cycles"):
+        frequency_point(record)

@@ -1,0 +1,254 @@
+"""The waveform fit: exact without noise, honest with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.residuals import covariance_meat, ljung_box
+from relay_autotune.identification.waveform import identify_waveform
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.response import response
+from relay_autotune.sampled_relay import simulate_sampled_relay
+from relay_autotune.simulation import RelayRun, simulate_relay
+from relay_autotune.ultimate import ultimate_point
+
+
+def _run(gain: float, tau: float, dead: float, bias: float = 0.0, samples: int = 1000) -> RelayRun:
+    model = TransferFunction.fopdt(gain, tau, dead)
+    relay = RelaySettings(5.0, 40.0, 1.0, bias, 0.0, reverse_acting=gain < 0.0)
+    end = simulate_relay(model, relay, cycles=5).command.times[-1]
+    return simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, samples))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    gain=st.floats(0.1, 10.0) | st.floats(-10.0, -0.1),
+    tau=st.floats(0.1, 100.0),
+    ratio=st.floats(0.05, 8.0),
+    bias=st.floats(-0.3, 0.3),
+)
+def test_noise_free_parameters_are_exact(gain, tau, ratio, bias):
+    found = identify_waveform(_run(gain, tau, ratio * tau, bias).record())
+    assert found.values == pytest.approx([gain, tau, ratio * tau], rel=1e-9)
+    truth = ultimate_point(TransferFunction.fopdt(gain, tau, ratio * tau))
+    assert found.ultimate_gain == pytest.approx(truth.gain, rel=1e-9)
+    assert found.ultimate_frequency == pytest.approx(truth.frequency, rel=1e-9)
+    assert found.warnings == ()
+
+
+def _noisy(run: RelayRun, ratio: float, seed: int) -> Record:
+    signal = float(np.mean(np.abs(run.measurement - 5.0)))
+    std = ratio * signal * math.sqrt(math.pi / 2.0)
+    return run.record(noise_std=std, rng=np.random.default_rng(seed))
+
+
+def _bound(run: RelayRun, process: tuple[float, float, float], std: float) -> tuple[float, float]:
+    """Cramer-Rao bound of K_u and w_u, relative, from differences of the exact response."""
+
+    def output(p: np.ndarray) -> np.ndarray:
+        return response(TransferFunction.fopdt(*p), run.time, run.command)
+
+    def ultimate(p: np.ndarray) -> np.ndarray:
+        point = ultimate_point(TransferFunction.fopdt(*p))
+        return np.log([point.gain, point.frequency])
+
+    p = np.array(process)
+    steps = np.diag(1e-5 * p)
+    by_output = [(output(p + s) - output(p - s)) / (2 * s.max()) for s in steps]
+    by_ultimate = np.array([(ultimate(p + s) - ultimate(p - s)) / (2 * s.max()) for s in steps])
+    jacobian = np.stack([*by_output, np.ones(run.time.size)])
+    covariance = np.linalg.inv(jacobian @ jacobian.T)[:3, :3] * std**2
+    variances = np.diag(by_ultimate.T @ covariance @ by_ultimate)
+    return float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
+
+
+PROCESSES = [(1.65, 20.0, 10.0), (1.0, 2.0, 2.0), (1.0, 1.0, 0.1), (1.0, 1.0, 10.0)]
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
+    run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
+    records = [_noisy(run, 0.1, seed) for seed in range(80)]
+    bounds = _bound(run, process, records[0].noise_std)
+    found = [identify_waveform(r) for r in records]
+    gain = [f.ultimate_gain / truth.gain - 1.0 for f in found]
+    frequency = [f.ultimate_frequency / truth.frequency - 1.0 for f in found]
+    for errors, bound in zip((gain, frequency), bounds, strict=True):
+        # The rms of 80 draws scatters by 8 %.
+        assert 0.75 < math.sqrt(float(np.mean(np.square(errors)))) / bound < 1.3
+    stated = float(np.mean([f.ultimate_gain_std for f in found])) / truth.gain
+    assert stated == pytest.approx(bounds[0], rel=0.1)
+
+
+def test_the_intervals_cover_the_truth():
+    process = (1.65, 20.0, 10.0)
+    run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
+    found = [identify_waveform(_noisy(run, 0.1, seed)) for seed in range(200)]
+    inside = [
+        np.mean([f.ci95_low[k] <= value <= f.ci95_high[k] for f in found])
+        for k, value in enumerate(process)
+    ]
+    for name, value in (("gain", truth.gain), ("frequency", truth.frequency)):
+        pulls = [
+            abs(getattr(f, f"ultimate_{name}") - value) / getattr(f, f"ultimate_{name}_std")
+            for f in found
+        ]
+        inside.append(np.mean(np.array(pulls) < 1.96))
+    # 200 draws of 95 %: five standard errors are 7.7 %.
+    assert min(inside) > 0.873
+
+
+def test_a_relay_that_sees_the_noise_at_its_samples():
+    model = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.3)
+    noise = 0.08 * np.random.default_rng(5).standard_normal(1600)
+    found = identify_waveform(simulate_sampled_relay(model, relay, period=0.2, noise=noise))
+    assert found.ultimate_gain == pytest.approx(2.3072, rel=0.02)
+    assert abs(found.values - [1.65, 20.0, 10.0]).max() < 4.0 * found.std.max()
+    assert found.fit.residual_rms == pytest.approx(0.08, rel=0.1)
+
+
+def _staircase(seed: int = 0) -> tuple[np.ndarray, np.ndarray, Record]:
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(2.0, 20.0, 15))
+    u = PiecewiseConstant(times, rng.uniform(0.0, 3.0, 15), 1.0)
+    # Irregular samples.
+    time = np.cumsum(rng.uniform(0.05, 0.7, 900))
+    y = 20.0 + response(TransferFunction.fopdt(1.2, 6.0, 2.345), time, u)
+    return time, y, Record(time, y, u(time), held_input=u)
+
+
+def test_any_held_input_and_irregular_samples_will_do():
+    _, _, record = _staircase()
+    found = identify_waveform(record)
+    assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-9)
+
+
+def test_a_step_test():
+    time = np.linspace(0.0, 60.0, 300)
+    u = PiecewiseConstant(np.array([5.0]), np.array([2.0]), 0.0)
+    y = 20.0 + response(TransferFunction.fopdt(1.2, 6.0, 2.345), time, u)
+    found = identify_waveform(Record(time, y, u(time), held_input=u))
+    assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-9)
+
+
+def test_a_drift_is_estimated_and_said():
+    time, y, record = _staircase()
+    rng = np.random.default_rng(1)
+    noisy = y + 0.004 * time + 0.02 * rng.standard_normal(y.size)
+    found = identify_waveform(replace(record, measurement=noisy))
+    assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=0.02)
+    assert any("drift" in w for w in found.warnings)
+
+
+def test_a_start_away_from_rest_is_estimated():
+    time, y, record = _staircase()
+    moving = y + 3.0 * np.exp(-(time - time[0]) / 6.0)
+    found = identify_waveform(replace(record, measurement=moving))
+    assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-6)
+
+
+def test_a_record_cut_out_of_an_oscillation():
+    record = _run(1.65, 20.0, 10.0, 0.3, 2000).record()
+    part = slice(700, 2000)
+    inside = record.held_input.times > record.time[700]
+    u = PiecewiseConstant(
+        record.held_input.times[inside],
+        record.held_input.values[inside],
+        float(record.command[700]),
+    )
+    cut = Record(record.time[part], record.measurement[part], record.command[part], held_input=u)
+    found = identify_waveform(cut)
+    assert found.values == pytest.approx([1.65, 20.0, 10.0], rel=1e-6)
+
+
+def test_a_second_input_shows_in_the_residual_and_is_said():
+    time, y, record = _staircase()
+    other = PiecewiseConstant(np.array([40.0, 130.0]), np.array([1.0, 0.0]), 0.0)
+    disturbed = y + response(TransferFunction.fopdt(0.6, 9.0, 1.0), time, other)
+    noise = 0.01 * np.random.default_rng(2).standard_normal(y.size)
+    found = identify_waveform(replace(record, measurement=disturbed + noise, noise_std=0.01))
+    assert any("not white" in w for w in found.warnings)
+    assert any("larger than the noise" in w for w in found.warnings)
+    assert found.fit.whiteness_p < 1e-3
+
+
+def test_a_gain_that_the_data_do_not_tell_is_named():
+    found = identify_waveform(_noisy(_run(1.0, 1.0, 0.02), 0.2, 3))
+    assert "gain" in found.undetermined
+    assert "time_constant" in found.undetermined
+    assert abs(found.ultimate_gain_std / found.ultimate_gain) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("measurement", "command", "said"),
+    [
+        (np.arange(100.0), np.zeros(100), "command never changes"),
+        (np.full(100, 7.0), np.arange(100) // 50 * 1.0, "constant at 7"),
+        (
+            np.random.default_rng(0).standard_normal(100),
+            np.arange(100) // 50 * 1.0,
+            "no response",
+        ),
+        (np.arange(8.0), np.arange(8) // 4 * 1.0, "8 samples"),
+    ],
+)
+def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command, said):
+    time = np.arange(measurement.size, dtype=float)
+    with pytest.raises(IdentificationError, match=said):
+        identify_waveform(Record(time, measurement, command))
+
+
+def test_an_unknown_structure_is_refused():
+    with pytest.raises(IdentificationError, match="no structure"):
+        identify_waveform(_staircase()[2], "ladder")
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 10_000),
+    samples=st.integers(12, 120),
+    scale=st.floats(1e-6, 1e6),
+    switches=st.integers(1, 6),
+)
+def test_any_record_gives_a_finite_model_or_a_reason(seed, samples, scale, switches):
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.exponential(1.0, samples))
+    command = np.repeat(rng.standard_normal(switches + 1), samples // (switches + 1) + 1)[:samples]
+    y = scale * np.cumsum(rng.standard_normal(samples))
+    try:
+        found = identify_waveform(Record(time, y, command))
+    except IdentificationError:
+        return
+    assert np.all(np.isfinite(found.values))
+    assert found.values[1] > 0.0
+    assert found.values[2] >= 0.0
+
+
+def test_ljung_box_is_uniform_for_white_noise_and_small_for_coloured():
+    rng = np.random.default_rng(11)
+    p = [ljung_box(rng.standard_normal(400)) for _ in range(300)]
+    assert 0.4 < np.mean(p) < 0.6
+    assert np.mean(np.array(p) < 0.05) < 0.1
+    coloured = np.convolve(rng.standard_normal(500), [1.0, 0.8, 0.5])
+    assert ljung_box(coloured) < 1e-6
+    assert math.isnan(ljung_box(np.array([1.0, 2.0])))
+
+
+def test_the_long_run_variance_of_coloured_noise():
+    # An AR(1) process of coefficient a has the long-run variance 1/(1 - a)^2.
+    rng = np.random.default_rng(4)
+    e = rng.standard_normal(200_000)
+    from scipy.signal import lfilter
+
+    x = lfilter([1.0], [1.0, -0.7], e)
+    meat = covariance_meat(x[None, :], x)[0, 0] / x.size
+    assert meat == pytest.approx(1.0 / 0.3**2, rel=0.25)
