@@ -161,7 +161,8 @@ class RelayExperiment:
         :param lost_samples: samples that the middleware is known to have lost.
         :raises RecordError: if there is no sample.
         """
-        n = len(self._samples)
+        # A sample that was being answered when the caller was struck by an error has no answer.
+        n = len(self._samples.command)
         time, measurement, command = self._samples.columns(0, n)
         return Record(
             time=time,

@@ -59,10 +59,10 @@ class IdentifierNode(ServedNode):
         self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
         self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
         self.create_subscription(
-            RelayCycle, "relay_cycle", self._on_cycle, quality.cycles(CYCLE_DEPTH)
+            RelayCycle, "relay_cycle", self._on_cycle, quality.latched(CYCLE_DEPTH)
         )
         self.create_subscription(
-            RelayExperiment, "relay_experiment", self._on_experiment, quality.RESULT
+            RelayExperiment, "relay_experiment", self._on_experiment, quality.latched(10)
         )
         self.add_on_set_parameters_callback(self._on_set)
 

@@ -162,9 +162,7 @@ def declare(node: Node, table: Iterable[Entry], *, read_only: bool = False) -> N
             raise ParameterError(
                 f"{entry.name} is {found}, expected {entry.range_text}"
             ) from error
-        problem = entry.problem(value_of(node, entry))
-        if problem is not None:
-            raise ParameterError(problem)
+        _check(entry, value_of(node, entry))
 
 
 def value_of(node: Node, entry: Entry) -> Any:
@@ -194,11 +192,19 @@ def merged(node: Node, table: Sequence[Entry], changes: Iterable[Parameter]) -> 
         entry = by_name.get(change.name)
         if entry is None:
             continue
-        problem = entry.problem(change.value)
-        if problem is not None:
-            raise ParameterError(problem)
+        _check(entry, change.value)
         values[change.name] = change.value
     return values
+
+
+def _check(entry: Entry, value: Any) -> None:
+    problem = entry.problem(value)
+    # Only what is unlimited by default may be infinite.
+    infinite = isinstance(value, float) and math.isinf(value) and not math.isinf(entry.default)
+    if problem is None and infinite:
+        problem = f"{entry.name} is {value:g}, expected a finite number"
+    if problem is not None:
+        raise ParameterError(problem)
 
 
 def _wrong_type(entry: Entry, error: InvalidParameterTypeException) -> str:

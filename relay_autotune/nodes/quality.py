@@ -26,19 +26,21 @@ MEASUREMENT = QoSProfile(
 COMMAND = QoSProfile(
     depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
 )
-# A result stays for who comes late.
-RESULT = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
 
 
-def cycles(depth: int) -> QoSProfile:
-    """Return the profile of `relay_cycle`, latched with room for all cycles of an experiment."""
+def latched(depth: int) -> QoSProfile:
+    """Return the profile of what stays for who comes late.
+
+    :param depth: how many messages stay.
+    """
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL,
     )
+
+
+RESULT = latched(1)
 
 
 def for_bag(profile: QoSProfile) -> Qos:
@@ -54,36 +56,44 @@ def for_bag(profile: QoSProfile) -> Qos:
     )
 
 
-def why_no_publisher(node: Node, topic: str, requested: QoSProfile) -> str:
+def why_no_publisher(node: Node, topic: str) -> str:
     """Say why nothing arrives on a topic, as far as the graph tells.
 
     :param node: the node that subscribes.
     :param topic: resolved name of the topic.
-    :param requested: what the subscription asks for.
     """
     ends = node.get_publishers_info_by_topic(topic)
     if not ends:
         return f"{topic} has no publisher"
-    problems = _problems(ends, lambda offered: qos_check_compatible(offered, requested))
+    own = _own(node, node.get_subscriptions_info_by_topic(topic))
+    problems = _problems(ends, lambda offered: qos_check_compatible(offered, own))
     if problems:
         return f"{topic} has {_count(len(ends), 'publisher')}, but {'; '.join(problems)}"
     return f"{topic} has {_count(len(ends), 'publisher')}, but nothing arrives"
 
 
-def why_no_subscriber(node: Node, topic: str, offered: QoSProfile) -> str:
+def why_no_subscriber(node: Node, topic: str) -> str:
     """Say why nobody takes what is published on a topic, as far as the graph tells.
 
     :param node: the node that publishes.
     :param topic: resolved name of the topic.
-    :param offered: what the publisher offers.
     """
     ends = node.get_subscriptions_info_by_topic(topic)
     if not ends:
         return f"{topic} has no subscriber"
-    problems = _problems(ends, lambda wanted: qos_check_compatible(offered, wanted))
+    own = _own(node, node.get_publishers_info_by_topic(topic))
+    problems = _problems(ends, lambda wanted: qos_check_compatible(own, wanted))
     if problems:
         return f"{topic} has no subscriber that can be served: {'; '.join(problems)}"
     return f"{topic} has {_count(len(ends), 'subscriber')}, but none is connected yet"
+
+
+def _own(node: Node, ends: Sequence[Any]) -> Any:
+    # The profile as it is in force: what it was made from leaves deadlines to the middleware.
+    for end in ends:
+        if (end.node_namespace, end.node_name) == (node.get_namespace(), node.get_name()):
+            return end.qos_profile
+    return None
 
 
 def _problems(ends: Sequence[Any], check: Any) -> list[str]:
@@ -95,7 +105,8 @@ def _problems(ends: Sequence[Any], check: Any) -> list[str]:
             continue
         compatibility, reason = check(end.qos_profile)
         if compatibility == QoSCompatibility.ERROR:
-            problems.append(f"{who} has an incompatible QoS: {reason.rstrip('; ')}")
+            told = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
+            problems.append(f"{who} has an incompatible QoS: {told}")
     return problems
 
 

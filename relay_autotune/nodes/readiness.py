@@ -33,10 +33,10 @@ def require_connections(
         raise NotReadyError("use_sim_time is true, but no time has come on /clock")
     if age > timeout:
         when = "yet" if math.isinf(age) else f"for {age:.3g} s"
-        why = why_no_publisher(node, measurement.topic_name, measurement.qos_profile)
+        why = why_no_publisher(node, measurement.topic_name)
         raise NotReadyError(f"no measurement has come {when}: {why}")
     if command.get_subscription_count() == 0:
-        why = why_no_subscriber(node, command.topic_name, command.qos_profile)
+        why = why_no_subscriber(node, command.topic_name)
         raise NotReadyError(f"no command would arrive: {why}")
 
 

@@ -44,6 +44,7 @@ class Recorder:
         self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
         self._opened = threading.Event()
         self._closing = threading.Event()
+        self._finished: Callable[[], object] = bool
         self._writer: BagWriter | None = None
         # Bound once: this is called for each sample.
         self.sample = self._samples.put
@@ -66,8 +67,12 @@ class Recorder:
         """Wait for the folder to be made, or refused, for ``timeout`` seconds at most."""
         self._opened.wait(timeout)
 
-    def close(self) -> None:
-        """Ask for the bag to be finished; returns at once."""
+    def close(self, finished: Callable[[], None]) -> None:
+        """Ask for the bag to be finished; returns at once.
+
+        :param finished: called by the recorder's thread once the bag is whole.
+        """
+        self._finished = finished
         self._closing.set()
 
     def join(self, timeout: float) -> bool:
@@ -116,6 +121,7 @@ class Recorder:
 
     def _finish(self, writer: BagWriter) -> None:
         writer.close()
+        self._finished()
 
     def _discard(self) -> None:
         for queue in (self._samples, self._messages):

@@ -132,11 +132,11 @@ class Recordings:
             return
         if recording.timer is not None:
             self._node.destroy_timer(recording.timer)
-        recording.recorder.close()
-        if recording.recorder.failure is None:
-            log = self._node.get_logger()
-            say = log.warning if recording.waiting and recording.missing else log.info
-            say(f"the recording {recording.recorder.path} is closed {why}")
+        log = self._node.get_logger()
+        say = log.warning if recording.waiting and recording.missing else log.info
+        recording.recorder.close(
+            lambda: say(f"the recording {recording.recorder.path} is closed {why}")
+        )
 
     def close_all(self, why: str, timeout: float) -> None:
         """Close all recordings and wait for the newest to be finished.

@@ -88,7 +88,7 @@ class RelayNode(ServedNode):
         )
         self._publish = self._command.publish
         self._cycles = self.create_publisher(
-            RelayCycle, "relay_cycle", quality.cycles(depth), event_callbacks=quiet
+            RelayCycle, "relay_cycle", quality.latched(depth), event_callbacks=quiet
         )
         self._experiments = self.create_publisher(
             ExperimentMessage, "relay_experiment", quality.RESULT, event_callbacks=quiet
@@ -145,7 +145,7 @@ class RelayNode(ServedNode):
                 self._publish(self._message)
                 session.answered()
                 experiment = session.experiment
-                if len(experiment.cycles) != session.published_cycles:
+                if experiment.cycle_count != session.published_cycles:
                     self._defer_cycles(session)
                 if experiment.finished:
                     self._leave(session)
@@ -245,9 +245,9 @@ class RelayNode(ServedNode):
     # While a tune runs.
 
     def _defer_cycles(self, session: Session) -> None:
-        for index in range(session.published_cycles, len(session.experiment.cycles)):
+        for index in range(session.published_cycles, session.experiment.cycle_count):
             self.defer(partial(self._publish_cycle, session, index))
-        session.published_cycles = len(session.experiment.cycles)
+        session.published_cycles = session.experiment.cycle_count
 
     def _publish_cycle(self, session: Session, index: int) -> None:
         experiment = session.experiment
@@ -304,7 +304,11 @@ class RelayNode(ServedNode):
                     f"parameters stay as they are while tune {self._session.id} runs; "
                     f"wait for its end or call ~/abort"
                 )
-            merged(self, TUNE_PARAMETERS, changes)
+            values = merged(self, TUNE_PARAMETERS, changes)
+            experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
+            # Without an amplitude, which a request may bring, the rest is judged at the start.
+            if experiment["amplitude"] > 0.0:
+                ExperimentParameters(**experiment).validate()
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -393,7 +397,7 @@ class RelayNode(ServedNode):
             experiment = session.experiment
             values |= {
                 "state": experiment.state.name.lower(),
-                "cycles": len(experiment.cycles),
+                "cycles": experiment.cycle_count,
                 "noise standard deviation": experiment.noise_std,
                 "samples": session.sample_count,
                 "lost samples": self._lost if self._counted else 0,

@@ -168,6 +168,7 @@ class Rig:
             assert answer.reason.startswith(("no measurement", "no command", "use_sim_time")), (
                 answer.reason
             )
+            self.run_for(0.1)
             return None
 
         return self.until(accepted, "start of a tune")

@@ -1,0 +1,306 @@
+"""Every bad input is a reason, not silence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from loop_rig import LATCHED, RELIABLE, Rig
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_domain import free_domain
+from std_msgs.msg import Float32, Float64
+
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED_ONLY = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture(scope="module")
+def idle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """Keep a relay that is asked for tunes which it must refuse."""
+    with free_domain() as domain:
+        rig = Rig(domain, tmp_path_factory.mktemp("idle"))
+        try:
+            rig.relay(amplitude=1.0, baseline=0.0, command_min=-2.0, command_max=2.0)
+            yield rig
+        finally:
+            rig.close()
+
+
+class Ends:
+    """The two ends of the loop, made by the onlooker."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        measurement: tuple[Any, QoSProfile] | None = (Float64, RELIABLE),
+        command: tuple[Any, QoSProfile] | None = (Float64, RELIABLE),
+        value: Callable[[int], float] = lambda k: 0.0,
+    ) -> None:
+        self.node = rig.node
+        self.count = 0
+        self.value = value
+        self.made: list[Callable[[], Any]] = []
+        self.commands: list[Any] = []
+        if measurement is not None:
+            self.kind, qos = measurement
+            self.publisher = self.node.create_publisher(self.kind, "measurement", qos)
+            timer = self.node.create_timer(0.01, self.publish)
+            self.made += [
+                lambda: self.node.destroy_timer(timer),
+                lambda: self.node.destroy_publisher(self.publisher),
+            ]
+        if command is not None:
+            kind, qos = command
+            subscription = self.node.create_subscription(
+                kind, "command", self.commands.append, qos
+            )
+            self.made.append(lambda: self.node.destroy_subscription(subscription))
+
+    def publish(self) -> None:
+        self.publisher.publish(self.kind(data=self.value(self.count)))
+        self.count += 1
+
+    def __enter__(self) -> Ends:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for undo in self.made:
+            undo()
+
+
+def refused(rig: Rig, said: str, **request: Any) -> str:
+    """Ask until the answer is the expected one: the graph may not be known at once."""
+
+    def reason() -> str:
+        answer = rig.ask_for_tune(**request)
+        assert not answer.accepted
+        assert not answer.experiment_id
+        if said in answer.reason:
+            return answer.reason
+        rig.run_for(0.1)
+        return ""
+
+    return str(rig.until(reason, f"a refusal with {said!r}"))
+
+
+def test_no_measurement_arriving(idle: Rig) -> None:
+    with Ends(idle, measurement=None):
+        reason = refused(idle, "no measurement has come yet: /measurement has no publisher")
+        assert "\n" not in reason
+
+
+def test_a_measurement_of_another_type(idle: Rig) -> None:
+    with Ends(idle, measurement=(Float32, RELIABLE)):
+        refused(idle, "/onlooker has type std_msgs/msg/Float32, expected std_msgs/msg/Float64")
+
+
+def test_a_measurement_with_incompatible_qos(idle: Rig) -> None:
+    with Ends(idle, measurement=(Float64, BEST_EFFORT)):
+        reason = refused(idle, "/onlooker has an incompatible QoS")
+        assert "reliab" in reason.lower()
+
+
+def test_no_subscriber_on_the_command(idle: Rig) -> None:
+    with Ends(idle, command=None):
+        refused(idle, "no command would arrive: /command has no subscriber")
+
+
+def test_a_command_subscriber_with_incompatible_qos(idle: Rig) -> None:
+    with Ends(idle, command=(Float64, LATCHED_ONLY)):
+        reason = refused(idle, "/onlooker has an incompatible QoS")
+        assert "transient local" in reason.lower()
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "said"),
+    [
+        (-1.0, "amplitude is -1"),
+        (math.nan, "amplitude is nan"),
+        (math.inf, "amplitude is inf"),
+        (5.0, "expected from command_min -2 to command_max 2"),
+    ],
+)
+def test_an_amplitude_that_cannot_be(idle: Rig, amplitude: float, said: str) -> None:
+    with Ends(idle):
+        refused(idle, said, amplitude=amplitude)
+
+
+def set_parameter(rig: Rig, name: str, value: float) -> Any:
+    value_message = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    request = SetParameters.Request(parameters=[Parameter(name=name, value=value_message)])
+    return rig.call(SetParameters, "relay_node/set_parameters", request).results[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("amplitude", -1.0),
+        ("amplitude", math.nan),
+        ("cycle_tolerance", 1.5),
+        ("measurement_timeout", 0.0),
+        ("measurement_timeout", math.nan),
+        ("bias", math.inf),
+        ("baseline", math.inf),
+    ],
+)
+def test_a_parameter_out_of_range(idle: Rig, name: str, value: float) -> None:
+    result = set_parameter(idle, name, value)
+    assert not result.successful
+    assert name in result.reason
+
+
+def test_an_unknown_baseline(idle: Rig) -> None:
+    assert set_parameter(idle, "baseline", math.nan).successful
+    with Ends(idle):
+        refused(idle, "the baseline is not known")
+    assert set_parameter(idle, "baseline", 0.0).successful
+
+
+def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
+    with Ends(idle) as ends:
+
+        def accepted() -> Any:
+            answer = idle.ask_for_tune(dry_run=True)
+            idle.run_for(0.1)
+            return answer if answer.accepted else None
+
+        answer = idle.until(accepted, "a dry run")
+        assert "relay between -0.7 and 1.3 about the baseline 0" in answer.reason
+        assert answer.experiment_id == ""
+        idle.run_for(0.2)
+        assert not ends.commands
+
+
+@pytest.mark.parametrize(
+    ("executable", "parameters", "said"),
+    [
+        ("relay_node", {"amplitude": -1.0}, "amplitude is -1.0, expected at least 0 u"),
+        ("relay_node", {"amplitude": math.nan}, "amplitude is nan"),
+        ("relay_node", {"amplitude": 1}, "amplitude is 1, expected a number with a decimal"),
+        ("relay_node", {"min_cycles": 1}, "min_cycles is 1"),
+        ("identifier_node", {"method": "guess"}, "method is 'guess', expected one of waveform"),
+        ("plant_node", {}, "found neither"),
+    ],
+)
+def test_a_bad_parameter_at_the_start_is_one_line(
+    rig: Rig, executable: str, parameters: dict[str, Any], said: str
+) -> None:
+    process = rig.start(executable, **parameters)
+    assert process.wait() == 2
+    (line,) = process.log.strip().splitlines()
+    assert line.startswith(f"{executable}: ")
+    assert said in line
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_measurement_that_is_no_number_ends_the_tune(rig: Rig, bad: float) -> None:
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    relay = rig.relay(amplitude=1.0, baseline=0.5)
+    with Ends(rig, value=lambda k: math.sin(0.1 * k)) as ends:
+        answer = rig.tune()
+        rig.until(lambda: len(ends.commands) > 50, "commands")
+        ends.value = lambda _: bad
+        ended = rig.until(lambda: experiments, "the record")[-1]
+        rig.until(lambda: ends.commands[-1].data == 0.5, "the safe command")
+    rig.until(lambda: "is closed" in relay.log, "the bag")
+    assert ended.outcome == RelayExperiment.FAILED
+    assert f"is {bad:g}, expected" in ended.reason
+    (record,) = read_experiments(rig.bag(answer)).experiments
+    assert len(record) == len(ended.time) >= 50
+
+
+def test_a_constant_measurement_ends_the_tune(rig: Rig) -> None:
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    gains = rig.listen("pi_gains", PidGains)
+    rig.relay(amplitude=1.0, baseline=0.5, max_duration=1.5, settle_time=0.3)
+    rig.identifier()
+    with Ends(rig, value=lambda _: 20.0) as ends:
+        rig.tune()
+        ended = rig.until(lambda: experiments, "the record")[-1]
+        rig.until(lambda: ends.commands[-1].data == 0.5, "the safe command")
+    assert ended.outcome == RelayExperiment.FAILED
+    assert "max_duration 1.5 s" in ended.reason
+    rig.run_for(0.3)
+    assert not gains
+
+
+def test_while_a_tune_runs(rig: Rig) -> None:
+    relay = rig.relay(amplitude=1.0, baseline=0.5, settle_time=60.0)
+    with Ends(rig):
+        first = rig.tune()
+        second = rig.ask_for_tune()
+        assert not second.accepted
+        assert f"tune {first.experiment_id} is running" in second.reason
+        result = set_parameter(rig, "amplitude", 0.5)
+        assert not result.successful
+        assert f"while tune {first.experiment_id} runs" in result.reason
+        assert relay.running
+
+
+def test_a_folder_that_cannot_be_written_is_said_and_the_tune_goes_on(rig: Rig) -> None:
+    blocked = rig.folder / "a_file"
+    blocked.write_text("not a folder")
+    status = rig.listen("/diagnostics", DiagnosticArray, QoSProfile(depth=10))
+    gains = rig.listen("pi_gains", PidGains)
+    rig.plant(
+        sample_period=0.1,
+        mode="lockstep",
+        structure="fopdt",
+        time_constants=[2.0],
+        dead_time=1.0,
+    )
+    relay = rig.relay(
+        amplitude=1.0, baseline=0.0, sample_period=0.1, record_directory=str(blocked)
+    )
+    rig.identifier()
+    answer = rig.tune()
+    assert "not recorded: cannot make the bag" in answer.reason
+    rig.until(lambda: gains, "gains")
+    rig.until(
+        lambda: any("not recorded" in s.message for m in status for s in m.status),
+        "the diagnostics",
+    )
+    assert "the tune goes on, but not recorded" in relay.log
+
+
+def test_without_an_identifier_the_bag_is_closed_with_the_reason(rig: Rig) -> None:
+    rig.plant(
+        sample_period=0.1,
+        mode="lockstep",
+        structure="fopdt",
+        time_constants=[2.0],
+        dead_time=1.0,
+    )
+    relay = rig.relay(amplitude=1.0, baseline=0.0, sample_period=0.1, model_timeout=0.5)
+    answer = rig.tune()
+    said = "is closed without transfer_function and pi_gains, not come within 0.5 s"
+    rig.until(lambda: said in relay.log, "the end of the recording")
+    (record,) = read_experiments(rig.bag(answer)).experiments
+    assert record.experiment_id == answer.experiment_id
+
+
+def test_the_identifier_survives_messages_that_make_no_sense(rig: Rig) -> None:
+    models = rig.listen("transfer_function", TransferFunction)
+    identifier = rig.identifier()
+    publisher = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
+    rig.until(publisher.get_subscription_count, "the identifier")
+    empty = RelayExperiment(experiment_id="empty", outcome=1)
+    nowhere = RelayExperiment(experiment_id="nowhere", outcome=77)
+    torn = RelayExperiment(experiment_id="torn", outcome=1, time=[0.0, 1.0], measurement=[1.0])
+    backwards = RelayExperiment(experiment_id="backwards", outcome=1)
+    backwards.time = [0.0, 2.0, 1.0]
+    backwards.measurement = backwards.command = [1.0, 1.0, 1.0]
+    for message in (empty, nowhere, torn, backwards):
+        publisher.publish(message)
+        said = f"experiment {message.experiment_id} cannot be used"
+        rig.until(lambda said=said: said in identifier.log, said)
+    assert identifier.running
+    assert not models
