@@ -57,6 +57,8 @@ class Identification:
     :param fit: quality of the fit.
     :param warnings: sentences that the user must read.
     :param undetermined: parameters whose 95 % interval is wider than 20 % of the value.
+    :param fitted: the model's measurement at the record's samples, with all that was estimated
+        beside the model [y], shape (n,); NaN: not part of the fit; empty: not computed.
     """
 
     method: str
@@ -74,6 +76,7 @@ class Identification:
     fit: FitReport = field(default_factory=FitReport)
     warnings: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
+    fitted: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @property
     def structure(self) -> str:
@@ -95,6 +98,7 @@ def with_uncertainty(
     quantile: float = 1.96,
     fit: FitReport | None = None,
     warnings: tuple[str, ...] = (),
+    fitted: FloatArray | None = None,
 ) -> Identification:
     """Complete an identification: intervals of the parameters and of the ultimate point.
 
@@ -112,6 +116,7 @@ def with_uncertainty(
     :param quantile: half width of a 95 % interval in standard deviations.
     :param fit: quality of the fit.
     :param warnings: sentences for the user.
+    :param fitted: the model's measurement at the samples; None: not computed.
     :raises IdentificationError: if a value is not finite.
     """
     if not bool(np.all(np.isfinite(values))):
@@ -155,6 +160,7 @@ def with_uncertainty(
         fit or FitReport(),
         warnings,
         undetermined,
+        np.empty(0) if fitted is None else fitted,
     )
 
 

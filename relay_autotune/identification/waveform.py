@@ -263,6 +263,9 @@ def _report(
     units = np.ones(p)
     units[0] = scale
     spread = scale * math.sqrt(float(np.mean((problem.y - problem.y.mean()) ** 2)))
+    # The samples of the fit are the last ones of the record.
+    fitted = np.full(len(record), math.nan)
+    fitted[-n:] = record.measurement[-n:] - scale * state.residual
     fit = FitReport(
         residual_rms=rms,
         noise_std=record.noise_std,
@@ -279,6 +282,7 @@ def _report(
         quantile=float(stdtrit(degrees, 0.975)),
         fit=fit,
         warnings=_warnings(record, fit, coloured, scale, problem),
+        fitted=fitted,
     )
 
 

@@ -1,0 +1,253 @@
+"""The demo: plant, relay and identifier as three processes, tuned by one service call."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
+from relay_autotune.autotune import Analysis, analyse
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.cli.table import digits, process_text
+from relay_autotune.document import document, model_fields, to_json
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.models import TransferFunction
+from relay_autotune.nodes.domain import free_domain
+from relay_autotune.report import draw
+from relay_autotune.ultimate import ultimate_point
+
+TRUTH = TransferFunction.fopdt(1.65, 20.0, 10.0)
+PERIOD = 0.1
+NOISE_STD = 0.05
+SEED = 1
+BASELINE, REST = 2.0, 40.0
+AMPLITUDE = 1.0
+
+_DEADLINE = 50.0
+
+
+class DemoError(RelayAutotuneError):
+    """The demo could not go on."""
+
+
+@dataclass(frozen=True)
+class _Started:
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+
+def main() -> int:
+    """Run the demo; leave bag, result and picture in ``demo_output/``."""
+    output = Path("demo_output")
+    try:
+        if output.exists():
+            shutil.rmtree(output)
+        output.mkdir()
+        with free_domain() as domain:
+            bag, seen = _run(output, domain)
+        shutil.move(bag, output / "bag")
+        # The logs are for the case that something went wrong.
+        for left in (output / "records", output / "log"):
+            shutil.rmtree(left, ignore_errors=True)
+        for log in output.glob("*.log"):
+            log.unlink()
+        return _finish(output, seen)
+    except (RelayAutotuneError, OSError) as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("demo: interrupted", file=sys.stderr)
+        return 130
+
+
+def _run(output: Path, domain: int) -> tuple[Path, Any]:
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(output / "log"),
+    }
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    plant = {
+        "mode": "lockstep",
+        "sample_period": PERIOD,
+        "structure": TRUTH.structure,
+        "gain": TRUTH.gain,
+        "time_constants": f"[{TRUTH.time_constants[0].real}]",
+        "dead_time": TRUTH.dead_time,
+        "operating_point": f"[{REST}, {BASELINE}]",
+        "noise_std": NOISE_STD,
+        "seed": SEED,
+    }
+    relay = {
+        "amplitude": AMPLITUDE,
+        "baseline": BASELINE,
+        "sample_period": PERIOD,
+        "record_directory": str(output / "records"),
+    }
+    print("The process, which only plant_node knows:")
+    print(f"  {process_text(TRUTH)}, noise {NOISE_STD} y, sampled every {PERIOD} s, in lockstep")
+    print("Three processes in a ROS domain of their own:")
+    started: list[_Started] = []
+    try:
+        for name, parameters in (
+            ("plant_node", plant),
+            ("relay_node", relay),
+            ("identifier_node", {}),
+        ):
+            started.append(_start(name, parameters, environment, output))
+            print(f"  {name}, process {started[-1].process.pid}")
+        return _watch(started, output, domain)
+    finally:
+        _end(started)
+
+
+def _start(
+    name: str, parameters: dict[str, Any], environment: dict[str, str], output: Path
+) -> _Started:
+    executable = shutil.which(name)
+    if executable is None:
+        raise DemoError(f"{name} is not on the PATH: run `. ./env.sh`, or `make demo`")
+    arguments = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
+    log = output / f"{name}.log"
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [executable, "--ros-args", *arguments],
+            env=environment,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    return _Started(name, process, log)
+
+
+def _end(started: list[_Started]) -> None:
+    for each in started:
+        if each.process.poll() is None:
+            each.process.send_signal(signal.SIGINT)
+    for each in started:
+        try:
+            each.process.wait(6.0)
+        except subprocess.TimeoutExpired:
+            each.process.kill()
+            each.process.wait()
+
+
+def _watch(started: list[_Started], output: Path, domain: int) -> tuple[Path, Any]:
+    # ROS is looked for only when the demo runs, so that its errors are one line.
+    from relay_autotune.cli.onlooker import Onlooker
+
+    deadline = time.monotonic() + _DEADLINE
+
+    def alive() -> None:
+        for each in started:
+            if each.process.poll() is not None:
+                raise DemoError(f"{each.name} ended by itself; its log is {each.log}")
+        if time.monotonic() > deadline:
+            raise DemoError(f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}")
+
+    with Onlooker(domain, alive) as onlooker:
+        answer = onlooker.start_tune()
+        print("One service call, relay_node/start_tune:")
+        print(f"  accepted: experiment {answer.experiment_id}")
+        _show_cycles(onlooker)
+        onlooker.wait(lambda: onlooker.gains)
+        bag = output / "records" / answer.experiment_id
+        relay_log = next(each.log for each in started if each.name == "relay_node")
+        onlooker.wait(lambda: "is closed" in relay_log.read_text(errors="replace"))
+        return bag, onlooker.gains[-1]
+
+
+def _show_cycles(onlooker: Any) -> None:
+    print("  cycle   period s   high s   low s   peaks y           K_u so far")
+    shown: list[Any] = []
+    while not onlooker.experiments or len(shown) < len(onlooker.cycles):
+        onlooker.wait(lambda: onlooker.experiments or len(onlooker.cycles) > len(shown))
+        for cycle in onlooker.cycles[len(shown) :]:
+            fits = [m for m in onlooker.models if not m.final]
+            so_far = f"{fits[-1].ultimate_gain:.3f}" if fits else ""
+            if fits and math.isfinite(fits[-1].ultimate_gain_std):
+                so_far += f" ± {1.96 * fits[-1].ultimate_gain_std:.3f}"
+            settled = "   settled" if cycle.converged else ""
+            print(
+                f"  {cycle.index + 1:>5}   {cycle.period:>8.2f}   {cycle.period_high:>6.2f}   "
+                f"{cycle.period_low:>5.2f}   {cycle.peak_min:>6.3f} {cycle.peak_max:>6.3f}   "
+                f"{so_far}{settled}"
+            )
+            shown.append(cycle)
+    end = onlooker.experiments[-1]
+    print(f"  {end.reason}")
+
+
+def _finish(output: Path, live: Any) -> int:
+    recording = read_experiments(output / "bag")
+    found = analyse(recording.experiments[0])
+    if found.model is None or found.best_gains is None:
+        raise DemoError(f"nothing was identified: {found.reason}")
+    _compare(found)
+    gains = found.best_gains
+    same = (live.kc, live.ti, live.ms) == (gains.kc, gains.ti, gains.ms)
+    print(
+        "The bag, replayed, gives "
+        + ("the same gains to the last digit." if same else "OTHER gains than the live nodes.")
+    )
+    result = document(str(output / "bag"), [found])
+    result["truth"] = model_fields(TRUTH)
+    (output / "result.json").write_text(to_json(result) + "\n")
+    draw(
+        found,
+        output / "figure.png",
+        title=f"Relay test: {process_text(found.model.model)}  (true: {process_text(TRUTH)})",
+    )
+    print(f"Left in {output}/: bag/, result.json, figure.png")
+    print(f"  try: . ./env.sh && replay {output}/bag")
+    return 0 if same else 1
+
+
+def _compare(found: Analysis) -> None:
+    model, gains, truth = found.model, found.best_gains, ultimate_point(TRUTH)
+    assert model is not None
+    assert gains is not None
+    assert truth is not None
+    true = (TRUTH.gain, TRUTH.time_constants[0].real, TRUTH.dead_time)
+    print("The process and what was identified (waveform fit):")
+    print("                      true   identified     95 % interval          error")
+    rows = [
+        (name, value, estimate, (low, high))
+        for name, value, estimate, low, high in zip(
+            ("gain y/u", "time constant s", "dead time s"),
+            true,
+            model.values,
+            model.ci95_low,
+            model.ci95_high,
+            strict=True,
+        )
+    ]
+    for name, value, estimate, std in (
+        ("K_u u/y", truth.gain, model.ultimate_gain, model.ultimate_gain_std),
+        ("w_u rad/s", truth.frequency, model.ultimate_frequency, model.ultimate_frequency_std),
+    ):
+        rows.append((name, value, estimate, (estimate - 1.96 * std, estimate + 1.96 * std)))
+    for name, value, estimate, (low, high) in rows:
+        interval = f"{digits(low)} to {digits(high)}"
+        error = 100.0 * (estimate / value - 1.0)
+        found_text = f"{digits(estimate):>10}     {interval:<20} {error:+.2f} %"
+        print(f"  {name:<16} {value:>7.4g}   {found_text}")
+    print(f"PI gains ({gains.reason}):")
+    print(
+        f"  kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s   "
+        f"(parallel: p {digits(gains.p)}, i {digits(gains.i)})   "
+        f"Ms {gains.ms:.2f}, for 95 % of the models below {gains.ms_95:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

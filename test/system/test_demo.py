@@ -1,0 +1,59 @@
+"""The demo, as `make demo` runs it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from relay_autotune.bag.reader import read_experiments
+
+
+def test_the_demo_tunes_and_leaves_bag_result_and_picture(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "relay_autotune.cli.demo"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the same gains to the last digit" in done.stdout
+    output = tmp_path / "demo_output"
+    assert {p.name for p in output.iterdir()} == {"bag", "result.json", "figure.png"}
+    result = json.loads((output / "result.json").read_text())
+    truth, experiment = result["truth"], result["experiments"][0]
+    model = experiment["models"][experiment["selected"]]
+    assert experiment["outcome"] == "completed"
+    assert model["structure"] == "fopdt"
+    for name in ("gain", "dead_time"):
+        assert model[name] == pytest.approx(truth[name], rel=0.03)
+    assert model["time_constants"] == pytest.approx(truth["time_constants"], rel=0.03)
+    gains = experiment["gains"][experiment["recommended"]]
+    assert gains["kc"] > 0.0
+    assert 1.0 < gains["ms"] <= gains["ms_95"] < 2.0
+    assert len(read_experiments(output / "bag").experiments) == 1
+    assert (output / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_demo_without_executables_says_so(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "relay_autotune.cli.demo"],
+        cwd=tmp_path,
+        env={**_environment(), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("demo: plant_node is not on the PATH")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def _environment() -> dict[str, str]:
+    import os
+
+    return dict(os.environ)
