@@ -12,9 +12,11 @@ from relay_autotune.identification import (
     DEFAULT_METHOD,
     METHODS,
     Identification,
+    Known,
     identify,
     method_named,
 )
+from relay_autotune.identification.known import NOTHING
 from relay_autotune.record import Cycle, Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES, Gains, ensemble, rule_named, tune
 
@@ -70,6 +72,7 @@ def analyse(
     *,
     method: str = DEFAULT_METHOD,
     rule: str = DEFAULT_RULE,
+    known: Known = NOTHING,
     final: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
@@ -81,6 +84,7 @@ def analyse(
     :param record: the experiment.
     :param method: the method whose model counts.
     :param rule: the rule whose gains count.
+    :param known: what is known of the process beforehand.
     :param final: False while the experiment still runs: only the chosen model, no gains.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
@@ -90,12 +94,12 @@ def analyse(
     cycles: tuple[Cycle, ...] = ()
     try:
         cycles = cycles_of(record)
-        chosen = _guarded(record, method)
+        chosen = _guarded(record, method, known)
     except RelayAutotuneError as error:
         return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
     models = [chosen]
     if final:
-        models += _others(record, method)
+        models += _others(record, method, known)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
         return found
@@ -121,23 +125,23 @@ def analyse(
     return Analysis(record, cycles, found.models, 0, tuple(gains), 0)
 
 
-def _guarded(record: Record, method: str) -> Identification:
+def _guarded(record: Record, method: str, known: Known) -> Identification:
     try:
-        return identify(record, method)
+        return identify(record, method, known)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise IdentificationError(
             f"{method} broke down on this record ({error}): it holds no usable response"
         ) from error
 
 
-def _others(record: Record, method: str) -> list[Identification]:
+def _others(record: Record, method: str, known: Known) -> list[Identification]:
     """Models of the other methods, for comparison; one that does not apply is left out."""
     found = []
     for name in METHODS:
         if name == method:
             continue
         try:
-            found.append(_guarded(record, name))
+            found.append(_guarded(record, name, known))
         except RelayAutotuneError:
             continue
     return found

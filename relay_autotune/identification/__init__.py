@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.record import Record
 
-Method = Callable[[Record], Identification]
+Method = Callable[[Record, Known], Identification]
 
 METHODS: dict[str, Method] = {
     "waveform": identify_waveform,
@@ -19,7 +20,15 @@ METHODS: dict[str, Method] = {
 }
 DEFAULT_METHOD = "waveform"
 
-__all__ = ["DEFAULT_METHOD", "METHODS", "FitReport", "Identification", "identify", "method_named"]
+__all__ = [
+    "DEFAULT_METHOD",
+    "METHODS",
+    "FitReport",
+    "Identification",
+    "Known",
+    "identify",
+    "method_named",
+]
 
 
 def method_named(name: str) -> Method:
@@ -32,11 +41,14 @@ def method_named(name: str) -> Method:
     return METHODS[name]
 
 
-def identify(record: Record, method: str = DEFAULT_METHOD) -> Identification:
+def identify(
+    record: Record, method: str = DEFAULT_METHOD, known: Known = NOTHING
+) -> Identification:
     """Identify a model from a record.
 
     :param record: the experiment.
     :param method: one of ``METHODS``.
+    :param known: what is known of the process beforehand.
     :raises IdentificationError: if the method is unknown or the record does not tell a model.
     """
-    return method_named(method)(record)
+    return method_named(method)(record, known)

@@ -20,6 +20,7 @@ from scipy.special import stdtrit
 from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, infer_settings, limit_cycle
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.fourier import cycle_means, frequency_point
+from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, with_uncertainty
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
@@ -143,9 +144,24 @@ def fopdt_from_unbiased(
     i = int(signs[-1])
     t = math.exp(float(brentq(mismatch, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-15)))
     k = response * math.hypot(w0 * t, 1.0)
-    whole = _log_ratio(mu * k + amplitude, mu * k - amplitude, "eq 21")
-    dead = _log_ratio(mu * k - epsilon, mu * k - amplitude, "eq 22")
-    return k, t, 0.5 * period * dead / whole
+    return fopdt_with_gain(k, period, amplitude, mu, epsilon)
+
+
+def fopdt_with_gain(
+    gain: float, period: float, amplitude: float, mu: float, epsilon: float
+) -> tuple[float, float, float]:
+    """Return (K, T, L) from a symmetric limit cycle and the gain (eqs 21 and 22).
+
+    :param gain: K > 0 [y/u].
+    :param period: T_u [s].
+    :param amplitude: A, highest deviation of y [y].
+    :param mu: amplitude of the relay [u].
+    :param epsilon: its hysteresis [y].
+    :raises IdentificationError: if no FOPDT process of this gain has the limit cycle.
+    """
+    whole = _log_ratio(mu * gain + amplitude, mu * gain - amplitude, "eq 21")
+    dead = _log_ratio(mu * gain - epsilon, mu * gain - amplitude, "eq 22")
+    return gain, 0.5 * period / whole, 0.5 * period * dead / whole
 
 
 def _log_ratio(numerator: float, denominator: float, where: str) -> float:
@@ -174,35 +190,54 @@ def steady_state(record: Record, settings: RelaySettings) -> tuple[float, bool]:
     return settings.setpoint, False
 
 
-def identify_biased(record: Record) -> Identification:
+def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a FOPDT model from a biased relay test (eqs 6 to 11).
 
     Deviations are taken from the measured steady state; where the set-point lies elsewhere, the
     bias about it is ``mu0 - (setpoint - rest)/K``.
 
     :param record: a relay test with a bias.
+    :param known: a known gain takes the place of eq 6.
     :raises IdentificationError: if the relay was unbiased, or the numbers are no limit cycle of a
         FOPDT process.
     """
-    return _identify("wang_biased", record, _measure_biased)
+    return _identify("wang_biased", record, known, _measure_biased)
 
 
-def identify_unbiased(record: Record) -> Identification:
+def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a FOPDT model from an unbiased relay test (eqs 22 to 25).
 
     :param record: a relay test without bias.
+    :param known: a known gain takes the place of eqs 23 to 25.
     :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
     """
-    return _identify("wang_unbiased", record, _measure_unbiased)
+    return _identify("wang_unbiased", record, known, _measure_unbiased)
 
 
-def _measure_biased(record: Record, settings: RelaySettings, cycle: LimitCycle) -> FloatArray:
+def _measure_biased(
+    record: Record, settings: RelaySettings, cycle: LimitCycle, known: Known
+) -> FloatArray:
     # With the command turned round a reverse-acting process has a positive gain.
     sign = -1 if settings.reverse_acting else 1
     high, low = (cycle.period_high, cycle.period_low)[::sign]
     about = settings.setpoint
     rest, _ = steady_state(record, settings)
     seen = FopdtCycle(high, low, cycle.peak_max - about, cycle.peak_min - about)
+    gain = (
+        _static_gain(record, settings, sign, rest) if math.isnan(known.gain) else sign * known.gain
+    )
+    if not gain > 0.0:
+        raise IdentificationError(
+            f"a gain of {sign * gain:g} is against the direction of the relay: the state before "
+            "the test was not steady, the load changed, or the known gain has the wrong sign"
+        )
+    bias = sign * settings.bias - (about - rest) / gain
+    k, t, dead = fopdt_from_biased(seen, gain, settings.amplitude, bias, settings.hysteresis)
+    return np.array((sign * k, t, dead))
+
+
+def _static_gain(record: Record, settings: RelaySettings, sign: int, rest: float) -> float:
+    """Eq 6, with the command turned round where the process is reverse-acting."""
     mean_y, mean_u = cycle_means(record)
     excursion = sign * (mean_u - settings.baseline)
     if abs(excursion) < _LEAST_BIAS * settings.amplitude:
@@ -211,35 +246,35 @@ def _measure_biased(record: Record, settings: RelaySettings, cycle: LimitCycle) 
             "the measurement (eq 6) tells no gain: use a biased relay, or the method "
             "wang_unbiased; an integrating process always has a mean of zero"
         )
-    gain = (mean_y - rest) / excursion
-    if not gain > 0.0:
-        raise IdentificationError(
-            f"the means over whole cycles give a gain of {gain:g} against the direction of the "
-            "relay: the state before the test was not steady, or the load changed"
-        )
-    bias = sign * settings.bias - (about - rest) / gain
-    k, t, dead = fopdt_from_biased(seen, gain, settings.amplitude, bias, settings.hysteresis)
-    return np.array((sign * k, t, dead))
+    return (mean_y - rest) / excursion
 
 
-def _measure_unbiased(record: Record, settings: RelaySettings, cycle: LimitCycle) -> FloatArray:
+def _measure_unbiased(
+    record: Record, settings: RelaySettings, cycle: LimitCycle, known: Known
+) -> FloatArray:
     if abs(settings.bias) > 0.01 * settings.amplitude:
         raise IdentificationError(
             f"the relay had a bias of {settings.bias:g}, but eqs 19 to 25 hold for a symmetric "
             "one: use the method wang_biased"
         )
-    response = abs(frequency_point(record).value)
+    sign = -1 if settings.reverse_acting else 1
     amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
-    k, t, dead = fopdt_from_unbiased(
-        cycle.period, amplitude, response, settings.amplitude, settings.hysteresis
-    )
-    return np.array((-k if settings.reverse_acting else k, t, dead))
+    if math.isnan(known.gain):
+        response = abs(frequency_point(record).value)
+        k, t, dead = fopdt_from_unbiased(
+            cycle.period, amplitude, response, settings.amplitude, settings.hysteresis
+        )
+    else:
+        k, t, dead = fopdt_with_gain(
+            sign * known.gain, cycle.period, amplitude, settings.amplitude, settings.hysteresis
+        )
+    return np.array((sign * k, t, dead))
 
 
-_Measure = Callable[[Record, RelaySettings, LimitCycle], FloatArray]
+_Measure = Callable[[Record, RelaySettings, LimitCycle, Known], FloatArray]
 
 
-def _identify(method: str, record: Record, measure: _Measure) -> Identification:
+def _identify(method: str, record: Record, known: Known, measure: _Measure) -> Identification:
     """Measure on the averaged limit cycle; its scatter from cycle to cycle is the uncertainty."""
     settings = record.settings or infer_settings(record)
     bounds = record.cycle_start or find_cycles(record)
@@ -252,12 +287,12 @@ def _identify(method: str, record: Record, measure: _Measure) -> Identification:
     _, measured = steady_state(record, settings)
     first, last = average.cycles[0], average.cycles[-1]
     whole = replace(record, settings=settings, cycle_start=bounds[first : last + 2])
-    values = measure(whole, settings, average)
+    values = measure(whole, settings, average, known)
     singles = []
     for index in average.cycles:
         one = replace(whole, cycle_start=bounds[index : index + 2])
         try:
-            singles.append(measure(one, settings, _single(record, index)))
+            singles.append(measure(one, settings, _single(record, index), known))
         except IdentificationError:
             # One cycle may be too noisy for the logarithms; the others still tell the scatter.
             continue

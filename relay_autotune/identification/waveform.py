@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.lags import Fopdt
 from relay_autotune.identification.residuals import covariance_meat, ljung_box
 from relay_autotune.identification.result import FitReport, Identification, with_uncertainty
@@ -176,13 +177,14 @@ def _select(problem: _Problem, first: _State, floor: float) -> tuple[_Problem, _
     return min(candidates, key=lambda c: _criterion(c[1].cost, n, _parameters(c[1]), floor))
 
 
-def identify_waveform(record: Record, structure: str = "fopdt") -> Identification:
+def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a model from all samples of a record.
 
     :param record: any record whose command moves; baseline samples before the test help.
-    :param structure: one of ``STRUCTURES``.
+    :param known: its structure, one of ``STRUCTURES``, is fitted; by default a FOPDT.
     :raises IdentificationError: if the record holds too little, or no response to the command.
     """
+    structure = known.structure or Fopdt.structure
     if structure not in STRUCTURES:
         raise IdentificationError(
             f"the waveform fit has no structure {structure!r}; it has {', '.join(STRUCTURES)}"
@@ -199,9 +201,9 @@ def identify_waveform(record: Record, structure: str = "fopdt") -> Identificatio
         # What the process was fed before the record is unknown, and acts for one dead time.
         after = time >= time[0] + float(state.theta[1])
         if np.count_nonzero(after) > 4 * _parameters(state):
-            known = chosen.part(after)
-            chosen, state = known, _refine(known, state.theta)
-            floor = known.y.size * _NEGLIGIBLE**2
+            chosen = chosen.part(after)
+            state = _refine(chosen, state.theta)
+            floor = chosen.y.size * _NEGLIGIBLE**2
     _require_response(chosen, state, floor)
     return _report(record, chosen, state, floor, scale)
 

@@ -10,11 +10,13 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.fourier import cycle_means, frequency_point
+from relay_autotune.identification.known import Known
 from relay_autotune.identification.wang1997 import (
     FopdtCycle,
     fopdt_from_biased,
     fopdt_from_unbiased,
     fopdt_limit_cycle,
+    fopdt_with_gain,
     identify_biased,
     identify_unbiased,
 )
@@ -138,3 +140,20 @@ def test_without_whole_cycles_there_is_no_point():
     record = replace(_record(1.65, 0.3, 501), cycle_start=())
     with pytest.raises(IdentificationError, match="whole cycles"):
         frequency_point(record)
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T4"))
+def test_unbiased_relay_with_a_known_gain(name, inputs, exact, tol):
+    p = inputs
+    found = fopdt_with_gain(exact["K"], p["Tu"], p["A"], p["mu"], p["eps"])
+    assert found == pytest.approx((exact["K"], exact["T"], exact["L"]), rel=tol)
+
+
+@pytest.mark.parametrize(("method", "bias"), [(identify_biased, 0.3), (identify_unbiased, 0.0)])
+@pytest.mark.parametrize("gain", [1.65, -1.65])
+def test_a_known_gain_is_used(method, bias, gain):
+    found = method(_record(gain, bias), Known(gain=gain))
+    assert found.values[0] == gain
+    assert found.values == pytest.approx([gain, 20.0, 10.0], rel=1e-3)
+    with pytest.raises(IdentificationError):
+        method(_record(gain, bias, 2001), Known(gain=-gain))

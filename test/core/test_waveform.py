@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import Known
 from relay_autotune.identification.residuals import covariance_meat, ljung_box
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.models import TransferFunction
@@ -209,7 +210,7 @@ def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command
 
 def test_an_unknown_structure_is_refused():
     with pytest.raises(IdentificationError, match="no structure"):
-        identify_waveform(_staircase()[2], "ladder")
+        identify_waveform(_staircase()[2], Known(structure="ladder"))
 
 
 @settings(deadline=None, max_examples=40)
