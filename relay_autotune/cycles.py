@@ -11,7 +11,7 @@ import numpy as np
 
 from relay_autotune.errors import RecordError
 from relay_autotune.foreign import find_cycles, infer_settings
-from relay_autotune.record import Cycle, FloatArray, Record
+from relay_autotune.record import Cycle, FloatArray, Outcome, Record
 
 __all__ = [
     "MIN_CYCLES",
@@ -195,18 +195,17 @@ def cycles_of(
 ) -> tuple[Cycle, ...]:
     """Compute the whole cycles of a record.
 
-    The cycles are bounded by ``record.cycle_start``; where that is empty and the record is not
-    one of our experiments (it has no settings), by the switches of its command, as found by
-    :func:`~relay_autotune.foreign.find_cycles`.
+    The cycles are bounded by ``record.cycle_start``. Where that is empty and it is not known how
+    the experiment ended (a recording that was cut short, or another program's), they are bounded
+    by the switches of the command, as found by
+    :func:`~relay_autotune.foreign.find_cycles`; and settings that are missing are inferred.
 
     :param record: the record of an experiment.
     :param min_cycles: number of successive cycles that must agree for ``converged``.
     :param tolerance: relative difference allowed between them, see :func:`agree`.
     """
-    bounds, settings = record.cycle_start, record.settings
-    if settings is None:
-        settings = infer_settings(record)
-        bounds = bounds or find_cycles(record)
+    bounds = _bounds(record)
+    settings = record.settings or infer_settings(record)
     if settings is None or len(bounds) < 2:
         return ()
     cycles: list[Cycle] = []
@@ -226,6 +225,12 @@ def cycles_of(
             )
         )
     return tuple(cycles)
+
+
+def _bounds(record: Record) -> tuple[int, ...]:
+    if record.cycle_start or record.outcome is not Outcome.UNKNOWN:
+        return record.cycle_start
+    return find_cycles(record)
 
 
 @dataclass(frozen=True)
@@ -333,8 +338,7 @@ def first_harmonic(
     :raises RecordError: if there is no whole cycle, or the command has no such component.
     """
     average = limit_cycle(record, min_cycles=min_cycles, tolerance=tolerance)
-    bounds = record.cycle_start if record.settings is not None else ()
-    bounds = bounds or find_cycles(record)
+    bounds = _bounds(record)
     first, last = bounds[average.cycles[0]], bounds[average.cycles[-1] + 1]
     part = slice(first, last + 1)
     t = record.time[part] - record.time[first]

@@ -15,12 +15,14 @@ _RUN = 3
 # or so many samples where that is later: without noise a process without dead time is seen to
 # respond at the first sample, and an interval then says nothing of how fast it is.
 _FIRST_LOOK = 5
-_LAST_LOOK = 20
+_LAST_LOOK = 50
 _LAST_LOOK_SAMPLES = 200
 
-# Parts of the largest deviation: differing by less is level, being nearer to the rest is back.
+# Parts of the largest deviation: differing by less is level, being nearer to the rest is back,
+# and having more left at the last look outweighs what was before.
 _LEVEL = 0.05
 _BACK = 0.15
+_LEFT = 0.5
 
 
 class ResponseDetector:
@@ -88,8 +90,9 @@ class DirectionWatch:
     - the sum of m is negative: the other side is the answer;
     - m was level for half of the time (an integrating or very slow process); or it goes back ever
       more slowly and its geometric continuation ends at the rest, or before; or it was at rest
-      for a quarter of the time: the first side is the answer;
-    - after 20 intervals, and 200 samples, the sum of m decides.
+      for half of the time: the first side is the answer;
+    - after 50 intervals, and 200 samples, the side is the answer on which half of the largest
+      deviation or more is left; or else that of the sum of m.
 
     An unstable process runs away meanwhile: its sign has to be given.
 
@@ -142,8 +145,13 @@ class DirectionWatch:
         if self._is_level() or self._tends_back() or self._is_back():
             return self._side
         if len(self._means) >= _LAST_LOOK and self._samples >= _LAST_LOOK_SAMPLES:
-            return self._side if total >= 0.0 else -self._side
+            return self._side if self._balance() >= 0.0 else -self._side
         return 0
+
+    def _balance(self) -> float:
+        quarter = self._means[-(-3 * len(self._means) // 4) :]
+        left = sum(quarter) / len(quarter)
+        return left if abs(left) >= _LEFT * self.largest else sum(self._means)
 
     def _is_level(self) -> bool:
         half = len(self._means) // 2
@@ -169,10 +177,10 @@ class DirectionWatch:
         return end >= -_BACK * self.largest
 
     def _is_back(self) -> bool:
-        # For a quarter of the time, so that passing through the rest is not taken for staying.
-        quarter = -(-len(self._means) // 4)
+        # For half of the time, so that passing through the rest is not taken for staying.
+        half = len(self._means) // 2
         largest = self.largest
         return all(
             abs(mean) <= max(_BACK * largest, 2.0 * error)
-            for mean, error in zip(self._means[-quarter:], self._errors[-quarter:], strict=True)
+            for mean, error in zip(self._means[half:], self._errors[half:], strict=True)
         )

@@ -217,11 +217,11 @@ class ExperimentParameters:
     def _validate_each(self) -> None:
         for parameter in PARAMETERS:
             value = getattr(self, parameter.name)
-            if isinstance(parameter.default, int) and value != int(value):
-                raise ParameterError(f"{parameter.name} is {value:g}, expected a whole number")
             problem = parameter.problem(value)
             if problem is None and math.isinf(value) and parameter.name not in _LIMITS:
                 problem = f"{parameter.name} is {value:g}, expected a finite number"
+            if problem is None and isinstance(parameter.default, int) and value != int(value):
+                problem = f"{parameter.name} is {value:g}, expected a whole number"
             if problem is not None:
                 raise ParameterError(problem)
 

@@ -466,7 +466,7 @@ def test_stamps_of_samples_after_the_end_are_left_out():
 
 
 def test_parameters_are_checked_against_the_baseline():
-    with pytest.raises(ParameterError, match="the high level of the relay is 10.3"):
+    with pytest.raises(ParameterError, match=r"the high level of the relay is 10\.3"):
         experiment(baseline=9.0, command_max=10.0)
 
 
