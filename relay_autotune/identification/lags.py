@@ -82,30 +82,15 @@ class Fopdt:
         return e[None, :], np.stack((by_tau, np.zeros_like(e)))[:, None, :]
 
     @staticmethod
-    def starts(shortest: float, longest: float) -> list[FloatArray]:
-        """Return a coarse grid of (tau, D).
+    def starts(shortest: float, longest: float) -> tuple[FloatArray, FloatArray]:
+        """Return a coarse grid: shapes, here (tau,), and dead times to try with each of them.
 
         :param shortest: smallest time that the samples resolve [s].
         :param longest: longest stretch in which the dead time must lie [s].
+        :return: shapes, shape (s, m - 1), and dead times [s], shape (d,).
         """
         taus = np.geomspace(0.5 * shortest, 30.0 * longest, 14)
-        fractions = (
-            0.0,
-            0.01,
-            0.03,
-            0.06,
-            0.1,
-            0.15,
-            0.2,
-            0.27,
-            0.35,
-            0.45,
-            0.55,
-            0.67,
-            0.8,
-            0.95,
-        )
-        return [np.array((tau, f * longest)) for tau in taus for f in fractions]
+        return taus[:, None], longest * np.array(_SHARES)
 
     @staticmethod
     def scale(theta: FloatArray) -> FloatArray:

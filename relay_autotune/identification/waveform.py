@@ -137,12 +137,29 @@ def _time_scales(time: FloatArray, u: PiecewiseConstant) -> tuple[float, float]:
     return shortest, min(1.1 * float(np.max(np.diff(inside))), rest)
 
 
+def _costs(problem: _Problem, shape: FloatArray, dead_times: FloatArray) -> FloatArray:
+    """Return the sums of squares that a shape and a constant leave, for each dead time."""
+    # A dead time only moves the response, so that one pass over moved samples gives all of them.
+    moved = (problem.time - dead_times[:, None]).ravel()
+    columns, _ = problem.structure.columns(np.append(shape, 0.0), moved, problem.u)
+    columns = columns.reshape(-1, dead_times.size, problem.time.size)
+    columns = columns - columns.mean(axis=2, keepdims=True)
+    size = np.sqrt(np.einsum("kdn,kdn->kd", columns, columns))
+    size[size == 0.0] = 1.0
+    columns = columns / size[:, :, None]
+    y = problem.y - problem.y.mean()
+    projection = np.einsum("kdn,n->dk", columns, y)
+    inverse = np.linalg.pinv(np.einsum("kdn,ldn->dkl", columns, columns), hermitian=True)
+    return np.asarray(y @ y - np.einsum("dk,dkl,dl->d", projection, inverse, projection))
+
+
 def _start(problem: _Problem) -> _State:
     shortest, longest = _time_scales(problem.time, problem.u)
     stride = max(1, problem.time.size // _GRID_SAMPLES)
     coarse = problem.part(slice(None, None, stride))
-    grid = problem.structure.starts(min(shortest, 0.1 * longest), longest)
-    costs = np.array([_evaluate(coarse, theta).cost for theta in grid])
+    shapes, dead_times = problem.structure.starts(min(shortest, 0.1 * longest), longest)
+    grid = [np.append(shape, dead_time) for shape in shapes for dead_time in dead_times]
+    costs = np.concatenate([_costs(coarse, shape, dead_times) for shape in shapes])
     best: list[FloatArray] = []
     for i in np.argsort(costs, kind="stable"):
         apart = [float(np.abs(np.log((grid[i] + longest * 1e-3) / b)).max()) for b in best]
