@@ -1,4 +1,4 @@
-r"""Exact time response of a rational transfer function to constant inputs.
+r"""Exact motion of rational transfer functions between changes of a held input.
 
 The process is a chain of first-order lags (complex constants for oscillating pairs), with the
 held input as one more state in front, so that everything between two changes of the input is
@@ -15,17 +15,19 @@ nearly equal nor widely spread time constants cost accuracy, and no step size en
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_sylvester
 
 from relay_autotune.errors import ModelError
 from relay_autotune.models import TransferFunction
 
 FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+# Real where every time constant is, which is four times as fast; complex otherwise.
+Coordinates = NDArray[Any]
 
 _CLOSE = 0.3
 _EPSILON = 1e-17
@@ -37,14 +39,14 @@ _UNDERFLOW = 745.0
 class _Cluster:
     """One group of eigenvalues: its centre, its place in the chain, its motion and its output.
 
-    ``motion[p]`` is (A - c)^p / (p! scale^p) and ``output[p]`` the row C times that.
+    ``motion[p]`` is (A - c)^p / (p! scale^p) and ``output[p]`` the rows C times that.
     """
 
     centre: complex
     scale: float
     place: slice
-    motion: ComplexArray
-    output: ComplexArray
+    motion: Coordinates
+    output: Coordinates
 
 
 def _group(eigenvalues: list[complex], horizon: float) -> list[list[complex]]:
@@ -77,143 +79,199 @@ def _terms(group: list[complex], centre: complex, horizon: float) -> int:
     return _MOST_TERMS
 
 
+def _divide(rows: Coordinates, top: complex, constant: complex) -> tuple[Coordinates, Coordinates]:
+    """Divide polynomials, lowest power first in shape (p, n), by ``top s + constant``.
+
+    :return: quotients, shape (p, n - 1), and remainders, shape (p,).
+    """
+    quotient = np.zeros_like(rows[:, 1:])
+    carried = np.zeros_like(rows[:, 0])
+    for power in range(rows.shape[1] - 1, 0, -1):
+        carried = (rows[:, power] - constant * carried) / top
+        quotient[:, power - 1] = carried
+    return quotient, rows[:, 0] - constant * carried
+
+
+def _sylvester(a: Coordinates, b: Coordinates, right: Coordinates) -> Coordinates:
+    """Solve ``a x - x b = right`` for small blocks."""
+    rows, columns = right.shape
+    operator = np.kron(a, np.eye(columns)) - np.kron(np.eye(rows), b.T)
+    return np.asarray(np.linalg.solve(operator, right.ravel()).reshape(rows, columns))
+
+
 class Modes:
-    """A transfer function, without its dead time, in decoupled coordinates.
+    """Transfer functions of one denominator, without dead time, in decoupled coordinates.
 
     The coordinates z describe state and held input together; they change by
     :attr:`input_direction` times the step where the input steps.
 
-    :param model: the process.
+    :param constants: time constants T of the poles, ``prod(1 + T s)`` [s].
+    :param integrators: further poles at s = 0.
+    :param numerators: of each output, coefficients of powers of s, lowest first, shape (p, d).
     :param horizon: longest stretch of constant input that will be asked for [s].
-    :raises ModelError: if the process passes its input on at once and has no poles.
+    :raises ModelError: if a numerator is of higher degree than the denominator.
     """
 
-    def __init__(self, model: TransferFunction, horizon: float = math.inf) -> None:
-        if model.integrators < 0:
-            raise ModelError("the response of a process with a zero at s = 0 is not supported")
-        poles = [-1.0 / t for t in model.time_constants] + [0j] * model.integrators
-        groups = _group([0j, *poles], horizon)
+    def __init__(
+        self,
+        constants: Sequence[complex],
+        integrators: int,
+        numerators: Coordinates,
+        horizon: float = math.inf,
+    ) -> None:
+        groups = _group([0j, *(-1.0 / t for t in constants), *[0j] * integrators], horizon)
         # The input comes first in the chain, then the poles of its own cluster.
         groups.sort(key=lambda g: 0j not in g)
         groups[0].sort(key=abs)
         chain = [e for group in groups for e in group]
-        n = len(chain)
-        factors = [(1.0, 0j) if e == 0j else (-1.0 / e, 1.0 + 0j) for e in chain[1:]]
+        self._dtype: Any = np.float64 if all(e.imag == 0.0 for e in chain) else np.complex128
+        values = self._cast(np.array(chain))
+        couplings = np.where(values == 0.0, 1.0, -values)[1:]
+        a = np.diag(values) + np.diag(couplings, -1)
+        c = self._output_rows(values[1:], self._cast(np.asarray(numerators)))
 
-        a = np.diag(np.array(chain, dtype=np.complex128))
-        for i, e in enumerate(chain[1:], start=1):
-            a[i, i - 1] = 1.0 if e == 0j else -e
-        c = self._output_row(model, factors)
-
-        self.size = n
-        self._clusters: list[_Cluster] = []
+        self.size = len(chain)
         places, first = [], 0
         for group in groups:
             places.append(slice(first, first + len(group)))
             first += len(group)
-        v = np.eye(n, dtype=np.complex128)
+        v = np.eye(self.size, dtype=self._dtype)
         for j, place in enumerate(places):
             for below in places[j + 1 :]:
                 coupling = a[below, : below.start] @ v[: below.start, place]
-                v[below, place] = solve_sylvester(a[below, below], -a[place, place], -coupling)
+                v[below, place] = _sylvester(a[below, below], a[place, place], -coupling)
+        self._clusters: list[_Cluster] = []
         for group, place in zip(groups, places, strict=True):
-            centre = complex(sum(group) / len(group))
-            if all(e == group[0] for e in group):
-                centre = group[0]
+            centre = group[0] if all(e == group[0] for e in group) else sum(group) / len(group)
             scale = abs(centre) or 1.0
-            offset = a[place, place] - centre * np.eye(len(group))
-            power = np.eye(len(group), dtype=np.complex128)
+            offset = a[place, place] - self._cast(np.asarray(centre)) * np.eye(len(group))
+            power = np.eye(len(group), dtype=self._dtype)
             motion = [power]
             for p in range(1, _terms(group, centre, horizon)):
                 power = power @ offset / (p * scale)
                 motion.append(power)
             stack = np.array(motion)
-            row = c @ v[:, place]
-            self._clusters.append(_Cluster(centre, scale, place, stack, row @ stack))
-        inverse = np.linalg.solve(v, np.eye(n)[:, 0])
-        self.input_direction: ComplexArray = np.ascontiguousarray(inverse)
+            rows = c @ v[:, place]
+            self._clusters.append(_Cluster(complex(centre), scale, place, stack, rows @ stack))
+        self.input_direction = np.linalg.solve(v, np.eye(self.size)[:, 0])
 
-    @staticmethod
-    def _output_row(
-        model: TransferFunction, factors: list[tuple[complex, complex]]
-    ) -> ComplexArray:
-        """Weights of the chain's states that make the numerator.
+    @classmethod
+    def of(cls, model: TransferFunction, horizon: float = math.inf) -> Modes:
+        """Return the modes of one transfer function.
+
+        :param model: the process.
+        :param horizon: longest stretch of constant input that will be asked for [s].
+        :raises ModelError: if it has a zero at s = 0.
+        """
+        if model.integrators < 0:
+            raise ModelError("the response of a process with a zero at s = 0 is not supported")
+        numerator = np.array(model.numerator[::-1])[None, :]
+        return cls(model.time_constants, model.integrators, numerator, horizon)
+
+    def _cast(self, array: Coordinates) -> Coordinates:
+        return np.ascontiguousarray(array.real if self._dtype is np.float64 else array)
+
+    def _output_rows(self, eigenvalues: Coordinates, numerators: Coordinates) -> Coordinates:
+        """Return the weights of the chain's states that make each numerator.
 
         State i is the input over the product of the first i factors, so dividing the numerator
         by the last factor leaves that state's weight as remainder, and so on down the chain.
         """
-        numerator = np.ones(1, dtype=np.complex128) * model.gain
-        for z in model.zeros:
-            numerator = np.convolve(numerator, np.array([z, 1.0]))
-        row = np.zeros(len(factors) + 1, dtype=np.complex128)
-        for i in range(len(factors), 0, -1):
-            quotient, remainder = np.polydiv(numerator, np.array(factors[i - 1]))
-            row[i] = remainder[-1]
-            shorter = quotient if numerator.size > 1 else np.zeros(1)
-            numerator = np.atleast_1d(shorter).astype(np.complex128)
-        row[0] = numerator[-1]
+        row = np.zeros((numerators.shape[0], eigenvalues.size + 1), dtype=self._dtype)
+        rest = numerators.astype(self._dtype)
+        for i in range(eigenvalues.size, 0, -1):
+            e = eigenvalues[i - 1]
+            top, constant = (1.0, 0.0) if e == 0.0 else (-1.0 / e, 1.0)
+            rest, row[:, i] = _divide(rest, top, constant)
+            if rest.shape[1] == 0:
+                return row
+        if rest.shape[1] > 1 and bool(np.any(rest[:, 1:])):
+            raise ModelError("a process has at least as many poles as zeros")
+        row[:, 0] = rest[:, 0]
         return row
 
-    def rest(self) -> ComplexArray:
-        """Coordinates of the process at rest with zero input."""
-        return np.zeros(self.size, dtype=np.complex128)
+    def rest(self) -> Coordinates:
+        """Return the coordinates of the process at rest with zero input."""
+        return np.zeros(self.size, dtype=self._dtype)
 
-    def move(self, z: ComplexArray, time: float) -> ComplexArray:
+    @property
+    def growing(self) -> NDArray[np.bool_]:
+        """Which coordinates belong to poles in the right half plane, shape (size,)."""
+        found = np.zeros(self.size, dtype=bool)
+        for cluster in self._clusters:
+            found[cluster.place] = cluster.centre.real > 0.0
+        return found
+
+    def propagators(self, times: FloatArray) -> Coordinates:
+        """Return the matrices that move the coordinates on by each time.
+
+        :param times: s, of either sign, shape (m,).
+        :return: block diagonal, shape (m, size, size).
+        """
+        moved = np.zeros((times.size, self.size, self.size), dtype=self._dtype)
+        for cluster in self._clusters:
+            factors, x = self._factors(cluster, times)
+            total = np.broadcast_to(cluster.motion[-1], (times.size, *cluster.motion[-1].shape))
+            for matrix in cluster.motion[-2::-1]:
+                total = total * x[:, None, None] + matrix
+            moved[:, cluster.place, cluster.place] = total * factors[:, None, None]
+        return moved
+
+    def _factors(self, cluster: _Cluster, times: FloatArray) -> tuple[Coordinates, FloatArray]:
+        """Return exp(centre t), and t in units of the cluster."""
+        x = times * cluster.scale
+        if cluster.centre == 0j:
+            return np.ones(times.size), x
+        if cluster.centre.real != 0.0:
+            # Beyond this the exponential is zero; a large power must not make it nan.
+            edge = _UNDERFLOW * cluster.scale / abs(cluster.centre.real)
+            x = np.clip(x, -edge, edge)
+        centre = self._cast(np.asarray(cluster.centre / cluster.scale))
+        return np.exp(centre * x), x
+
+    def move(self, z: Coordinates, time: float) -> Coordinates:
         """Return the coordinates ``time`` [s] later, with the input held.
 
         :param z: coordinates, shape (size,).
         """
-        moved = np.empty_like(z)
-        for cluster in self._clusters:
-            x = time * cluster.scale
-            terms = cluster.motion.shape[0]
-            part = z[cluster.place]
-            if x > _UNDERFLOW and cluster.centre.real * time < -_UNDERFLOW:
-                moved[cluster.place] = 0.0
-                continue
-            total = cluster.motion[terms - 1] @ part
-            for p in range(terms - 2, -1, -1):
-                total = total * x + cluster.motion[p] @ part
-            moved[cluster.place] = total * np.exp(cluster.centre * time)
-        return moved
+        return np.asarray(self.propagators(np.array([time]))[0] @ z)
 
-    def weights(self, z: ComplexArray) -> list[ComplexArray]:
-        """Return, for each cluster, the coefficients of the output's polynomial.
+    def weights(self, z: Coordinates) -> list[Coordinates]:
+        """Return, for each cluster, the coefficients of the outputs' polynomials.
 
         :param z: coordinates, shape (..., size).
+        :return: shapes (..., terms, p).
         """
-        return [z[..., c.place] @ c.output.T for c in self._clusters]
+        return [
+            np.einsum("tps,...s->...tp", cluster.output, z[..., cluster.place])
+            for cluster in self._clusters
+        ]
 
-    def output(self, weights: list[ComplexArray], time: FloatArray) -> FloatArray:
-        """Return the output ``time`` after the coordinates that gave ``weights``.
+    def outputs(self, weights: list[Coordinates], time: FloatArray) -> FloatArray:
+        """Return the outputs ``time`` after the coordinates that gave ``weights``.
 
-        :param weights: from :meth:`weights`, each of shape (terms,) or (n, terms).
+        :param weights: from :meth:`weights`, each of shape (terms, p) or (n, terms, p).
         :param time: s, shape (n,).
+        :return: shape (n, p).
         """
-        y = np.zeros(time.shape)
+        y = np.zeros((time.size, weights[0].shape[-1]))
         for cluster, w in zip(self._clusters, weights, strict=True):
-            x = time * cluster.scale
-            if cluster.centre.real < 0.0:
-                # Beyond this the exponential is zero; a large power must not make it nan.
-                x = np.minimum(x, _UNDERFLOW * cluster.scale / -cluster.centre.real)
-            total = w[..., -1]
-            for p in range(w.shape[-1] - 2, -1, -1):
-                total = total * x + w[..., p]
-            if cluster.centre == 0j:
-                y += np.broadcast_to(total.real, time.shape)
-            else:
-                y += (total * np.exp(cluster.centre * time)).real
+            factors, x = self._factors(cluster, time)
+            total = w[..., -1, :]
+            for p in range(w.shape[-2] - 2, -1, -1):
+                total = total * x[:, None] + w[..., p, :]
+            y += (total * factors[:, None]).real
         return y
 
-    def slope_weights(self, weights: list[ComplexArray]) -> list[ComplexArray]:
-        """Return the weights of the output's time derivative.
+    def slope_weights(self, weights: list[Coordinates]) -> list[Coordinates]:
+        """Return the weights of the outputs' time derivatives.
 
         :param weights: from :meth:`weights`.
         """
         slopes = []
         for cluster, w in zip(self._clusters, weights, strict=True):
-            derivative = cluster.centre * w
-            powers = np.arange(1, w.shape[-1]) * cluster.scale
-            derivative[..., :-1] += w[..., 1:] * powers
+            derivative = self._cast(np.asarray(cluster.centre)) * w
+            powers = np.arange(1, w.shape[-2]) * cluster.scale
+            derivative[..., :-1, :] += w[..., 1:, :] * powers[:, None]
             slopes.append(derivative)
         return slopes

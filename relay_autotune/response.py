@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.models import TransferFunction
-from relay_autotune.modes import Modes
+from relay_autotune.modes import Coordinates, Modes
 from relay_autotune.record import PiecewiseConstant
 
 FloatArray = NDArray[np.float64]
@@ -30,19 +30,41 @@ def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> 
     if changes.size == 0 or flat.size == 0:
         return np.zeros(t.shape)
     end = max(float(flat.max()), float(changes[-1]))
-    modes = Modes(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
+    modes = Modes.of(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
     steps = np.diff(u.values, prepend=u.initial)
-    z = np.empty((changes.size, modes.size), dtype=np.complex128)
-    current = modes.rest()
-    for k in range(changes.size):
-        if k:
-            current = modes.move(current, float(changes[k] - changes[k - 1]))
-        current = current + steps[k] * modes.input_direction
-        z[k] = current
+    z = coordinates_at_changes(modes, changes, steps)
     segment = np.searchsorted(changes, flat, side="right") - 1
     after = segment >= 0
     y = np.zeros(flat.shape)
     index = segment[after]
     weights = [w[index] for w in modes.weights(z)]
-    y[after] = modes.output(weights, flat[after] - changes[index])
+    y[after] = modes.outputs(weights, flat[after] - changes[index])[:, 0]
     return y.reshape(t.shape)
+
+
+def coordinates_at_changes(
+    modes: Modes, changes: FloatArray, steps: FloatArray, *, backward: bool = False
+) -> Coordinates:
+    """Return the coordinates just after each change of the input, from rest before the first.
+
+    :param modes: the process.
+    :param changes: when the delayed input changes [s], shape (m,).
+    :param steps: by how much, shape (m,).
+    :param backward: True: the growing modes are followed backward, from zero just after the last
+        change, so that they stay bounded; their true motion differs by a multiple of their own
+        free motion.
+    :return: shape (m, modes.size).
+    """
+    forward = modes.propagators(np.diff(changes))
+    kicks = steps[:, None] * modes.input_direction
+    z = np.empty((changes.size, modes.size), dtype=np.result_type(forward, kicks))
+    z[0] = kicks[0]
+    for k in range(1, changes.size):
+        z[k] = forward[k - 1] @ z[k - 1] + kicks[k]
+    growing = modes.growing
+    if backward and bool(np.any(growing)):
+        back = modes.propagators(-np.diff(changes))
+        z[-1, growing] = 0.0
+        for k in range(changes.size - 1, 0, -1):
+            z[k - 1, growing] = (back[k - 1] @ (z[k] - kicks[k]))[growing]
+    return z

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import ModelError
 from relay_autotune.models import TransferFunction
-from relay_autotune.modes import ComplexArray, Modes
+from relay_autotune.modes import Coordinates, Modes
 from relay_autotune.record import Cycle, Outcome, PiecewiseConstant, Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
@@ -31,7 +31,7 @@ class Plant:
     def __init__(self, model: TransferFunction, *, initial_command: float = 0.0) -> None:
         self.time = 0.0
         self._dead_time = model.dead_time
-        self._modes = Modes(model)
+        self._modes = Modes.of(model)
         self._z = self._modes.rest()
         self._weights = self._modes.weights(self._z)
         self._since = 0.0
@@ -55,7 +55,7 @@ class Plant:
         while self._on_the_way and self._on_the_way[0][0] <= time:
             self._arrive(*self._on_the_way.popleft())
         self.time = time
-        return float(self._modes.output(self._weights, np.array([time - self._since]))[0])
+        return float(self._modes.outputs(self._weights, np.array([time - self._since]))[0, 0])
 
     def _arrive(self, time: float, command: float) -> None:
         z = self._modes.move(self._z, time - self._since)
@@ -110,13 +110,13 @@ class RelayRun:
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
     # Relative to the cell, since a root may lie at its very beginning, which may be zero.
-    return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15))
+    return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15, maxiter=1000))
 
 
 class _Segment:
     """The motion between two changes of the delayed input."""
 
-    def __init__(self, modes: Modes, z: ComplexArray, level: float, corners: FloatArray) -> None:
+    def __init__(self, modes: Modes, z: Coordinates, level: float, corners: FloatArray) -> None:
         self.modes, self.z, self.level, self._corners = modes, z, level, corners
         self.weights = modes.weights(z)
         self.slopes = modes.slope_weights(self.weights)
@@ -125,10 +125,11 @@ class _Segment:
         self.rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
 
     def output(self, time: ArrayLike) -> FloatArray:
-        return self.level + self.modes.output(self.weights, np.atleast_1d(np.asarray(time)))
+        at = np.atleast_1d(np.asarray(time, dtype=np.float64))
+        return np.asarray(self.level + self.modes.outputs(self.weights, at)[:, 0])
 
     def slope(self, time: float) -> float:
-        return float(self.modes.output(self.slopes, np.array([time]))[0])
+        return float(self.modes.outputs(self.slopes, np.array([time]))[0, 0])
 
     def grid(self, length: float) -> FloatArray:
         """Return times dense enough that each cell holds at most one extremum."""
@@ -143,7 +144,7 @@ class _Segment:
 
     def turning_points(self, grid: FloatArray) -> FloatArray:
         """Return the times of the extrema between the grid's ends."""
-        slope = self.modes.output(self.slopes, grid)
+        slope = self.modes.outputs(self.slopes, grid)[:, 0]
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
         return np.array([_root(self.slope, grid[i], grid[i + 1]) for i in cells])
 
@@ -155,7 +156,7 @@ class _Segment:
         if cells.size == 0:
             return math.nan
         i = int(cells[0])
-        if f[i] >= 0.0:
+        if f[i] >= -self.rounding:
             return float(grid[i])
 
         def crossing(time: float) -> float:
@@ -220,7 +221,7 @@ def simulate_relay(
     :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
     """
     process = replace(model, dead_time=model.dead_time + settings.extra_delay)
-    modes = Modes(process)
+    modes = Modes.of(process)
     constants = [abs(t) for t in model.time_constants] or [max(process.dead_time, 1e-9)]
     oscillation = max((abs((1.0 / t).imag) for t in model.time_constants), default=0.0)
     corners = np.array([min(constants), oscillation])
