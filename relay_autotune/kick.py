@@ -121,6 +121,11 @@ class DirectionWatch:
         """The largest mean deviation of an interval to either side [y]."""
         return max(abs(m) for m in self._means)
 
+    @property
+    def remains(self) -> float:
+        """The largest mean deviation after the interval in which the response was seen [y]."""
+        return max((abs(m) for m in self._means[2:]), default=0.0)
+
     def add(self, time: float, measurement: float) -> int:
         """Take one sample, from the one on at which the response was seen; return the sign."""
         if time >= self._end and self._count > 0:

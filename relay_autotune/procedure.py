@@ -41,9 +41,10 @@ KICK_SETTLINGS = 50.0
 _LEAST_SETTLING_SAMPLES = 5
 # An interval of the probe has at least this many samples.
 _PROBE_SAMPLES = 2
-# A stay at the low level shorter than this part of the time that the process took to respond
-# cannot be an answer of the process: it is noise at a switch, and no cycle begins after it.
-_SHORT_STAY = 0.5
+# A stay at the low level shorter than this part of the longest stay (less, in proportion to how
+# unequally a biased relay pushes), or of half the time that the process took to respond, cannot be
+# an answer of the process: it is noise at a switch, and no cycle begins after it.
+_SHORT_STAY = 0.2
 
 _SIGNS = {1: "positive", -1: "negative"}
 
@@ -196,7 +197,7 @@ class Procedure:
             if self.sign == 0:
                 return self._probe(detector, t, y)
             return self._relay(t, y, doubtful=False)
-        if t - start <= self._kick_limit():
+        if t - self._settled_at <= self._kick_limit():
             return level
         still = (
             f"stayed within {detector.band:g} of its rest {self.rest.mean:g}"
@@ -222,16 +223,16 @@ class Procedure:
         watch = DirectionWatch(interval, t, self.rest, detector.side)
         watch.add(t, y)
         self.state = State.PROBE
-        self.answer = partial(self._find_direction, watch, detector.band, t + interval)
+        self.answer = partial(self._find_direction, watch, t + interval)
         return self._high
 
     def _find_direction(
-        self, watch: DirectionWatch, band: float, pulse_end: float, t: float, y: float
+        self, watch: DirectionWatch, pulse_end: float, t: float, y: float
     ) -> float:
         sign = watch.add(t, y)
         if sign == 0:
             return self._high if t < pulse_end else self._baseline
-        if watch.largest <= band:
+        if watch.remains < self.rest.noise_std:
             # The pulse left nothing behind: noise had looked like a response.
             return self._kick()
         self.sign = sign
@@ -260,11 +261,17 @@ class Procedure:
     ) -> float:
         if relay.update(t, y):
             patience.learn(relay.last_stay, self._samples.interval)
-            if relay.is_high and relay.last_stay >= _SHORT_STAY * self._response_time:
+            if relay.is_high and not self._is_noise(relay):
                 return self._begin_cycle()
         elif t - relay.since > patience.limit:
             return self._no_return(doubtful, t, y)
         return self._high if relay.is_high else self._low
+
+    def _is_noise(self, relay: Relay) -> bool:
+        p = self._parameters
+        balance = (p.amplitude - abs(p.relay_bias)) / (p.amplitude + abs(p.relay_bias))
+        longest = max(balance * relay.longest_stay, 0.5 * self._response_time)
+        return relay.last_stay < _SHORT_STAY * longest
 
     def _begin_cycle(self) -> float:
         self.cycle_start.append(len(self._samples) - 1)

@@ -35,6 +35,8 @@ class Relay:
         """Instant of the last switch, or of the begin [s]."""
         self.last_stay = 0.0
         """How long it stayed at the level before this one [s]."""
+        self.longest_stay = 0.0
+        """The longest stay between two switches so far [s]."""
         self.switches = 0
         """Number of switches so far."""
 
@@ -49,6 +51,8 @@ class Relay:
         self.is_high = not self.is_high
         self.last_stay = time - self.since
         self.since = time
+        if self.switches > 0:
+            self.longest_stay = max(self.longest_stay, self.last_stay)
         self.switches += 1
         return True
 
@@ -65,7 +69,7 @@ class Patience:
     :param bias: offset of their middle from the baseline [u], smaller than the amplitude.
     """
 
-    RATIO = 20.0
+    RATIO = 10.0
     LEAST_SAMPLES = 200
 
     def __init__(self, amplitude: float, bias: float) -> None:
