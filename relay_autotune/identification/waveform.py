@@ -33,6 +33,7 @@ _GRID_SAMPLES = 240
 _STARTS = 3
 _NEGLIGIBLE = 1e-10
 _MOST_ITERATIONS = 80
+_LEAST_GAIN = 1e-15
 _UNEXPLAINED = 1.5
 _WHITE = 1e-3
 
@@ -114,13 +115,19 @@ def _refine(problem: _Problem, theta: FloatArray) -> _State:
         trial = _evaluate(problem, problem.structure.move(state.theta, step))
         if not trial.cost < state.cost:
             damping *= 10.0
-            if damping > 1e12 or float(np.abs(step).max()) < 1e-14:
+            # Where even the undamped step promises less than rounding, no other will be seen.
+            promised = gradient @ np.linalg.lstsq(normal, gradient, rcond=None)[0]
+            if (
+                promised <= _LEAST_GAIN * state.cost
+                or damping > 1e12
+                or float(np.abs(step).max()) < 1e-14
+            ):
                 break
             continue
         gained = state.cost - trial.cost
         state = trial
         damping = max(damping / 10.0, 1e-12)
-        if gained <= 1e-15 * state.cost or float(np.abs(step).max()) < 1e-14:
+        if gained <= _LEAST_GAIN * state.cost or float(np.abs(step).max()) < 1e-14:
             break
     return state
 
