@@ -27,6 +27,7 @@ setup(
             "identifier_node = relay_autotune.nodes.identifier:main",
             "plant_node = relay_autotune.nodes.plant:main",
             "replay = relay_autotune.cli.replay:main",
+            "identify = relay_autotune.cli.identify:main",
             "csv_to_bag = relay_autotune.cli.csv_to_bag:main",
         ],
     },

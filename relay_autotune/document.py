@@ -67,7 +67,7 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "reason": _reason(analysis),
         "experiment_id": record.experiment_id,
         "limit_cycle": _limit_cycle(analysis),
-        "models": [_model(identification) for identification in analysis.models],
+        "models": [identification_fields(model) for model in analysis.models],
         "selected": analysis.selected,
         "gains": [_gains(gains) for gains in analysis.gains],
         "recommended": analysis.recommended,
@@ -93,7 +93,8 @@ def _limit_cycle(analysis: Analysis) -> dict[str, Any] | None:
     }
 
 
-def _model(identification: Identification) -> dict[str, Any]:
+def identification_fields(identification: Identification) -> dict[str, Any]:
+    """Return an identified model with its accuracy as it appears in documents."""
     names = identification.parameters
     intervals = zip(identification.ci95_low, identification.ci95_high, strict=True)
     return {

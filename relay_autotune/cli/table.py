@@ -79,7 +79,7 @@ def _experiment(analysis: Analysis, which: str) -> list[str]:
     lines.append(_line("recorded", _span(record)))
     lines += _limit_cycle(analysis)
     if analysis.model is not None:
-        lines += ["", *_model(analysis.model)]
+        lines += ["", *identification_lines(analysis.model)]
         lines += _others(analysis)
     if analysis.best_gains is not None:
         lines += ["", *_gains(analysis.best_gains)]
@@ -127,7 +127,8 @@ def _limit_cycle(analysis: Analysis) -> list[str]:
     ]
 
 
-def _model(found: Identification) -> list[str]:
+def identification_lines(found: Identification) -> list[str]:
+    """Return an identified model with its accuracy, as lines."""
     name = f"{found.structure}, {found.method}"
     lines = [_line("process", f"{process_text(found.model)}   ({name})")]
     rows = list(zip(found.parameters, found.values, found.ci95_low, found.ci95_high, strict=True))

@@ -1,0 +1,130 @@
+"""What `identify` takes: numbers read off a chart, and the methods that make a model of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from relay_autotune.cli.chart_wang import identify_biased_chart, identify_unbiased_chart
+from relay_autotune.errors import SelectionError
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.result import Identification
+
+Numbers = Mapping[str, float]
+ChartMethod = Callable[[Numbers, Known], Identification]
+
+ANY, POSITIVE, NOT_NEGATIVE, NOT_ZERO = "", "> 0", ">= 0", "not 0"
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number that the command line may give.
+
+    :param unit: its unit.
+    :param meaning: what it is, for the help.
+    :param range: one of ``ANY``, ``POSITIVE``, ``NOT_NEGATIVE``, ``NOT_ZERO``.
+    """
+
+    unit: str
+    meaning: str
+    range: str = ANY
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A method with the numbers that it takes.
+
+    :param summary: what it does, for the help.
+    :param identify: from the numbers given, by name, and what is known of the process, to a
+        model. The gain, the dead time, structure and order are in the latter.
+    :param required: names of the numbers without which it does nothing.
+    :param optional: names of those that it can do without.
+    """
+
+    summary: str
+    identify: ChartMethod
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+
+
+# "gain" and "dead_time" reach the methods as what is known of the process.
+NUMBERS: dict[str, Number] = {
+    "period": Number("s", "period of the limit cycle", POSITIVE),
+    "period_high": Number("s", "time that the command stays high", POSITIVE),
+    "period_low": Number("s", "time that the command stays low", POSITIVE),
+    "amplitude": Number("y", "half of peak to peak of the measurement", POSITIVE),
+    "peak_max": Number("y", "highest measurement, from its steady state"),
+    "peak_min": Number("y", "lowest measurement, from its steady state"),
+    "relay": Number("u", "amplitude of the relay, half the distance of its levels", POSITIVE),
+    "bias": Number("u", "middle of the relay's levels, from the steady state"),
+    "hysteresis": Number("y", "half width of the switching band, 0 if not given", NOT_NEGATIVE),
+    "gain": Number("y/u", "static gain of the process", NOT_ZERO),
+    "dead_time": Number("s", "dead time of the process", NOT_NEGATIVE),
+    "mean_measurement": Number("y", "mean over whole cycles, from the steady state"),
+    "mean_command": Number("u", "mean over whole cycles, from the steady state"),
+}
+
+CHART_METHODS: dict[str, Chart] = {
+    "wang_biased": Chart(
+        "FOPDT from a biased relay (Wang, Hang and Zou 1997)",
+        identify_biased_chart,
+        ("period_high", "period_low", "peak_max", "peak_min", "relay", "bias"),
+        ("hysteresis", "gain", "mean_measurement", "mean_command"),
+    ),
+    "wang_unbiased": Chart(
+        "FOPDT from an unbiased relay (Wang, Hang and Zou 1997)",
+        identify_unbiased_chart,
+        ("period", "amplitude", "relay", "gain"),
+        ("hysteresis",),
+    ),
+}
+CHART_METHODS["wang"] = replace(CHART_METHODS["wang_biased"], summary="the same as wang_biased")
+
+
+def option(name: str) -> str:
+    """Return the command-line option of a number."""
+    return "--" + name.replace("_", "-")
+
+
+def identify_chart(method: str, numbers: Numbers, known: Known) -> Identification:
+    """Identify a model from numbers.
+
+    :param method: one of ``CHART_METHODS``.
+    :param numbers: those that were given, by name.
+    :param known: what is known of the process beside them; gain and dead time come from
+        ``numbers``.
+    :raises SelectionError: if there is no such method, a number lacks, is out of its range, or
+        is none that the method takes.
+    :raises IdentificationError: if no model has these numbers.
+    """
+    if method not in CHART_METHODS:
+        raise SelectionError(f"unknown method {method!r}; known: {', '.join(CHART_METHODS)}")
+    chart = CHART_METHODS[method]
+    lacking = [option(n) for n in chart.required if n not in numbers]
+    if lacking:
+        raise SelectionError(f"{method} also needs {', '.join(lacking)}")
+    unused = [option(n) for n in numbers if n not in chart.required + chart.optional]
+    if unused:
+        takes = ", ".join(option(n) for n in chart.required + chart.optional)
+        raise SelectionError(f"{method} makes no use of {', '.join(unused)}; it takes {takes}")
+    for name, value in numbers.items():
+        _require_range(name, value)
+    facts = replace(
+        known,
+        gain=numbers.get("gain", math.nan),
+        dead_time=numbers.get("dead_time", math.nan),
+    )
+    return chart.identify(numbers, facts)
+
+
+def _require_range(name: str, value: float) -> None:
+    wanted = NUMBERS[name].range
+    good = {
+        ANY: True,
+        POSITIVE: value > 0.0,
+        NOT_NEGATIVE: value >= 0.0,
+        NOT_ZERO: value != 0.0,
+    }[wanted]
+    if not good or not math.isfinite(value):
+        raise SelectionError(f"{option(name)} must be finite and {wanted}, found {value:g}")

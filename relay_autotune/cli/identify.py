@@ -1,0 +1,100 @@
+"""Identify a process from numbers read off a chart: `identify --method NAME --period P ...`."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from collections.abc import Sequence
+
+from relay_autotune.cli.arguments import DONE, finite, guarded
+
+PROGRAM = "identify"
+
+_EPILOG = """\
+Results go to standard output, everything else to standard error.
+Exit status: 0 done; 1 no model has these numbers; 2 the command line does not fit.
+
+Examples:
+  identify --method wang_biased --period-high 15.4 --period-low 20.4 --peak-max 0.5 \\
+           --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    :param arguments: those of the command line; default: the process's own.
+    :return: the exit status.
+    """
+    given = _joined(list(sys.argv[1:] if arguments is None else arguments))
+
+    def work() -> int:
+        return _run(_parser().parse_args(given))
+
+    return guarded(PROGRAM, work)
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """Join an option to a negative number after it; argparse takes -1e-3 for an option."""
+    joined: list[str] = []
+    for before, argument in itertools.pairwise(["", *arguments]):
+        negative = argument[:1] == "-" and argument[1:2] in tuple("0123456789.")
+        if negative and before[:2] == "--" and "=" not in before:
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _parser() -> argparse.ArgumentParser:
+    from relay_autotune.cli.chart import CHART_METHODS, NUMBERS, option
+
+    methods = "\n".join(
+        f"  {name:<14} {chart.summary}\n{'':<17}"
+        + " ".join(option(n) for n in chart.required)
+        + "".join(f" [{option(n)}]" for n in chart.optional)
+        for name, chart in CHART_METHODS.items()
+    )
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Identify a process from the numbers of a limit cycle, without a record.",
+        epilog=f"methods and their numbers:\n{methods}\n\n{_EPILOG}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--method", required=True, metavar="NAME", help="how to identify")
+    for name, number in NUMBERS.items():
+        letter = number.unit.upper() if number.unit.isalpha() else "X"
+        parser.add_argument(
+            option(name), type=finite, metavar=letter, help=f"{number.meaning} [{number.unit}]"
+        )
+    parser.add_argument("--structure", default="", metavar="NAME", help="structure of the model")
+    parser.add_argument(
+        "--order", type=int, default=0, metavar="N", help="number of equal lags of the model"
+    )
+    parser.add_argument("--json", action="store_true", help="print the model as a JSON document")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    from relay_autotune.cli.chart import NUMBERS, identify_chart
+    from relay_autotune.cli.table import identification_lines
+    from relay_autotune.document import identification_fields, to_json
+    from relay_autotune.errors import ParameterError, SelectionError
+    from relay_autotune.identification.known import Known
+
+    numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
+    try:
+        known = Known(structure=options.structure, order=options.order)
+    except ParameterError as error:
+        raise SelectionError(str(error)) from error
+    found = identify_chart(options.method, numbers, known)
+    if options.json:
+        print(to_json(identification_fields(found)), flush=True)
+    else:
+        print("\n".join(identification_lines(found)))
+    return DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
