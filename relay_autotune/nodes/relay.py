@@ -8,21 +8,18 @@ import time
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.parameter import Parameter
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import ParameterError, RecordError, RelayAutotuneError
 from relay_autotune.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
-from relay_autotune.nodes import quality
+from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
@@ -43,11 +40,11 @@ from relay_autotune.nodes.tune_parameters import (
 from relay_autotune.record import Outcome
 from relay_autotune.relay import RelayExperiment
 from relay_autotune.relay_parameters import ExperimentParameters
-from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
+from relay_autotune_msgs.msg import RelayCycle
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 from relay_autotune_msgs.srv import StartTune
 
-# How long the end of a tune may wait for a subscriber to acknowledge the safe command [s].
+# How long the end of the process waits for the record to be acknowledged.
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Cycles that wait for who comes late, or max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
@@ -73,76 +70,32 @@ class RelayNode(ServedNode):
         self._sequence = 0
         self._lost = 0
         self._counted = False
+        self._ahead = 0
         self._summary = "no tune yet"
-        self._message = Float64()
-        self._make_ends()
-        self.add_on_set_parameters_callback(self._on_set)
-
-    def _make_ends(self) -> None:
-        overridable = QoSOverridingOptions.with_default_policies()
-        # Each event that a publisher watches costs every turn of the executor a little.
-        quiet = PublisherEventCallbacks(use_default_callbacks=False)
-        depth = max(self.get_parameter("max_cycles").value, CYCLES_KEPT)
-        self._command = self.create_publisher(
-            Float64, "command", quality.COMMAND, qos_overriding_options=overridable
-        )
-        self._publish = self._command.publish
-        self._cycles = self.create_publisher(
-            RelayCycle, "relay_cycle", quality.latched(depth), event_callbacks=quiet
-        )
-        self._experiments = self.create_publisher(
-            ExperimentMessage, "relay_experiment", quality.RESULT, event_callbacks=quiet
-        )
-        self._diagnostics = self.create_publisher(
-            DiagnosticArray, "/diagnostics", 1, event_callbacks=quiet
-        )
-        self._measurement = self.create_subscription(
-            Float64,
-            "measurement",
-            self._on_measurement,
-            quality.MEASUREMENT,
-            qos_overriding_options=overridable,
-        )
-        unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
-        self._models = self.create_subscription(
-            TransferFunction,
-            "transfer_function",
-            partial(self._on_result, "transfer_function"),
-            quality.RESULT,
-            event_callbacks=unheard,
-        )
-        self._gains = self.create_subscription(
-            PidGains,
-            "pi_gains",
-            partial(self._on_result, "pi_gains"),
-            quality.RESULT,
-            event_callbacks=unheard,
-        )
-        self._recordings = Recordings(
+        self._ends = Ends(
             self,
-            {
-                "measurement": self._measurement,
-                "command": self._command,
-                "relay_cycle": self._cycles,
-                "relay_experiment": self._experiments,
-                "transfer_function": self._models,
-                "pi_gains": self._gains,
-            },
+            on_measurement=self._on_measurement,
+            on_result=self._on_result,
+            cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
         )
+        self._send = self._ends.send
+        self._recordings = Recordings(self, self._ends.recorded())
         self.create_service(StartTune, "~/start_tune", self._on_start)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
+        self.add_on_set_parameters_callback(self._on_set)
 
     # The hot path.
 
     def _on_measurement(self, message: Float64, info: dict[str, Any]) -> None:
         session = self._session
-        if session is not None:
+        if self._ahead:
+            self._ahead -= 1
+        elif session is not None:
             command = session.answer(message.data, info)
             if command is not None:
                 # Nothing comes before this: the actuator waits for it.
-                self._message.data = command
-                self._publish(self._message)
+                self._send(command)
                 session.answered()
                 experiment = session.experiment
                 if experiment.cycle_count != session.published_cycles:
@@ -152,8 +105,7 @@ class RelayNode(ServedNode):
             elif session.may_be_no_repeat:
                 self._answer_later(session)
         elif self._held is not None:
-            self._message.data = self._held
-            self._publish(self._message)
+            self._send(self._held)
         self._last_arrival = time.monotonic()
         self._arrivals += 1
         number = info["publication_sequence_number"]
@@ -171,10 +123,6 @@ class RelayNode(ServedNode):
                 session.answered()
 
         timer = self.create_timer(NO_REPEAT_AFTER, answer, clock=self._steady)
-
-    def _send(self, command: float) -> None:
-        self._message.data = command
-        self._publish(self._message)
 
     # Starting.
 
@@ -212,8 +160,8 @@ class RelayNode(ServedNode):
         parameters.validate(baseline)
         require_connections(
             self,
-            self._measurement,
-            self._command,
+            self._ends.measurement,
+            self._ends.command,
             time.monotonic() - self._last_arrival,
             self.get_parameter("measurement_timeout").value,
         )
@@ -235,7 +183,7 @@ class RelayNode(ServedNode):
         session.record_with(sample)
         self._lost = 0
         # Numbers of several publishers cannot be told apart.
-        self._counted = self._measurement.get_publisher_count() == 1
+        self._counted = self._ends.measurement.get_publisher_count() == 1
         self._last_arrival = time.monotonic()
         self._session = session
         timeout = self.get_parameter("measurement_timeout").value
@@ -267,7 +215,7 @@ class RelayNode(ServedNode):
             command=columns[2],
             lead_in=first - begin,
         )
-        self._cycles.publish(message)
+        self._ends.cycles.publish(message)
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
 
     def _watch(self) -> None:
@@ -280,7 +228,9 @@ class RelayNode(ServedNode):
             watchdog.timer_period_ns = max(int((timeout - silent) * 1e9), 1_000_000)
             watchdog.reset()
             return
-        self._stop(session, f"no measurement on {self._measurement.topic_name} for {silent:.3g} s")
+        self._stop(
+            session, f"no measurement on {self._ends.measurement.topic_name} for {silent:.3g} s"
+        )
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         session = self._session
@@ -317,10 +267,16 @@ class RelayNode(ServedNode):
 
     def _stop(self, session: Session, reason: str) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
-        self._send(session.experiment.safe_command)
-        acknowledged: bool = self._command.wait_for_all_acked(ACKNOWLEDGE)
+        acknowledged = self._send_safe(session.experiment.safe_command)
         session.experiment.abort(reason)
         self._leave(session)
+        return acknowledged
+
+    def _send_safe(self, command: float) -> bool:
+        count, acknowledged = self._ends.send_until_acknowledged(command)
+        if self.get_parameter("sample_period").value > 0.0:
+            # A plant in lockstep answers each of these with a measurement, which wants no more.
+            self._ahead = count
         return acknowledged
 
     def _leave(self, session: Session) -> None:
@@ -347,7 +303,7 @@ class RelayNode(ServedNode):
             message.noise_std = math.nan
         if session.sample_count:
             set_stamp(message.header.stamp, session.start_ns)
-        self._experiments.publish(message)
+        self._ends.experiments.publish(message)
         outcome = experiment.outcome.name.lower()
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
         self.get_logger().info(f"tune {session.id} {outcome}: {experiment.reason}")
@@ -369,10 +325,9 @@ class RelayNode(ServedNode):
             if session is not None:
                 self._stop(session, reason)
             elif self._held is not None:
-                self._send(self._held)
-                self._command.wait_for_all_acked(ACKNOWLEDGE)
+                self._send_safe(self._held)
             self.work_off()
-            self._experiments.wait_for_all_acked(ACKNOWLEDGE)
+            self._ends.experiments.wait_for_all_acked(ACKNOWLEDGE)
         finally:
             self._recordings.close_all(f"because {reason}", CLOSE_WITHIN)
 
@@ -383,7 +338,7 @@ class RelayNode(ServedNode):
         age = time.monotonic() - self._last_arrival
         problems = []
         if age > self.get_parameter("measurement_timeout").value:
-            problems.append(f"no measurement on {self._measurement.topic_name}")
+            problems.append(f"no measurement on {self._ends.measurement.topic_name}")
         if self._recordings.problem():
             problems.append(self._recordings.problem())
         values: dict[str, object] = {
@@ -405,7 +360,7 @@ class RelayNode(ServedNode):
         summary = self._summary if session is None else f"tune {session.id} is running"
         now = int(self.get_clock().now().nanoseconds)
         name = self.get_fully_qualified_name().lstrip("/")
-        self._diagnostics.publish(diagnostics(name, now, problems, summary, values))
+        self._ends.diagnostics.publish(diagnostics(name, now, problems, summary, values))
 
 
 def main(args: list[str] | None = None) -> int:

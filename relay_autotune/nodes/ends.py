@@ -1,0 +1,101 @@
+"""The topics of relay_node: what it hears and says, and with which quality of service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from std_msgs.msg import Float64
+
+from relay_autotune.nodes import quality
+from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
+
+# The safe command is repeated at this interval until it is acknowledged, so many times at most.
+# Fast DDS asks for acknowledgements when the publisher's history is full, else every 3 s.
+REPEAT_SAFE = Duration(seconds=0.01)
+REPEATS = 15
+
+
+class Ends:
+    """Publishers and subscriptions of relay_node.
+
+    :param node: the node.
+    :param on_measurement: called with each measurement and the middleware's facts about it.
+    :param on_result: called with the topic's unresolved name and each model or gains.
+    :param cycles_kept: cycles that wait for who comes late.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        *,
+        on_measurement: Callable[[Float64, dict[str, Any]], None],
+        on_result: Callable[[str, Any], None],
+        cycles_kept: int,
+    ) -> None:
+        overridable = QoSOverridingOptions.with_default_policies()
+        # Each event that an end watches costs every turn of the executor a little.
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
+        self.command = node.create_publisher(
+            Float64, "command", quality.COMMAND, qos_overriding_options=overridable
+        )
+        self.cycles = node.create_publisher(
+            RelayCycle, "relay_cycle", quality.latched(cycles_kept), event_callbacks=quiet
+        )
+        self.experiments = node.create_publisher(
+            RelayExperiment, "relay_experiment", quality.RESULT, event_callbacks=quiet
+        )
+        self.diagnostics = node.create_publisher(
+            DiagnosticArray, "/diagnostics", 1, event_callbacks=quiet
+        )
+        self.measurement = node.create_subscription(
+            Float64,
+            "measurement",
+            on_measurement,
+            quality.MEASUREMENT,
+            qos_overriding_options=overridable,
+        )
+        self.models, self.gains = (
+            node.create_subscription(
+                kind, name, partial(on_result, name), quality.RESULT, event_callbacks=unheard
+            )
+            for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
+        )
+        self._message = Float64()
+        # Bound once: this is called for each measurement.
+        self._publish = self.command.publish
+
+    def recorded(self) -> dict[str, Any]:
+        """Return what a recording holds, by the topics' unresolved names."""
+        return {
+            "measurement": self.measurement,
+            "command": self.command,
+            "relay_cycle": self.cycles,
+            "relay_experiment": self.experiments,
+            "transfer_function": self.models,
+            "pi_gains": self.gains,
+        }
+
+    def send(self, command: float) -> None:
+        """Publish a command."""
+        self._message.data = command
+        self._publish(self._message)
+
+    def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
+        """Publish a command until every subscriber has acknowledged it.
+
+        :param command: the command [u].
+        :return: how often it was published, and whether it was acknowledged.
+        """
+        for count in range(1, REPEATS + 1):
+            self.send(command)
+            if self.command.wait_for_all_acked(REPEAT_SAFE):
+                return count, True
+        return REPEATS, False
