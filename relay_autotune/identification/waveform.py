@@ -52,19 +52,20 @@ class _Problem:
     relaxation: bool = False
 
     def columns(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Columns of the linear coefficients (k, n), derivatives by theta (m, k, n)."""
+        """Columns of the linear coefficients (k, n), derivatives of the first of them (m, l, n).
+
+        The columns that theta does not change come last.
+        """
         columns, derivatives = self.structure.columns(theta, self.time, self.u)
-        rows, slopes = [columns], [derivatives]
+        rows = [columns]
         if self.relaxation:
             state, by_theta = self.structure.relaxation(theta, self.time)
             rows.append(state)
-            slopes.append(by_theta)
-        constant = [np.ones_like(self.time)]
+            derivatives = np.concatenate((derivatives, by_theta), axis=1)
+        rows.append(np.ones((1, self.time.size)))
         if self.drift:
-            constant.append((self.time - self.time.mean()) / np.ptp(self.time))
-        rows.append(np.stack(constant))
-        slopes.append(np.zeros((derivatives.shape[0], len(constant), self.time.size)))
-        return np.concatenate(rows), np.concatenate(slopes, axis=1)
+            rows.append(((self.time - self.time.mean()) / np.ptp(self.time))[None, :])
+        return np.concatenate(rows), derivatives
 
     def part(self, chosen: NDArray[np.bool_] | slice) -> _Problem:
         return replace(self, time=self.time[chosen], y=self.y[chosen])
@@ -95,7 +96,7 @@ def _evaluate(problem: _Problem, theta: FloatArray) -> _State:
     coefficients = np.linalg.solve(r, np.where(weak, 0.0, projection))
     coefficients = coefficients / size
     residual = problem.y - coefficients @ columns
-    derivative = np.einsum("k,mkn->mn", coefficients, derivatives)
+    derivative = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
     cost = float(residual @ residual)
     return _State(theta, coefficients, residual, cost, q, derivative, columns)
 
