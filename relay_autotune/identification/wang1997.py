@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import stdtrit
 
-from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, infer_settings, limit_cycle
+from relay_autotune.cycles import LimitCycle
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.cycle_scatter import NOT_SETTLED, Stretch, relay_test
 from relay_autotune.identification.fourier import cycle_means, frequency_point
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, with_uncertainty
@@ -28,7 +28,6 @@ from relay_autotune.record import Record, RelaySettings
 FloatArray = NDArray[np.float64]
 
 _LEAST_BIAS = 0.02
-_LEAST_CYCLES = 3
 
 PARAMETERS = ("gain", "time_constant", "dead_time")
 
@@ -276,48 +275,25 @@ _Measure = Callable[[Record, RelaySettings, LimitCycle, Known], FloatArray]
 
 def _identify(method: str, record: Record, known: Known, measure: _Measure) -> Identification:
     """Measure on the averaged limit cycle; its scatter from cycle to cycle is the uncertainty."""
-    settings = record.settings or infer_settings(record)
-    bounds = record.cycle_start or find_cycles(record)
-    if settings is None or len(bounds) < 2:
-        raise IdentificationError(
-            f"{method} needs at least one whole cycle of a relay test and the record holds none: "
-            "use the method waveform, which takes any input"
-        )
-    average = limit_cycle(record)
-    _, measured = steady_state(record, settings)
-    first, last = average.cycles[0], average.cycles[-1]
-    whole = replace(record, settings=settings, cycle_start=bounds[first : last + 2])
-    values = measure(whole, settings, average, known)
-    singles = []
-    for index in average.cycles:
-        one = replace(whole, cycle_start=bounds[index : index + 2])
-        try:
-            singles.append(measure(one, settings, _single(record, index), known))
-        except IdentificationError:
-            # One cycle may be too noisy for the logarithms; the others still tell the scatter.
-            continue
-    covariance = None
-    if len(singles) >= _LEAST_CYCLES:
-        scatter = np.array(singles) - np.mean(singles, axis=0)
-        covariance = scatter.T @ scatter / (len(singles) * (len(singles) - 1))
+    test = relay_test(method, record)
+
+    def values(part: Stretch) -> FloatArray:
+        return measure(part.record, part.settings, part.cycle, known)
+
+    covariance, quantile = test.scatter(values)
     warnings = []
-    if not average.converged:
-        warnings.append("the limit cycle had not settled: its last cycles still differ")
-    if not measured:
+    if not test.whole.cycle.converged:
+        warnings.append(NOT_SETTLED)
+    if not steady_state(record, test.whole.settings)[1]:
         warnings.append(
             "no samples at rest before the test: the set-point stands in for the steady state"
         )
-    quantile = float(stdtrit(max(len(singles) - 1, 1), 0.975))
     return with_uncertainty(
         method,
         lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
         PARAMETERS,
-        values,
+        values(test.whole),
         covariance,
         quantile,
         warnings=tuple(warnings),
     )
-
-
-def _single(record: Record, index: int) -> LimitCycle:
-    return limit_cycle(cycles_of(record)[index : index + 1])

@@ -1,0 +1,95 @@
+"""A relay test as its averaged limit cycle, and the uncertainty that its cycles tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, infer_settings, limit_cycle
+from relay_autotune.errors import IdentificationError
+from relay_autotune.record import Record, RelaySettings
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_CYCLES = 3
+
+NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Cycles of a relay test with their features.
+
+    :param record: its ``cycle_start`` bounds these cycles alone.
+    :param settings: the relay, inferred where the record does not tell it.
+    :param cycle: averages over the cycles.
+    """
+
+    record: Record
+    settings: RelaySettings
+    cycle: LimitCycle
+
+
+@dataclass(frozen=True)
+class RelayTest:
+    """A relay test, as the methods see it that need a limit cycle only.
+
+    :param whole: the cycles that agree, averaged.
+    :param singles: each of them by itself.
+    """
+
+    whole: Stretch
+    singles: tuple[Stretch, ...]
+
+    def scatter(self, measure: Callable[[Stretch], FloatArray]) -> tuple[FloatArray | None, float]:
+        """Return the covariance of a mean over cycles, from how the single cycles differ.
+
+        :param measure: from a stretch to values, shape (p,); a cycle for which it raises an
+            ``IdentificationError`` is left out.
+        :return: covariance, shape (p, p), None if fewer than three cycles are left; and half the
+            width of a 95 % interval in standard deviations.
+        """
+        found = []
+        for single in self.singles:
+            try:
+                found.append(measure(single))
+            except IdentificationError:
+                # One cycle may be too noisy for a method; the others still tell the scatter.
+                continue
+        count = len(found)
+        quantile = float(stdtrit(max(count - 1, 1), 0.975))
+        if count < _LEAST_CYCLES:
+            return None, quantile
+        away = np.array(found) - np.mean(found, axis=0)
+        return away.T @ away / (count * (count - 1)), quantile
+
+
+def relay_test(method: str, record: Record) -> RelayTest:
+    """Take a record for a relay test.
+
+    :param method: on whose behalf, for the message.
+    :param record: the record.
+    :raises IdentificationError: if it holds no whole cycle.
+    """
+    settings = record.settings or infer_settings(record)
+    bounds = record.cycle_start or find_cycles(record)
+    if settings is None or len(bounds) < 2:
+        raise IdentificationError(
+            f"{method} needs at least one whole cycle of a relay test and the record holds none: "
+            "use the method waveform, which takes any input"
+        )
+    cycles = cycles_of(record)
+    average = limit_cycle(record)
+
+    def stretch(first: int, last: int, cycle: LimitCycle) -> Stretch:
+        part = replace(record, settings=settings, cycle_start=bounds[first : last + 2])
+        return Stretch(part, settings, cycle)
+
+    return RelayTest(
+        stretch(average.cycles[0], average.cycles[-1], average),
+        tuple(stretch(i, i, limit_cycle(cycles[i : i + 1])) for i in average.cycles),
+    )
