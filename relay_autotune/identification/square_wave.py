@@ -1,0 +1,184 @@
+r"""Steady oscillation of real lags driven by a symmetric square wave, in closed form.
+
+All is for unit static gain and unit height of the square wave, so that y here is y/(K h). With T
+half a period, x = T/tau and m the part of a half period since the square wave went up, one lag is
+at
+
+    f(m, x) = 1 - 2 exp(-m x)/(1 + exp(-x)),
+
+and lags x_1 ... x_n in a row at the value at 0 of the polynomial that runs through the points
+(x_i, f(m, x_i)): Newton's form of it is what partial fractions give (Chang, Shen and Yu 1992,
+appendix), but stays accurate where lags are equal or nearly so. For n equal lags it is
+
+    F_n = sum over k < n of (-x)^k/k! d^k f/dx^k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from relay_autotune.errors import ModelError
+
+FloatArray = NDArray[np.float64]
+
+_CLOSE = 0.5
+_TAYLOR = 24
+_GRID = 64
+
+
+def level(time_constants: Sequence[float], period: float, part: float) -> float:
+    """Return y/(K h) at a part m of the half period in which the square wave is up.
+
+    :param time_constants: equal ones, two, or three of which the first two are equal [s].
+    :param period: P [s].
+    :param part: m, from 0 to 1.
+    :raises ModelError: if the time constants are of another pattern.
+    """
+    x = _ratios(time_constants, period)
+    value, factor = 0.0, 1.0
+    for ratio, difference in zip(x, _differences(part, x), strict=True):
+        value += factor * difference
+        factor *= -ratio
+    return value
+
+
+def slope_sign(time_constants: Sequence[float], period: float, part: float) -> float:
+    """Return a number with the sign of dy/dt at a part m of the upper half period.
+
+    :param time_constants: as for :func:`level` [s].
+    :param period: P [s].
+    :param part: m, from 0 to 1.
+    """
+    x = _ratios(time_constants, period)
+    if len(x) == 1:
+        return 1.0
+    # The rate is the highest difference times the product of -x.
+    return (-1.0) ** len(x) * _differences(part, x)[-1]
+
+
+def peak_part(time_constants: Sequence[float], period: float) -> float:
+    """Return when the measurement peaks: the part of a half period after the command arrived.
+
+    A square wave through real lags has one maximum in each period.
+
+    :param time_constants: as for :func:`level` [s].
+    :param period: P [s].
+    """
+    x = _ratios(time_constants, period)
+    # Beyond this every trace of the half period before has died away, below rounding.
+    if len(x) == 1 or min(x) > 50.0 + 5.0 * len(x):
+        return 0.0
+    return float(
+        brentq(lambda m: slope_sign(time_constants, period, m), 0.0, 1.0, xtol=1e-300, rtol=1e-15)
+    )
+
+
+def peak(time_constants: Sequence[float], period: float, harmonics: int | None = None) -> float:
+    """Return the amplitude y/(K h): the maximum over t of eq 19 of Chang et al.
+
+    The sum of eq 19 starts at n = 0 (printed: n = 1), and the root in its denominators covers
+    all factors.
+
+    :param time_constants: as for :func:`level`; with ``harmonics`` any real ones [s].
+    :param period: P [s].
+    :param harmonics: terms of the sum; 1: the describing function (eq 20); None: all of them.
+    """
+    if harmonics is None:
+        part = peak_part(time_constants, period)
+        if part == 0.0 and len(time_constants) > 1:
+            return 1.0
+        return -level(time_constants, period, part)
+    if harmonics == 1:
+        return fundamental(time_constants, period)
+    # One maximum in each half period, though ripples of the cut sum may lie on it.
+    angle = np.linspace(0.0, math.pi, _GRID * harmonics, endpoint=False)
+    y = _harmonic_sum(time_constants, period, harmonics, angle)
+    top = float(angle[np.argmax(np.abs(y))])
+    fine = top + np.linspace(-1.0, 1.0, 201) * math.pi / (_GRID * harmonics)
+    a = np.abs(_harmonic_sum(time_constants, period, harmonics, fine))
+    i = min(max(int(np.argmax(a)), 1), 199)
+    # The vertex of the parabola through the three highest points.
+    bend = a[i - 1] - 2.0 * a[i] + a[i + 1]
+    return float(a[i] - (a[i + 1] - a[i - 1]) ** 2 / (8.0 * bend)) if bend < 0.0 else float(a[i])
+
+
+def fundamental(time_constants: Sequence[float], period: float) -> float:
+    """Return the amplitude of the first harmonic, 4/pi |G(j w)|/K (eq 20).
+
+    :param time_constants: any real ones [s].
+    :param period: P [s].
+    """
+    w = 2.0 * math.pi / period
+    return 4.0 / math.pi / math.prod(math.hypot(1.0, w * tau) for tau in time_constants)
+
+
+def _harmonic_sum(
+    time_constants: Sequence[float], period: float, harmonics: int, angle: FloatArray
+) -> FloatArray:
+    w = 2.0 * math.pi / period
+    y = np.zeros_like(angle)
+    for n in range(harmonics):
+        k = 2 * n + 1
+        size = k * math.prod(math.hypot(1.0, k * w * tau) for tau in time_constants)
+        lag = sum(math.atan(k * w * tau) for tau in time_constants)
+        y += np.sin(k * angle - lag) / size
+    return 4.0 / math.pi * y
+
+
+def _ratios(time_constants: Sequence[float], period: float) -> tuple[float, ...]:
+    half = 0.5 * period
+    return tuple(half / tau for tau in time_constants)
+
+
+def _differences(m: float, x: tuple[float, ...]) -> list[float]:
+    """Divided differences f[x1], f[x1, x2], ..."""
+    if all(ratio == x[0] for ratio in x):
+        return _taylor(m, x[0], len(x))
+    if len(x) == 2:
+        return [_taylor(m, x[0], 1)[0], _secant(m, x[0], x[1])]
+    if len(x) != 3 or x[0] != x[1]:
+        raise ModelError(
+            f"found {len(x)} lags; expected equal ones, two, or three of which the first two are "
+            "equal"
+        )
+    step = x[2] - x[0]
+    if abs(step) < _CLOSE:
+        c = _taylor(m, x[0], _TAYLOR)
+        third = sum(c[k] * step ** (k - 2) for k in range(2, _TAYLOR))
+    else:
+        c = _taylor(m, x[0], 2)
+        third = (_secant(m, x[0], x[2]) - c[1]) / step
+    return [c[0], c[1], third]
+
+
+def _taylor(m: float, x: float, count: int) -> list[float]:
+    """First coefficients of f(m, x + d) in powers of d, from the quotient of two series."""
+    e = math.exp(-x)
+    # Written so that nothing cancels where x is small.
+    found = [(math.expm1(-x) - 2.0 * math.expm1(-m * x)) / (1.0 + e)]
+    if count == 1:
+        return found
+    above, below = math.exp(-m * x), [1.0 + e]
+    quotient = [above / below[0]]
+    for k in range(1, count):
+        above *= -m / k
+        e /= -k
+        below.append(e)
+        rest = above - sum(below[j] * quotient[k - j] for j in range(1, k + 1))
+        quotient.append(rest / below[0])
+        found.append(-2.0 * quotient[-1])
+    return found
+
+
+def _secant(m: float, x1: float, x2: float) -> float:
+    """Divided difference (f(x2) - f(x1))/(x2 - x1), without cancellation."""
+    x1, x2 = min(x1, x2), max(x1, x2)
+    d = x2 - x1
+    rise = math.expm1(-m * d) - math.exp(-x1 - m * d) * math.expm1(-(1.0 - m) * d)
+    scale = math.exp(-m * x1) / ((1.0 + math.exp(-x1)) * (1.0 + math.exp(-x2)))
+    return -2.0 * scale * rise / d
