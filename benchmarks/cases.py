@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from relay_autotune import threads  # noqa: F401  before numpy
@@ -83,21 +84,30 @@ class Case:
             hysteresis that relay_node would choose, three standard deviations.
         """
         std = self.noise_std(ratio)
-        rng = np.random.default_rng(seed)
+        # No two cases or ratios share their noise, so that their rows are independent.
+        rng = np.random.default_rng((seed, round(1000.0 * ratio), *self.title.encode()))
         if not relay_sees_noise:
             return self.run.record(noise_std=std, rng=rng)
         noise = std * rng.standard_normal(SAMPLES)
         settings = self.settings(3.0 * std)
-        return simulate_sampled_relay(self.model, settings, period=self.period, noise=noise)
+        record = simulate_sampled_relay(self.model, settings, period=self.period, noise=noise)
+        u = record.input()
+        # The samples begin with the kick; that the process rested before it is known here too.
+        kicked = PiecewiseConstant(
+            np.append(record.time[0], u.times), np.append(u.initial, u.values), settings.baseline
+        )
+        return replace(record, held_input=kicked)
 
-    def bound(self, time: FloatArray, u: PiecewiseConstant, *, drift: bool = False) -> FloatArray:
+    def bound(
+        self, time: FloatArray, u: PiecewiseConstant, beside: Sequence[FloatArray] = ()
+    ) -> FloatArray:
         """Return the Cramer-Rao bound of ``QUANTITIES`` for noise of unit standard deviation.
 
-        From central differences of the exact response; the offset is estimated beside the model.
+        From central differences of the exact response; an offset is estimated beside the model.
 
         :param time: of the samples [s], shape (n,).
         :param u: the input.
-        :param drift: True: a drift is estimated as well.
+        :param beside: what else is estimated, such as a drift: its course, shape (n,) each.
         :return: covariance of the relative errors, shape (5, 5).
         """
         by_output, by_quantity = [], []
@@ -108,10 +118,7 @@ class Case:
             change = output(up, time, u) - output(down, time, u)
             by_output.append(change / (2.0 * _STEP))
             by_quantity.append(np.log(quantities(up) / quantities(down)) / (2.0 * _STEP))
-        beside = [np.ones_like(time)]
-        if drift:
-            beside.append(time - time.mean())
-        jacobian = np.stack(by_output + beside)
+        jacobian = np.stack([*by_output, np.ones_like(time), *beside])
         covariance = np.linalg.inv(jacobian @ jacobian.T)[:3, :3]
         gradient = np.array(by_quantity)
         return np.asarray(gradient.T @ covariance @ gradient)
