@@ -40,11 +40,16 @@ class Ends:
         cycles_kept: int,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
-        # Each event that an end watches costs every turn of the executor a little.
+        # Each event that an end watches costs every turn of the executor; incompatible ends are
+        # named by /diagnostics and by the answer to a start.
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
         self.command = node.create_publisher(
-            Float64, "command", quality.COMMAND, qos_overriding_options=overridable
+            Float64,
+            "command",
+            quality.COMMAND,
+            event_callbacks=quiet,
+            qos_overriding_options=overridable,
         )
         self.cycles = node.create_publisher(
             RelayCycle, "relay_cycle", quality.latched(cycles_kept), event_callbacks=quiet
@@ -60,6 +65,7 @@ class Ends:
             "measurement",
             on_measurement,
             quality.MEASUREMENT,
+            event_callbacks=unheard,
             qos_overriding_options=overridable,
         )
         self.models, self.gains = (

@@ -18,19 +18,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rclpy
-from rclpy.executors import (
-    ConditionReachedException,
-    ShutdownException,
-    SingleThreadedExecutor,
-    TimeoutException,
-)
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.nodes.executor import Executor
 
-# With the default of 5 ms a thread that only computes keeps the measurement waiting so long.
-_SWITCH_INTERVAL = 2e-4
+# How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
+_SWITCH_INTERVAL = 5e-5
 
 
 class ServedNode(Node):
@@ -39,6 +35,8 @@ class ServedNode(Node):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self._deferred: deque[Callable[[], None]] = deque()
+        self.favoured: Subscription | None = None
+        """The subscription whose messages follow closely, see `Executor.favour`."""
         self._when_idle: deque[Callable[[], None]] = deque()
 
     def defer(self, work: Callable[[], None]) -> None:
@@ -71,25 +69,6 @@ class ServedNode(Node):
 
         :param reason: why the process ends, for people.
         """
-
-
-class Executor(SingleThreadedExecutor):
-    """rclpy's single-threaded executor, which also tells whether there was something to do."""
-
-    def turn(self, timeout_sec: float | None) -> bool:
-        """Wait for a callback and run it; return False if none became ready.
-
-        :param timeout_sec: how long to wait [s]; None: as long as it takes.
-        """
-        try:
-            handler, _, _ = self.wait_for_ready_callbacks(timeout_sec)
-        except (ConditionReachedException, ShutdownException, TimeoutException):
-            return False
-        handler()
-        error = handler.exception()
-        if error is not None:
-            raise error
-        return True
 
 
 def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None = None) -> int:
@@ -129,6 +108,8 @@ def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None 
 def _serve(node: ServedNode, stopped: list[int]) -> int:
     executor = Executor()
     executor.add_node(node)
+    if node.favoured is not None:
+        executor.favour(node.favoured)
     _wake_on_signal(executor)
     # What was imported stays: the collector need not look at it again and again.
     gc.collect()

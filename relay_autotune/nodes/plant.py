@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
@@ -25,6 +26,9 @@ from relay_autotune.nodes.parameters import NodeParameter, declare, values_of
 from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 MODES = ("realtime", "clock", "lockstep")
+
+# Simulated time waits so long for a command [s].
+LONGEST_WAIT = 0.2
 
 # Simulated time begins here [s]: zero means "no time yet" to ROS.
 CLOCK_START = 1.0
@@ -152,9 +156,14 @@ class PlantNode(ServedNode):
         self._period: float = values["sample_period"]
         self._samples = 0
         self._message = Float64()
+        # Each event that an end watches costs every turn of the executor a little.
         overridable = QoSOverridingOptions.with_default_policies()
         self._measurement = self.create_publisher(
-            Float64, "measurement", quality.MEASUREMENT, qos_overriding_options=overridable
+            Float64,
+            "measurement",
+            quality.MEASUREMENT,
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            qos_overriding_options=overridable,
         )
         received = {
             "realtime": self._on_command_in_time,
@@ -166,16 +175,21 @@ class PlantNode(ServedNode):
             "command",
             received,
             QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=overridable,
         )
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._start = time.monotonic()
         self._timer: Timer
         if values["mode"] == "lockstep":
+            self.favoured = self._command
             self._waiting = True
             self._value = self._process.measure(0.0)
             self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=self._steady)
         elif values["mode"] == "clock":
+            # Whether the last sample is to be waited for, and whether it was answered.
+            self._waiting = self._answered = False
+            self._ticked = 0.0
             self._clock = self.create_publisher(
                 ClockMessage, "/clock", QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
             )
@@ -200,6 +214,13 @@ class PlantNode(ServedNode):
     # Simulated time: it stands still between two messages of /clock.
 
     def _tick(self) -> None:
+        # Who has answered so far is waited for: on a busy machine simulated time runs slower,
+        # instead of the answers taking effect later.
+        wall = time.monotonic()
+        if self._waiting and wall - self._ticked < LONGEST_WAIT:
+            return
+        self._waiting, self._answered = self._answered, False
+        self._ticked = wall
         now = self._samples * self._period
         self._samples += 1
         value = self._process.measure(now)
@@ -210,6 +231,7 @@ class PlantNode(ServedNode):
 
     def _on_command_with_clock(self, message: Float64) -> None:
         self._process.command(message.data)
+        self._waiting, self._answered = False, True
 
     # Lockstep: each command is a step.
 
@@ -220,7 +242,7 @@ class PlantNode(ServedNode):
         elif self._measurement.get_subscription_count() and self._command.get_publisher_count():
             self._publish(self._value)
 
-    def _on_command_in_lockstep(self, message: Float64) -> None:
+    def _on_command_in_lockstep(self, message: Float64, _: dict[str, Any]) -> None:
         self._process.command(message.data)
         if self._waiting:
             self._waiting = False

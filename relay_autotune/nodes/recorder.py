@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -16,6 +18,10 @@ from relay_autotune.errors import BagError
 
 # What a killed process may lose at most [s].
 FLUSH_PERIOD = 0.5
+
+# The thread writes so many samples at a time and then lets the relay have the interpreter [s].
+PORTION = 8
+PAUSE = 5e-4
 
 # The writer is loaded before the first experiment, not by its thread.
 with contextlib.suppress(ImportError):
@@ -109,10 +115,12 @@ class Recorder:
 
     def _drain(self, writer: BagWriter) -> None:
         with contextlib.suppress(Empty):
-            while True:
+            for count in itertools.count(1):
                 received, source, measurement, sent, command = self._samples.get_nowait()
                 writer.write(self._measurement, received, source, encode_float64(measurement))
                 writer.write(self._command, sent, sent, encode_float64(command))
+                if count % PORTION == 0 and not self._closing.is_set():
+                    time.sleep(PAUSE)
         with contextlib.suppress(Empty):
             while True:
                 topic, time_ns, message = self._messages.get_nowait()

@@ -24,6 +24,7 @@ from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.quality import why_no_publisher
 from relay_autotune.nodes.readiness import (
     NotReadyError,
     baseline_from,
@@ -79,6 +80,9 @@ class RelayNode(ServedNode):
             cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
         )
         self._send = self._ends.send
+        if not self._simulated:
+            # With /clock, the time of a sample comes by another callback.
+            self.favoured = self._ends.measurement
         self._recordings = Recordings(self, self._ends.recorded())
         self.create_service(StartTune, "~/start_tune", self._on_start)
         self.create_service(Trigger, "~/abort", self._on_abort)
@@ -338,7 +342,8 @@ class RelayNode(ServedNode):
         age = time.monotonic() - self._last_arrival
         problems = []
         if age > self.get_parameter("measurement_timeout").value:
-            problems.append(f"no measurement on {self._ends.measurement.topic_name}")
+            why = why_no_publisher(self, self._ends.measurement.topic_name)
+            problems.append(f"no measurement comes: {why}")
         if self._recordings.problem():
             problems.append(self._recordings.problem())
         values: dict[str, object] = {

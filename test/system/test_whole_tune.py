@@ -127,10 +127,10 @@ def test_cycles_that_came_late_join_to_the_record(rig: Rig) -> None:
 
 def test_simulated_time_from_end_to_end(rig: Rig) -> None:
     results = Results(rig)
-    # 8 simulated seconds in a second, 160 samples in a second.
+    # 4 simulated seconds in a second, 80 samples in a second.
     rig.plant(
         mode="clock",
-        speed=8.0,
+        speed=4.0,
         sample_period=0.05,
         structure="fopdt",
         gain=2.0,
