@@ -1,0 +1,226 @@
+"""Messages and back, with stand-ins that have the fields of the message and nothing else."""
+
+from __future__ import annotations
+
+import array
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_autotune.errors import RecordError
+from relay_autotune.messages import (
+    fill_cycle,
+    fill_experiment,
+    fill_gains,
+    fill_transfer_function,
+    record_from_cycles,
+    record_from_message,
+    start_nanoseconds,
+    start_seconds,
+    transfer_function_from_message,
+)
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
+
+SETTINGS = RelaySettings(
+    setpoint=5.0,
+    baseline=1.0,
+    amplitude=0.5,
+    bias=0.1,
+    hysteresis=0.02,
+    extra_delay=0.3,
+    sample_period=0.1,
+    reverse_acting=True,
+)
+
+
+def header() -> SimpleNamespace:
+    return SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+
+
+def empty_message() -> SimpleNamespace:
+    return SimpleNamespace(header=header(), settings=SimpleNamespace(amplitude=0.0))
+
+
+def record(n: int = 40, **changes: Any) -> Record:
+    t = np.arange(n) * 0.1
+    facts: dict[str, Any] = {
+        "time": t,
+        "measurement": np.sin(t),
+        "command": np.sign(np.cos(t)),
+        "receive_time": t + 0.01,
+        "command_time": t + 0.011,
+        "settings": SETTINGS,
+        "noise_std": 0.01,
+        "cycle_start": (10, 20, 30),
+        "outcome": Outcome.COMPLETED,
+        "reason": "three cycles",
+        "experiment_id": "one",
+        "start": 1.7e9 + 0.1234567,
+        "lost_samples": 2,
+    }
+    return Record(**(facts | changes))
+
+
+def assert_same(a: Record, b: Record) -> None:
+    for name in ("time", "measurement", "command", "receive_time", "command_time"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    for name in ("settings", "cycle_start", "outcome", "reason", "experiment_id", "start"):
+        assert getattr(a, name) == getattr(b, name), name
+    assert a.lost_samples == b.lost_samples
+    assert a.noise_std == b.noise_std or (math.isnan(a.noise_std) and math.isnan(b.noise_std))
+
+
+def test_a_record_comes_back_to_the_last_bit() -> None:
+    message = empty_message()
+    fill_experiment(message, record())
+    assert isinstance(message.time, array.array)
+    assert_same(record_from_message(message), record())
+
+
+def test_a_record_without_relay_comes_back() -> None:
+    message = empty_message()
+    without = record(settings=None, noise_std=math.nan, cycle_start=(), outcome=Outcome.UNKNOWN)
+    fill_experiment(message, without)
+    assert_same(record_from_message(message), without)
+
+
+def test_a_summary_leaves_the_samples_out() -> None:
+    message = empty_message()
+    fill_experiment(message, record(), arrays=False)
+    assert not hasattr(message, "time")
+    assert message.reason == "three cycles"
+
+
+def test_an_unknown_outcome_is_refused_with_the_known_ones() -> None:
+    message = empty_message()
+    fill_experiment(message, record())
+    message.outcome = 9
+    with pytest.raises(RecordError, match=r"outcome is 9.*1 \(COMPLETED\)"):
+        record_from_message(message)
+
+
+@given(st.floats(0.0, 4e9, allow_nan=False))
+def test_a_start_survives_its_stamp(start: float) -> None:
+    there = start_seconds(start_nanoseconds(start))
+    # Near the epoch a double is finer than a nanosecond.
+    assert there == start or (start < 2**22 and abs(there - start) <= 0.5e-9)
+
+
+def cycle_messages(whole: Record, start_ns: int) -> list[SimpleNamespace]:
+    messages = []
+    for index, (first, last) in enumerate(
+        zip(whole.cycle_start, whole.cycle_start[1:], strict=False)
+    ):
+        begin = 0 if index == 0 else first
+        part = slice(begin, last + 1)
+        message = empty_message()
+        fill_cycle(
+            message,
+            Cycle(index, float(whole.time[first]), 1.0, 0.5, 0.5, 1.0, -1.0, 0.2, 0.3, 0.0, 0.0),
+            settings=SETTINGS,
+            experiment_id="one",
+            start_ns=start_ns,
+            time=whole.time[part],
+            measurement=whole.measurement[part],
+            command=whole.command[part],
+            lead_in=first - begin,
+        )
+        messages.append(message)
+    return messages
+
+
+def test_cycles_join_to_the_record_up_to_the_last_of_them() -> None:
+    whole = record()
+    start_ns = start_nanoseconds(whole.start)
+    joined = record_from_cycles(reversed(cycle_messages(whole, start_ns)))
+    n = whole.cycle_start[-1] + 1
+    assert np.array_equal(joined.measurement, whole.measurement[:n])
+    assert np.array_equal(joined.command, whole.command[:n])
+    # Each cycle has a stamp of its own, in whole nanoseconds.
+    assert np.allclose(joined.time, whole.time[:n], rtol=0.0, atol=2e-9)
+    assert joined.cycle_start == whole.cycle_start
+    assert joined.settings == SETTINGS
+    assert joined.outcome == Outcome.UNKNOWN
+
+
+def test_of_broken_cycles_the_newest_run_is_used() -> None:
+    whole = record(n=60, cycle_start=(10, 20, 30, 40, 50))
+    first, _, third, fourth = cycle_messages(whole, 0)
+    joined = record_from_cycles([first, third, fourth])
+    assert np.array_equal(joined.measurement, whole.measurement[30:51])
+    assert joined.cycle_start == (0, 10, 20)
+
+
+def test_no_cycle_is_refused() -> None:
+    with pytest.raises(RecordError, match="no cycle"):
+        record_from_cycles([])
+
+
+def identification(model: TransferFunction) -> Any:
+    return SimpleNamespace(
+        model=model,
+        method="waveform",
+        structure=model.structure,
+        parameters=("gain", "time_constant"),
+        std=np.array([0.1, 0.2]),
+        covariance=np.array([[0.01, 0.0], [0.0, 0.04]]),
+        ci95_low=np.array([1.0, 2.0]),
+        ci95_high=np.array([3.0, 4.0]),
+        ultimate_gain=3.0,
+        ultimate_gain_std=0.1,
+        ultimate_frequency=0.2,
+        ultimate_frequency_std=math.nan,
+        fit=SimpleNamespace(residual_rms=0.1, noise_std=0.1, fit=0.9, whiteness_p=0.5),
+        warnings=("mind",),
+        undetermined=(),
+    )
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        TransferFunction.fopdt(1.65, 20.0, 10.0),
+        TransferFunction.ipdt(0.5, 2.0),
+        TransferFunction.unstable_fopdt(2.0, 5.0, 1.0),
+        TransferFunction.from_polynomials([1.0], [4.0, 0.8, 1.0], 0.5),
+    ],
+)
+def test_a_model_comes_back(model: TransferFunction) -> None:
+    message = SimpleNamespace(header=header())
+    fill_transfer_function(message, identification(model), experiment_id="one", stamp_ns=5)
+    back = transfer_function_from_message(message)
+    s = 1j * np.geomspace(1e-3, 1e2, 50)
+    assert np.allclose(back(s), model(s), rtol=1e-12)
+    assert message.covariance == array.array("d", [0.01, 0.0, 0.0, 0.04])
+    assert message.header.stamp.nanosec == 5
+
+
+def test_a_complex_pair_is_left_to_the_polynomials() -> None:
+    model = TransferFunction.from_polynomials([1.0], [4.0, 0.8, 1.0], 0.5)
+    message = SimpleNamespace(header=header())
+    fill_transfer_function(message, identification(model))
+    assert list(message.time_constants) == []
+    assert list(message.denominator) == pytest.approx([4.0, 0.8, 1.0])
+
+
+def test_gains_are_written_field_by_field() -> None:
+    numbers = {
+        name: float(k)
+        for k, name in enumerate(
+            [
+                *("kc", "ti", "td", "tf", "b", "p", "i", "d", "ms", "ms_95", "mt"),
+                *("gain_margin", "phase_margin", "delay_margin", "iae_load"),
+            ]
+        )
+    }
+    message = SimpleNamespace(header=header())
+    gains: Any = SimpleNamespace(rule="itae", form="isa", reason="why", **numbers)
+    fill_gains(message, gains, experiment_id="one")
+    assert {name: getattr(message, name) for name in numbers} == numbers
+    assert (message.rule, message.form, message.final) == ("itae", "isa", True)

@@ -1,0 +1,123 @@
+"""The time base and the stamps of a running experiment."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from relay_autotune.errors import RecordError
+from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
+from relay_autotune.nodes.session import Session
+from relay_autotune.relay import RelayExperiment
+from relay_autotune.relay_parameters import ExperimentParameters
+
+
+def experiment() -> RelayExperiment:
+    return RelayExperiment(ExperimentParameters(amplitude=1.0, settle_time=100.0), 0.5, "one")
+
+
+def info(source: int | None, received: int | None = None) -> dict[str, Any]:
+    return {"source_timestamp": source, "received_timestamp": received}
+
+
+def test_samples_are_timed_by_their_source_stamps() -> None:
+    session = Session(experiment(), "one")
+    kept: list[Any] = []
+    session.record_with(kept.append)
+    start = 1_700_000_000_000_000_000
+    for k, source in enumerate((start, start + 90_000_001, start + 210_000_000)):
+        before = time.time_ns()
+        assert session.answer(float(k), info(source, source + 5_000)) == 0.5
+        session.answered()
+        assert before <= kept[-1][3] <= time.time_ns()
+    record = session.record()
+    assert record.time == pytest.approx([0.0, 0.090000001, 0.21], abs=1e-15)
+    assert record.receive_time == pytest.approx(record.time + 5e-6, abs=1e-12)
+    assert [k[:3] for k in kept][1] == (start + 90_005_001, start + 90_000_001, 1.0)
+    assert record.start == pytest.approx(1.7e9)
+    assert np.all(record.command == 0.5)
+
+
+def test_without_source_stamps_the_arrival_counts() -> None:
+    session = Session(experiment(), "one")
+    for received in (10, 30, 60):
+        session.answer(0.0, info(None, received * 10**9))
+        session.answered()
+    assert list(session.record().time) == pytest.approx([0.0, 20.0, 50.0])
+
+
+def test_simulated_time_is_the_clocks() -> None:
+    now = iter([5_000_000_000, 5_000_000_000, 5_100_000_000, 5_100_000_000])
+    session = Session(experiment(), "one", clock=lambda: next(now))
+    for _ in range(2):
+        session.answer(0.0, info(time.time_ns(), time.time_ns()))
+        session.answered()
+    record = session.record()
+    assert list(record.time) == pytest.approx([0.0, 0.1])
+    assert list(record.command_time) == pytest.approx([0.0, 0.1])
+    assert record.start == 5.0
+
+
+class Lockstep:
+    """A session by sample number, whose first sample was answered just now."""
+
+    def __init__(self) -> None:
+        self.session = Session(experiment(), "one", sample_period=0.1)
+        self.session.answer(7.0, info(time.time_ns()))
+        self.answered_at = time.time_ns()
+        self.session.answered()
+
+    def take(self, value: float, after: float) -> float | None:
+        stamp = self.answered_at + round(after * 1e9)
+        answer = self.session.answer(value, info(stamp))
+        if answer is not None:
+            self.session.answered()
+        return answer
+
+
+def test_sample_k_is_at_k_periods() -> None:
+    loop = Lockstep()
+    for k in range(1, 4):
+        assert loop.take(7.0 + k, 0.02 * k) == 0.5
+    record = loop.session.record()
+    assert list(record.time) == [k * 0.1 for k in range(4)]
+    assert list(record.command_time) == list(record.time)
+
+
+def test_what_was_sent_before_the_first_answer_is_a_repeat() -> None:
+    loop = Lockstep()
+    assert loop.take(7.0, -0.15) is None
+    assert loop.take(7.0, -0.05) is None
+    assert loop.take(7.5, 0.02) == 0.5
+    assert loop.session.sample_count == 2
+
+
+def test_what_crossed_the_first_answer_is_a_repeat() -> None:
+    loop = Lockstep()
+    assert loop.take(7.0, 0.2 * QUIET_AFTER_GO) is None
+    assert loop.session.may_be_no_repeat
+    # Sample 1 may say the same, but not as early.
+    assert loop.take(7.0, QUIET_AFTER_GO) == 0.5
+    assert loop.session.answer_after_all() is None
+    assert loop.session.sample_count == 2
+
+
+def test_another_value_is_no_repeat() -> None:
+    assert Lockstep().take(7.1, 0.2 * QUIET_AFTER_GO) == 0.5
+
+
+def test_a_sample_taken_for_a_repeat_is_answered_if_none_follows() -> None:
+    loop = Lockstep()
+    assert loop.take(7.0, 0.2 * QUIET_AFTER_GO) is None
+    assert loop.session.answer_after_all() == 0.5
+    loop.session.answered()
+    assert loop.session.answer_after_all() is None
+    assert list(loop.session.record().measurement) == [7.0, 7.0]
+
+
+def test_without_a_sample_there_is_no_record() -> None:
+    with pytest.raises(RecordError, match="found none"):
+        Session(experiment(), "one").record()
