@@ -50,16 +50,20 @@ def clocked(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def take_turns(works: Mapping[str, Callable[[], object]], turns: int) -> dict[str, Timing]:
+def take_turns(
+    works: Mapping[str, Callable[[], object]], turns: int, *, warm_up: bool = True
+) -> dict[str, Timing]:
     """Time several works and the reference, in turns, so that all meet the same machine.
 
     :param works: what is timed, by name.
-    :param turns: how often each is timed, after one turn that does not count.
+    :param turns: how often each is timed.
+    :param warm_up: True: after one turn that does not count.
     :return: for each name, and for "reference".
     """
     everything = {"reference": workload, **works}
-    for work in everything.values():
-        work()
+    if warm_up:
+        for work in everything.values():
+            work()
     taken = np.array([[clocked(work) for work in everything.values()] for _ in range(turns)])
     medians = np.median(taken, axis=0)
     multiples = np.median(taken / taken[:, :1], axis=0)
