@@ -1,0 +1,208 @@
+"""Whatever README and guide name exists in the code, and the guide names what there is."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pages import GUIDE, PAGES, ROOT, block_noted, blocks, commands, rows, spans
+
+from relay_autotune.autotune import analyse
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.cli import csv_to_bag, replay
+from relay_autotune.document import document
+from relay_autotune.identification import METHODS
+from relay_autotune.models import STRUCTURES
+from relay_autotune.nodes.plant import MODES
+from relay_autotune.tuning import RULES
+from tools.fill_docs import TABLES, filled
+
+EXECUTABLES = set(re.findall(r'"(\w+) = relay_autotune', (ROOT / "setup.py").read_text()))
+PLAIN = {"use_sim_time"}  # what every node has
+OVERRIDABLE = {"/measurement.subscription", "/command.publisher"}
+
+
+def names_of(kind: str) -> set[str]:
+    """Return the names that messages.md gives for topics or services."""
+    kinds = {"topic": ("subscribes", "publishes"), "service": ("serves",)}[kind]
+    return {row[2].strip("`") for row in rows("docs/messages.md", "node") if row[1] in kinds}
+
+
+def shell_commands(*start: str) -> list[list[str]]:
+    """Return the commands of all shell blocks that begin with some words."""
+    found = [words for block in blocks("sh") for words in commands(block.text)]
+    return [words for words in found if words[: len(start)] == list(start)]
+
+
+def in_code(word: str) -> bool:
+    return re.search(rf"(?<![\w]){re.escape(word)}(?![\w])", CODE) is not None
+
+
+def code_text() -> str:
+    files = [ROOT / name for name in ("setup.py", "Makefile", "package.xml", "env.sh")]
+    for folder in ("relay_autotune", "relay_autotune_msgs", "tools", "bags"):
+        for pattern in ("*.py", "*.msg", "*.srv", "*.action"):
+            files += (ROOT / folder).rglob(pattern)
+    return "\n".join(file.read_text() for file in files)
+
+
+CODE = code_text()
+
+
+@pytest.mark.parametrize("page", GUIDE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_what_the_code_says_is_written_in_the_page(page: Path) -> None:
+    assert page.read_text() == filled(page.read_text()), "run `python3 tools/fill_docs.py`"
+
+
+def test_every_node_has_its_table() -> None:
+    text = "\n".join(page.read_text() for page in GUIDE)
+    assert set(re.findall(r"<!-- parameters of (\w+) -->", text)) == set(TABLES)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_names_in_the_text_are_in_the_code(page: Path) -> None:
+    for span in spans(page):
+        if re.fullmatch(r"~?[a-z][a-z0-9]*(_[a-z0-9]+)+", span) or re.fullmatch("[a-z]+", span):
+            assert in_code(span), f"{page.name} names {span}, which is not in the code"
+        if re.fullmatch(r"[\w./]+/[\w.]*", span) and not span.startswith(("/", "~")):
+            there = [span, f"relay_autotune/{span}", span.replace("docs/", "")]
+            known = any((ROOT / path).exists() for path in there) or in_code(span)
+            made = span.startswith((".venv", "install", "demo_output", "src"))
+            assert known or made or is_interface(span), f"{page.name} names the path {span}"
+
+
+def is_interface(name: str) -> bool:
+    package, _, rest = name.partition("/")
+    kind, _, interface = rest.partition("/")
+    try:
+        return hasattr(importlib.import_module(f"{package}.{kind}"), interface)
+    except ImportError:
+        return False
+
+
+def test_executables_in_commands_exist() -> None:
+    runs = shell_commands("ros2", "run")
+    assert len(runs) >= 5
+    for words in runs:
+        assert words[2] == "relay_autotune"
+        assert words[3] in EXECUTABLES
+
+
+def test_every_executable_is_named_in_the_guide() -> None:
+    text = "\n".join(page.read_text() for page in GUIDE)
+    missing = {name for name in EXECUTABLES if f"`{name}`" not in text}
+    assert not missing, f"the guide does not say what {missing} is for"
+
+
+def test_parameters_in_commands_exist_and_may_have_these_values() -> None:
+    for words in shell_commands("ros2", "run"):
+        known = {entry.name: entry for entry in TABLES[words[3]]}
+        for flag, assignment in pairwise(words):
+            if flag != "-p" or assignment.endswith(":=..."):
+                continue
+            name, _, value = assignment.partition(":=")
+            if name.startswith("qos_overrides."):
+                assert name.removeprefix("qos_overrides.").rpartition(".")[0] in OVERRIDABLE
+                continue
+            assert name in known.keys() | PLAIN, f"{words[3]} has no parameter {name}"
+            if name in known:
+                check_value(known[name], yaml.safe_load(value))
+
+
+def check_value(entry: Any, value: Any) -> None:
+    assert entry.problem(value) is None
+    if isinstance(entry.default, float):
+        assert isinstance(value, float), f"{entry.name}: {value} lacks its decimal point"
+    elif entry.default == ():
+        assert all(isinstance(v, float) for v in value)
+    else:
+        assert isinstance(value, type(entry.default))
+
+
+def test_the_parameter_file_is_one_for_relay_node() -> None:
+    content = yaml.safe_load(block_noted("docs/live.md", "a parameter file").text)
+    ((node, section),) = content.items()
+    assert node == "/tank/relay_node"
+    known = {entry.name: entry for entry in TABLES["relay_node"]}
+    for name, value in section["ros__parameters"].items():
+        check_value(known[name], value)
+
+
+def test_services_and_topics_in_commands_exist() -> None:
+    services = {name.removeprefix("~/") for name in names_of("service")}
+    calls = shell_commands("ros2", "service", "call")
+    assert len(calls) >= 3
+    for words in calls:
+        node, _, service = words[3].rpartition("/")
+        assert service in services
+        assert node.rpartition("/")[2] == "relay_node"
+        assert is_interface(words[4])
+        kind = getattr(importlib.import_module("relay_autotune_msgs.srv"), words[4][-9:])
+        fields = kind.Request.get_fields_and_field_types()
+        assert set(yaml.safe_load(words[5]) or {}) <= set(fields)
+    topics = {name.removeprefix("/") for name in names_of("topic")}
+    for words in shell_commands("ros2", "topic", "echo"):
+        (topic,) = (word for word in words[3:] if word.startswith("/"))
+        assert topic.rpartition("/")[2] in topics
+    for page in GUIDE:
+        for service in re.findall(r"`~/(\w+)`", page.read_text()):
+            assert service in services, f"{page.name} names ~/{service}"
+
+
+def test_remapped_names_are_those_of_the_loop() -> None:
+    for page in GUIDE:
+        for name in re.findall(r"-r (\w+):=", page.read_text()):
+            assert name in {"measurement", "command", "__ns"}
+
+
+@pytest.mark.parametrize(
+    ("module", "column"), [(replay, "flag"), (csv_to_bag, "flag of `csv_to_bag`")]
+)
+def test_the_guide_has_the_flags_of_a_command(
+    module: Any, column: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        module.main(["--help"])
+    flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("\nExample")[0]))
+    shown = " ".join(row[0] for row in rows("docs/replay.md", column))
+    assert set(re.findall(r"--[a-z-]+", shown)) | {"--help"} == flags
+
+
+def test_methods_rules_structures_and_modes_each_have_their_place() -> None:
+    def titles(page: str, level: str = "##") -> set[str]:
+        found = re.findall(rf"^{level} ([a-z0-9_]+)$", (ROOT / page).read_text(), re.MULTILINE)
+        return set(found)
+
+    for page, known in (("docs/methods.md", METHODS), ("docs/rules.md", RULES)):
+        assert not set(known) - titles(page), f"{page} lacks a section named for each of these"
+        assert not titles(page) - set(known), f"{page} has sections on what does not exist"
+    structures = [row[0].strip("`") for row in rows("docs/plant.md", "structure")]
+    assert structures == list(STRUCTURES[:-1])
+    assert [row[0].strip("`") for row in rows("docs/plant.md", "mode")] == list(MODES)
+
+
+def test_every_interface_is_in_the_guide() -> None:
+    shown = set(re.findall(r"text of (\S+)", (ROOT / "docs/messages.md").read_text()))
+    there = (ROOT / "relay_autotune_msgs").glob("*/*.*")
+    files = {str(f.relative_to(ROOT)) for f in there if f.suffix in (".msg", ".srv", ".action")}
+    assert shown == files
+
+
+def test_the_guide_has_the_fields_of_the_document() -> None:
+    bag = ROOT / "bags/biased_relay"
+    found = document(str(bag), [analyse(read_experiments(bag).experiments[0])])
+    (experiment,) = found["experiments"]
+    model = experiment["models"][0]
+    for column, fields in {
+        "field of an experiment": experiment,
+        "field of `limit_cycle`": experiment["limit_cycle"],
+        "field of a model": model,
+        "field of `fit`": model["fit"],
+        "field of gains": experiment["gains"][0],
+    }.items():
+        assert [row[0] for row in rows("docs/replay.md", column)] == [f"`{f}`" for f in fields]

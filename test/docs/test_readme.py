@@ -1,0 +1,134 @@
+"""What README and guide show is what happens."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, sessions
+
+from relay_autotune.autotune import analyse
+from relay_autotune.cli import demo
+from relay_autotune.relay import RelayExperiment
+from relay_autotune.relay_parameters import ExperimentParameters
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+
+def run(words: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[str, int]:
+    """Run an executable of the package in this process; return what it says and its status."""
+    scripts = dict(
+        re.findall(r'"(\w+) = (relay_autotune[\w.]+:main)"', (ROOT / "setup.py").read_text())
+    )
+    module = importlib.import_module(scripts[words[0]].partition(":")[0])
+    capfd.readouterr()
+    try:
+        status = module.main(words[1:])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    said = capfd.readouterr()
+    return said.err + said.out, status
+
+
+@pytest.mark.parametrize("block", blocks("console"), ids=str)
+def test_a_console_shows_what_the_command_prints(
+    block: Block, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    for words, shown in sessions(block.text):
+        output, status = run(words, capfd)
+        if status:
+            output += f"[exit status {status}]\n"
+        assert matches(shown, output), output
+
+
+def test_logs_of_other_tools_are_read_by_the_commands_shown(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    t = np.arange(0.0, 300.0, 1.0)
+    heater = np.where(t < 50.0, 0.0, np.where(t < 180.0, 60.0, 20.0))
+    process = VirtualProcess(demo.TRUTH, disturbances=Disturbances(noise_std=0.1), seed=3)
+    rows = ["Time (sec),Heater 1 (%),Spare,Temperature 1 (degC)"]
+    for time, power in zip(t, heater, strict=True):
+        rows.append(f"{time},{power},0,{process.measure(time)}")
+        process.command(power)
+    Path("heater.csv").write_text("\n".join(rows) + "\n")
+    direct = block_noted("docs/replay.md", "a log of another tool")
+    by_bag = block_noted("docs/replay.md", "a log becomes a bag")
+    said = [run(words, capfd) for b in (direct, by_bag) for words in commands(b.text)]
+    assert [status for _, status in said] == [0, 0, 0]
+    models = [re.findall(r"process +(.*)", output) for output, _ in (said[0], said[2])]
+    assert models[0] == models[1] != []
+
+
+def test_the_demo_shown_is_the_one_computed(capsys: pytest.CaptureFixture[str]) -> None:
+    """The demo runs in lockstep, so that the same samples can be had without processes."""
+    process = VirtualProcess(
+        demo.TRUTH,
+        rest_measurement=demo.REST,
+        rest_command=demo.BASELINE,
+        disturbances=Disturbances(noise_std=demo.NOISE_STD),
+        seed=demo.SEED,
+    )
+    parameters = ExperimentParameters(amplitude=demo.AMPLITUDE, sample_period=demo.PERIOD)
+    experiment = RelayExperiment(parameters, demo.BASELINE)
+    k = 0
+    while not experiment.finished:
+        process.command(experiment.step(k * demo.PERIOD, process.measure(k * demo.PERIOD)))
+        k += 1
+    demo._compare(analyse(experiment.record()))
+    assert capsys.readouterr().out == block_noted("README.md", "made by the demo").text
+
+
+def test_the_picture_is_small() -> None:
+    picture = ROOT / "docs/images/demo.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size < 200_000
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+        if target.startswith("http"):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{page.name} links to {target}"
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
+            anchors = {re.sub(r"[^\w -]", "", t.lower()).replace(" ", "-") for t in titles}
+            assert anchor in anchors, f"{page.name} links to {target}"
+
+
+def test_make_has_every_target_named() -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for page in (*PAGES, ROOT / "env.sh"):
+        named = re.findall(r"(?:^|`)make ([a-z][\w-]*)(?:`|$| +#)", page.read_text(), re.MULTILINE)
+        assert set(named) <= targets, page
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_colcon_finds_both_packages_in_both_layouts(page: str, tmp_path: Path) -> None:
+    if not shutil.which("colcon"):
+        pytest.skip("colcon is not installed")
+    builds = [words for b in blocks("sh") if b.page == page for words in commands(b.text)]
+    builds = [words for words in builds if words[:2] == ["colcon", "build"]]
+    assert len(builds) == 2
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src/relay_autotune").symlink_to(ROOT)
+    for folder, words in zip((ROOT, tmp_path), builds, strict=True):
+        listed = subprocess.run(
+            [sys.executable, "-m", "colcon", "list", "--names-only", *words[2:]],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        )
+        assert set(listed.stdout.split()) == {"relay_autotune", "relay_autotune_msgs"}

@@ -1,0 +1,91 @@
+"""The pages of the user guide, and the commands and examples in them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (*GUIDE, ROOT / "CONTRIBUTING.md", ROOT / "bags/README.md")
+
+_FENCE = re.compile(
+    r"(?:^<!-- (?P<note>[^\n]*?) -->\n\n)?"
+    r"^```(?P<language>\w+)\n(?P<text>.*?)^```$",
+    re.DOTALL | re.MULTILINE,
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block, with the comment right above it, which readers do not see.
+
+    :param page: path of its page from the repository's root.
+    :param language: what is written after the fence.
+    :param note: the comment; empty: none.
+    :param text: what the block holds.
+    """
+
+    page: str
+    language: str
+    note: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page}: {self.text.splitlines()[0]}"
+
+
+def blocks(*languages: str, pages: tuple[Path, ...] = PAGES) -> list[Block]:
+    """Return the fenced blocks in some languages."""
+    return [
+        Block(str(page.relative_to(ROOT)), found["language"], found["note"] or "", found["text"])
+        for page in pages
+        for found in _FENCE.finditer(page.read_text())
+        if found["language"] in languages
+    ]
+
+
+def block_noted(page: str, note: str) -> Block:
+    """Return the one block of a page that has a note."""
+    (found,) = (b for b in blocks("sh", "text", "yaml") if (b.page, b.note) == (page, note))
+    return found
+
+
+def commands(text: str) -> list[list[str]]:
+    """Return the words of each line of a shell block."""
+    return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
+
+
+def sessions(text: str) -> list[tuple[list[str], str]]:
+    """Return the words of each command of a console block, and the output shown for it."""
+    parts = re.split(r"^\$ (.*)\n", text, flags=re.MULTILINE)
+    assert parts[0] == "", f"a console block begins with a command, found {parts[0]!r}"
+    return [(shlex.split(c), shown) for c, shown in zip(parts[1::2], parts[2::2], strict=True)]
+
+
+def matches(shown: str, output: str) -> bool:
+    """Tell whether an output is the one shown, where `...` stands for anything."""
+    pieces = [re.escape(piece) for piece in shown.rstrip("\n").split("...")]
+    return re.fullmatch(".*".join(pieces) + r"\s*", output, re.DOTALL) is not None
+
+
+def spans(page: Path) -> list[str]:
+    """Return what a page has in backticks within its text."""
+    return re.findall(r"`([^`\n]+)`", _FENCE.sub("", page.read_text()))
+
+
+def rows(page: str, first_column: str) -> list[list[str]]:
+    """Return the rows of the tables of a page whose header begins with a cell."""
+    found: list[list[str]] = []
+    inside = False
+    for line in (ROOT / page).read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if not line.startswith("|"):
+            inside = False
+        elif cells[0] == first_column:
+            inside = True
+        elif inside and not set(line) <= set("|-"):
+            found.append(cells)
+    return found
