@@ -174,3 +174,47 @@ def test_the_initial_command_answers_before_the_first_tune(rig: Rig) -> None:
     rig.relay(initial_command=0.25)
     rig.until(lambda: len(commands) > 5, "commands before a tune")
     assert {m.data for m in commands} == {0.25}
+
+
+def test_samples_that_the_middleware_lost_are_counted(rig: Rig) -> None:
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    rig.listen("command", Float64, RELIABLE)
+    publisher = rig.node.create_publisher(Float64, "measurement", 10)
+    relay = rig.relay(
+        amplitude=0.5, baseline=BASELINE, settle_time=600.0, measurement_timeout=60.0
+    )
+    rig.until(publisher.get_subscription_count, "the relay")
+    timer = rig.node.create_timer(0.01, lambda: publisher.publish(Float64()))
+    rig.tune()
+    rig.run_for(0.3)
+    rig.node.destroy_timer(timer)
+    relay.signal(signal.SIGSTOP)
+    # More than the relay's subscription keeps, while it cannot take any.
+    for _ in range(400):
+        publisher.publish(Float64())
+    relay.signal(signal.SIGCONT)
+    rig.run_for(0.5)
+    publisher.publish(Float64())
+    rig.run_for(0.2)
+    rig.call(Trigger, "relay_node/abort", Trigger.Request())
+    ended = rig.until(lambda: experiments, "the record")[-1]
+    assert ended.lost_samples >= 100
+    assert ended.lost_samples + len(ended.time) >= 400
+
+
+def test_a_plant_in_lockstep_waits_for_the_next_relay(rig: Rig) -> None:
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    rig.plant(
+        mode="lockstep",
+        sample_period=0.1,
+        structure="fopdt",
+        time_constants=[2.0],
+        dead_time=1.0,
+    )
+    for count in (1, 2):
+        relay = rig.relay(amplitude=1.0, baseline=0.0, sample_period=0.1, model_timeout=0.0)
+        rig.tune()
+        rig.until(lambda count=count: len(experiments) == count, "the record")
+        assert experiments[-1].outcome == RelayExperiment.COMPLETED
+        relay.signal(signal.SIGTERM)
+        assert relay.wait() == 0

@@ -245,6 +245,16 @@ def test_while_a_tune_runs(rig: Rig) -> None:
         assert relay.running
 
 
+def test_a_best_effort_sensor_is_heard_if_the_relay_is_told_so(rig: Rig) -> None:
+    rig.relay(
+        amplitude=1.0,
+        baseline=0.5,
+        **{"qos_overrides./measurement.subscription.reliability": "best_effort"},
+    )
+    with Ends(rig, measurement=(Float64, BEST_EFFORT)):
+        assert rig.tune(dry_run=True).accepted
+
+
 def test_a_folder_that_cannot_be_written_is_said_and_the_tune_goes_on(rig: Rig) -> None:
     blocked = rig.folder / "a_file"
     blocked.write_text("not a folder")
