@@ -45,7 +45,7 @@ def in_code(word: str) -> bool:
 
 def code_text() -> str:
     files = [ROOT / name for name in ("setup.py", "Makefile", "package.xml", "env.sh")]
-    for folder in ("relay_autotune", "relay_autotune_msgs", "tools", "bags"):
+    for folder in ("relay_autotune", "relay_autotune_msgs", "tools", "bags", "benchmarks"):
         for pattern in ("*.py", "*.msg", "*.srv", "*.action"):
             files += (ROOT / folder).rglob(pattern)
     return "\n".join(file.read_text() for file in files)
