@@ -26,7 +26,7 @@ Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command
 choice of topics, does not fit.
 
 Examples:
-  replay ~/.ros/relay_autotune/2026-08-22T10-00-00Z-1a2b
+  replay ~/.ros/relay_autotune/20261120T234315Z_2c010118
   replay --measurement /tank/level --command /tank/valve robot_bag
   replay --json log.csv --measurement level --command valve --time t
 """
