@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+from relay_autotune.cli.chart_chang import identify_atv_chart, identify_chang_chart
 from relay_autotune.cli.chart_wang import identify_biased_chart, identify_unbiased_chart
 from relay_autotune.errors import SelectionError
 from relay_autotune.identification.known import Known
@@ -77,6 +78,18 @@ CHART_METHODS: dict[str, Chart] = {
         identify_unbiased_chart,
         ("period", "amplitude", "relay", "gain"),
         ("hysteresis",),
+    ),
+    "chang": Chart(
+        "lags, exactly in time, from an unbiased relay (Chang, Shen and Yu 1992)",
+        identify_chang_chart,
+        ("period", "amplitude", "relay", "dead_time"),
+        ("gain", "hysteresis"),
+    ),
+    "atv": Chart(
+        "lags by the describing function, from an unbiased relay (Luyben 1987)",
+        identify_atv_chart,
+        ("period", "amplitude", "relay", "dead_time"),
+        ("gain", "hysteresis"),
     ),
 }
 CHART_METHODS["wang"] = replace(CHART_METHODS["wang_biased"], summary="the same as wang_biased")

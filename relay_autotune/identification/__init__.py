@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.atv import identify_atv
+from relay_autotune.identification.chang_method import identify_chang
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
@@ -17,6 +19,8 @@ METHODS: dict[str, Method] = {
     "waveform": identify_waveform,
     "wang_biased": identify_biased,
     "wang_unbiased": identify_unbiased,
+    "chang": identify_chang,
+    "atv": identify_atv,
 }
 DEFAULT_METHOD = "waveform"
 

@@ -26,8 +26,8 @@ from relay_autotune.errors import ModelError
 
 FloatArray = NDArray[np.float64]
 
-_CLOSE = 0.5
-_TAYLOR = 24
+_CLOSE = 0.25
+_TAYLOR = 15
 _GRID = 64
 
 
@@ -73,8 +73,9 @@ def peak_part(time_constants: Sequence[float], period: float) -> float:
     # Beyond this every trace of the half period before has died away, below rounding.
     if len(x) == 1 or min(x) > 50.0 + 5.0 * len(x):
         return 0.0
+    # The amplitude there is flat, so that this accuracy gives it to the last digit.
     return float(
-        brentq(lambda m: slope_sign(time_constants, period, m), 0.0, 1.0, xtol=1e-300, rtol=1e-15)
+        brentq(lambda m: slope_sign(time_constants, period, m), 0.0, 1.0, xtol=1e-12, rtol=1e-9)
     )
 
 

@@ -1,0 +1,41 @@
+"""The methods for an unbiased relay for the numbers of a chart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from relay_autotune.identification.atv import atv_from_numbers
+from relay_autotune.identification.chang_method import chang_from_numbers
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.result import Identification
+from relay_autotune.identification.symmetric_cycle import SymmetricCycle
+
+
+def identify_chang_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify lags by the exact equations of Chang et al.
+
+    :param numbers: period, amplitude, relay, dead_time; hysteresis.
+    :param known: gain, structure and order where they are known.
+    :raises IdentificationError: if no such model has the limit cycle.
+    """
+    return chang_from_numbers(_cycle(numbers), known)
+
+
+def identify_atv_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify lags by the original ATV.
+
+    :param numbers: period, amplitude, relay, dead_time; hysteresis.
+    :param known: gain, structure and order where they are known.
+    :raises IdentificationError: if no such model has the limit cycle.
+    """
+    return atv_from_numbers(_cycle(numbers), known)
+
+
+def _cycle(numbers: Mapping[str, float]) -> SymmetricCycle:
+    return SymmetricCycle(
+        numbers["period"],
+        numbers["amplitude"],
+        numbers["relay"],
+        numbers.get("hysteresis", 0.0),
+        numbers["dead_time"],
+    )
