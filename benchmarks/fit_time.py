@@ -1,4 +1,4 @@
-"""Time and memory of the FOPDT waveform fit: `python3 benchmarks/fit_time.py [--quick]`."""
+"""Time and memory of the waveform fit: `python3 benchmarks/fit_time.py [--quick]`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import tracemalloc
 from functools import partial
 
 from markdown import table, three
-from reference import take_turns
+from reference import Timing, take_turns
 
 # isort: split
 import numpy as np
@@ -20,9 +20,13 @@ from relay_autotune.simulation import simulate_relay
 
 TARGET = 0.060
 RATIOS = (0.0, 0.1)
-FOPDT = Known(structure="fopdt")
-TURNS = {1_000: 41, 10_000: 15, 100_000: 7, 1_000_000: 3}
-QUICK = {1_000: 3, 10_000: 1}
+STRUCTURES = {"FOPDT": Known(structure="fopdt"), "any": Known()}
+# Turns of each number of samples.
+TURNS = {
+    "FOPDT": {1_000: 41, 10_000: 15, 100_000: 7, 1_000_000: 3},
+    "any": {1_000: 7, 10_000: 5, 100_000: 3},
+}
+QUICK = {"FOPDT": {1_000: 3, 10_000: 1}}
 
 
 def record(samples: int, ratio: float) -> Record:
@@ -38,14 +42,40 @@ def record(samples: int, ratio: float) -> Record:
     return run.record(noise_std=case.noise_std(ratio), rng=np.random.default_rng(1))
 
 
-def peak_memory(of: Record) -> float:
+def peak_memory(of: Record, known: Known) -> float:
     """Return the peak of what a fit allocates [MB]."""
     tracemalloc.start()
     try:
-        identify(of, "waveform", FOPDT)
+        identify(of, "waveform", known)
         return tracemalloc.get_traced_memory()[1] * 1e-6
     finally:
         tracemalloc.stop()
+
+
+def rows(structure: str, samples: int, turns: int) -> tuple[list[tuple[object, ...]], Timing]:
+    """Return a row for each of ``RATIOS``, and how long the reference took beside them."""
+    known = STRUCTURES[structure]
+    records = {ratio: record(samples, ratio) for ratio in RATIOS}
+    works = {f"{r:g}": partial(identify, records[r], "waveform", known) for r in RATIOS}
+    timings = take_turns(works, turns)
+    target = f"<= {1e3 * TARGET:g}" if (structure, samples) == ("FOPDT", 1_000) else ""
+    found: list[tuple[object, ...]] = []
+    for ratio in RATIOS:
+        timing = timings[f"{ratio:g}"]
+        found.append(
+            (
+                structure,
+                f"{samples:,}",
+                f"{ratio:g}",
+                turns,
+                three(1e3 * timing.seconds),
+                target,
+                three(timing.multiple),
+                three(1e6 * timing.seconds / samples),
+                three(peak_memory(records[ratio], known)),
+            )
+        )
+    return found, timings["reference"]
 
 
 def main() -> int:
@@ -53,28 +83,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few and small fits: does it run?")
     options = parser.parse_args()
-    rows, reference = [], []
-    for samples, turns in (QUICK if options.quick else TURNS).items():
-        records = {ratio: record(samples, ratio) for ratio in RATIOS}
-        works = {f"{r:g}": partial(identify, records[r], "waveform", FOPDT) for r in RATIOS}
-        timings = take_turns(works, turns)
-        reference.append(timings["reference"].seconds)
-        for ratio in RATIOS:
-            timing = timings[f"{ratio:g}"]
-            rows.append(
-                (
-                    f"{samples:,}",
-                    f"{ratio:g}",
-                    turns,
-                    three(1e3 * timing.seconds),
-                    three(timing.multiple),
-                    three(1e6 * timing.seconds / samples),
-                    three(peak_memory(records[ratio])),
-                    f"<= {1e3 * TARGET:g}" if samples == 1_000 else "",
-                )
-            )
-    headings = ("samples", "NSR", "runs", "median [ms]", "x reference", "us/sample", "peak [MB]")
-    print(table((*headings, "target [ms]"), rows))
+    found, reference = [], []
+    for structure, turns_of in (QUICK if options.quick else TURNS).items():
+        for samples, turns in turns_of.items():
+            some, beside = rows(structure, samples, turns)
+            found += some
+            reference.append(beside.seconds)
+    headings = ("structure", "samples", "NSR", "runs", "median [ms]", "target [ms]")
+    print(table((*headings, "x reference", "us/sample", "peak [MB]"), found))
     print(f"\nreference workload: {three(1e3 * float(np.median(reference)))} ms")
     return 0
 

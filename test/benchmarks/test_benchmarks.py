@@ -17,6 +17,7 @@ QUICK = {
     "target_spread": ("--quick",),
     "replay_time": ("--quick",),
     "lockstep": ("--quick",),
+    "latency": ("--quick",),
 }
 
 
