@@ -101,7 +101,8 @@ class HalfCycle:
         n = len(self._poles)
         if n < 2:
             return 0.0
-        rates = self._modes.outputs(self._rates, np.arange(n, dtype=np.float64) * self.half_period)[:, 0]
+        at = np.arange(n, dtype=np.float64) * self.half_period
+        rates = self._modes.outputs(self._rates, at)[:, 0]
         denominator = np.ones(1, dtype=np.complex128)
         for pole in self._poles:
             denominator = np.convolve(denominator, [1.0, -np.exp(pole * self.half_period)])
