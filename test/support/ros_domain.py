@@ -26,19 +26,27 @@ def remove_leftovers(domain: int, segments: set[Path]) -> None:
     """Remove what killed processes have left, once no process of the domain lives.
 
     :param domain: the domain that this run holds.
-    :param segments: what the killed processes had mapped.
+    :param segments: what the killed processes had mapped, their own and those of their peers.
     """
-    numbers = ports(domain)
     for path in segments:
-        if "_port" not in path.name:
+        # Segments belong to participants of the domain, which have ended; but the ports from 7000
+        # on are those of all domains, and a living process may use the one of a killed one.
+        port = "_port" in path.name
+        if not (port and any(path in mapped_segments(pid) for pid in _processes())):
             _remove(path)
+    # A port's semaphore is mapped by nobody who merely sends.
     for path in SHARED_MEMORY.glob("*fastrtps_port*"):
         number = re.search(r"fastrtps_port(\d+)", path.name)
-        if number and int(number.group(1)) in numbers:
+        if number and int(number.group(1)) in ports(domain):
             _remove(path)
+
+
+def _processes() -> list[int]:
+    return [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
 
 
 def _remove(path: Path) -> None:
-    with suppress(OSError):
-        path.unlink()
-        path.with_name(f"{path.name}_el").unlink()
+    name = path.name.removeprefix("sem.").removesuffix("_mutex").removesuffix("_el")
+    for belonging in (name, f"{name}_el", f"sem.{name}_mutex"):
+        with suppress(OSError):
+            (SHARED_MEMORY / belonging).unlink()
