@@ -9,6 +9,7 @@ from relay_autotune.identification.atv import identify_atv
 from relay_autotune.identification.chang_method import identify_chang
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import FitReport, Identification
+from relay_autotune.identification.thyagarajan_method import identify_thyagarajan
 from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.record import Record
@@ -21,6 +22,7 @@ METHODS: dict[str, Method] = {
     "wang_unbiased": identify_unbiased,
     "chang": identify_chang,
     "atv": identify_atv,
+    "thyagarajan": identify_thyagarajan,
 }
 DEFAULT_METHOD = "waveform"
 
