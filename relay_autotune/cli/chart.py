@@ -6,7 +6,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from relay_autotune.cli.chart_chang import identify_atv_chart, identify_chang_chart
+from relay_autotune.cli.chart_chang import (
+    identify_atv_chart,
+    identify_chang_chart,
+    identify_li_chart,
+)
 from relay_autotune.cli.chart_wang import identify_biased_chart, identify_unbiased_chart
 from relay_autotune.errors import SelectionError
 from relay_autotune.identification.known import Known
@@ -62,6 +66,10 @@ NUMBERS: dict[str, Number] = {
     "hysteresis": Number("y", "half width of the switching band, 0 if not given", NOT_NEGATIVE),
     "gain": Number("y/u", "static gain of the process", NOT_ZERO),
     "dead_time": Number("s", "dead time of the process", NOT_NEGATIVE),
+    "extra_delay": Number("s", "dead time added to the relay, in the second test", POSITIVE),
+    "period_2": Number("s", "period in the second test", POSITIVE),
+    "amplitude_2": Number("y", "half of peak to peak in the second test", POSITIVE),
+    "relay_2": Number("u", "amplitude of the relay in the second test, if another", POSITIVE),
     "mean_measurement": Number("y", "mean over whole cycles, from the steady state"),
     "mean_command": Number("u", "mean over whole cycles, from the steady state"),
 }
@@ -90,6 +98,12 @@ CHART_METHODS: dict[str, Chart] = {
         identify_atv_chart,
         ("period", "amplitude", "relay", "dead_time"),
         ("gain", "hysteresis"),
+    ),
+    "li": Chart(
+        "lags with their gain from two tests, one with a dead time added (Li et al. 1991)",
+        identify_li_chart,
+        ("period", "amplitude", "relay", "period_2", "amplitude_2", "extra_delay"),
+        ("dead_time", "hysteresis", "relay_2"),
     ),
 }
 CHART_METHODS["wang"] = replace(CHART_METHODS["wang_biased"], summary="the same as wang_biased")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.atv import identify_atv
 from relay_autotune.identification.chang_method import identify_chang
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.li_method import identify_li, identify_li_jointly
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.identification.thyagarajan_method import identify_thyagarajan
 from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
@@ -15,6 +16,7 @@ from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.record import Record
 
 Method = Callable[[Record, Known], Identification]
+JointMethod = Callable[[Sequence[Record], Known], Identification]
 
 METHODS: dict[str, Method] = {
     "waveform": identify_waveform,
@@ -22,17 +24,24 @@ METHODS: dict[str, Method] = {
     "wang_unbiased": identify_unbiased,
     "chang": identify_chang,
     "atv": identify_atv,
+    "li": identify_li,
     "thyagarajan": identify_thyagarajan,
+}
+# These take several records of one process.
+JOINT_METHODS: dict[str, JointMethod] = {
+    "li": identify_li_jointly,
 }
 DEFAULT_METHOD = "waveform"
 
 __all__ = [
     "DEFAULT_METHOD",
+    "JOINT_METHODS",
     "METHODS",
     "FitReport",
     "Identification",
     "Known",
     "identify",
+    "identify_jointly",
     "method_named",
 ]
 
@@ -58,3 +67,22 @@ def identify(
     :raises IdentificationError: if the method is unknown or the record does not tell a model.
     """
     return method_named(method)(record, known)
+
+
+def identify_jointly(
+    records: Sequence[Record], method: str, known: Known = NOTHING
+) -> Identification:
+    """Identify one model from several experiments on one process.
+
+    :param records: the experiments.
+    :param method: one of ``JOINT_METHODS``.
+    :param known: what is known of the process beforehand.
+    :raises IdentificationError: if the method does not take several records, or they do not tell
+        a model.
+    """
+    if method not in JOINT_METHODS:
+        raise IdentificationError(
+            f"the method {method!r} does not take several records together; these do: "
+            f"{', '.join(JOINT_METHODS)}"
+        )
+    return JOINT_METHODS[method](records, known)

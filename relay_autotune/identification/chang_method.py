@@ -75,10 +75,10 @@ def solve(
                 "the period and the amplitude; give the gain, or use the method li"
             )
         k, tau = gain_and_time_constant(
-            model.order, period, cycle.amplitude, dead_time, h, cycle.hysteresis, harmonics
+            model.order, period, cycle.amplitude, dead_time, h, cycle.level, harmonics
         )
         return Solution(k, (tau,))
-    relative, level = cycle.amplitude / (gain * h), cycle.hysteresis / (gain * h)
+    relative, level = cycle.amplitude / (gain * h), cycle.level / (gain * h)
     if model.equal:
         return Solution(gain, (time_constant_from_period(model.order, period, dead_time, level),))
     if model == MODEL_4:
@@ -101,10 +101,10 @@ def mismatch(order: int, cycle: SymmetricCycle, gain: float) -> float:
     by_amplitude = time_constant_from_amplitude(order, cycle.period, cycle.amplitude / h, None)
     try:
         by_period = time_constant_from_period(
-            order, cycle.period, cycle.dead_time, cycle.hysteresis / h
+            order, cycle.period, cycle.dead_time, cycle.level / h
         )
     except IdentificationError:
-        if cycle.part <= 0.0 or cycle.hysteresis >= h:
+        if cycle.part <= 0.0 or cycle.level >= h:
             raise
         return math.inf
     return math.log(by_period / by_amplitude)
@@ -134,7 +134,7 @@ def _remarks(model: LagModel, cycle: SymmetricCycle, gain: float) -> list[str]:
         equations = f"{by_period} and {by_amplitude}" if unknown else by_period
     begin = f"without {' and '.join(left_out)}, as in the paper, {equations} would "
     try:
-        literal = solve(model, replace(cycle, hysteresis=0.0), gain, 1)
+        literal = solve(model, replace(cycle, switch_level=0.0), gain, 1)
     except IdentificationError:
         return [f"{begin}have no solution"]
     point = ultimate_point(model.build(literal.values(1, cycle.dead_time)))

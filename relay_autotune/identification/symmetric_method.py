@@ -21,7 +21,7 @@ from relay_autotune.identification.cycle_scatter import (
     Stretch,
     relay_test,
 )
-from relay_autotune.identification.dead_time import DeadTime, read_dead_time
+from relay_autotune.identification.dead_time import read_dead_time
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.lag_models import (
     MODEL_1,
@@ -36,12 +36,13 @@ from relay_autotune.identification.lag_models import (
 from relay_autotune.identification.result import Identification, with_uncertainty
 from relay_autotune.identification.square_wave import level
 from relay_autotune.identification.symmetric_cycle import (
+    CycleReader,
     SymmetricCycle,
+    features,
     half_cycles,
     known_gain,
     require_unbiased,
     skew_warning,
-    symmetric_cycle,
 )
 from relay_autotune.record import Record
 
@@ -49,8 +50,10 @@ FloatArray = NDArray[np.float64]
 
 MOST_EQUAL = 20
 
-# A structure is as good as another whose half cycles are so much nearer to the record's.
+# A structure is as good as another whose half cycles are so much nearer to the record's; less
+# than a share of the amplitude is what sampling makes of any.
 _ALIKE = 1.02
+_ALIKE_SHARE = 3e-3
 _SHAPE_SAMPLES = 300
 
 
@@ -106,14 +109,18 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
     sign = -1 if whole.settings.reverse_acting else 1
     gain = known_gain(known, sign)
     dead_time = read_dead_time(whole, record, known)
-    cycle = symmetric_cycle(whole, dead_time.of(whole))
-    model, remark = _choice(method, test, cycle, gain, dead_time, known)
+    reader = CycleReader.of(whole)
+
+    def read(stretch: Stretch) -> SymmetricCycle:
+        return reader.read(stretch, dead_time.of(stretch))
+
+    cycle = read(whole)
+    model, remark = _choice(method, test, read, gain, known)
     solution = _by_shape(whole, model, cycle, method.solve(model, cycle, gain))
 
     def values(stretch: Stretch) -> FloatArray:
-        delay = dead_time.of(stretch)
-        single = _alike(method.solve(model, symmetric_cycle(stretch, delay), gain), solution)
-        return single.values(sign, delay)
+        single = _alike(method.solve(model, read(stretch), gain), solution)
+        return single.values(sign, dead_time.of(stretch))
 
     covariance, quantile = test.scatter(values)
     remarks = [
@@ -132,16 +139,11 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
         quantile,
         warnings=tuple(r for r in remarks if r),
     )
-    spread, _ = test.scatter(_features)
+    spread, _ = test.scatter(features)
     if spread is None:
         return Found(identification, model, cycle)
     period_std, amplitude_std = (float(s) for s in np.sqrt(np.diag(spread)))
     return Found(identification, model, cycle, period_std, amplitude_std)
-
-
-def _features(stretch: Stretch) -> FloatArray:
-    cycle = stretch.cycle
-    return np.array((cycle.period, 0.5 * (cycle.peak_max - cycle.peak_min)))
 
 
 def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -> Found:
@@ -214,11 +216,11 @@ def choose(
 def _choice(
     method: SymmetricMethod,
     test: RelayTest,
-    cycle: SymmetricCycle,
+    read: Callable[[Stretch], SymmetricCycle],
     gain: float,
-    dead_time: DeadTime,
     known: Known,
 ) -> tuple[LagModel, str]:
+    cycle = read(test.whole)
     asked = model_asked_for(method.name, known)
     if asked is not None:
         return asked, ""
@@ -230,8 +232,7 @@ def _choice(
         """Allow for the scatter of the cycles, and half a sample interval of dead time."""
 
         def value(stretch: Stretch) -> FloatArray:
-            single = symmetric_cycle(stretch, dead_time.of(stretch))
-            return np.array([method.mismatch(order, single, gain)])
+            return np.array([method.mismatch(order, read(stretch), gain)])
 
         allowed = method.agreement
         covariance, quantile = test.scatter(value)
@@ -269,11 +270,12 @@ def _choose_without_gain(
             continue
         away[order] = 0.0
         if whole is not None:
-            away[order] = _misfit(whole, equal_lags(order), cycle, solved[order])
+            misfit = shape_misfit(whole, equal_lags(order), cycle, solved[order])
+            away[order] = misfit / cycle.amplitude
     if not solved:
         # The refusal of the simplest model says what is wrong.
         method.solve(MODEL_1, cycle, math.nan)
-    order = min(n for n in solved if away[n] <= _ALIKE * min(away.values()))
+    order = min(n for n in solved if alike(away[n], min(away.values())))
     why = "its simplicity" if whole is None else "the shape of its half cycles"
     model = equal_lags(order)
     return model, (
@@ -282,7 +284,18 @@ def _choose_without_gain(
     )
 
 
-def _misfit(whole: Stretch, model: LagModel, cycle: SymmetricCycle, solution: Solution) -> float:
+def alike(misfit: float, least: float) -> bool:
+    """Return True if half cycles are as near to the record's as the nearest.
+
+    :param misfit: a :func:`shape_misfit` over the amplitude.
+    :param least: that of the structure that comes nearest.
+    """
+    return misfit <= _ALIKE * least + _ALIKE_SHARE
+
+
+def shape_misfit(
+    whole: Stretch, model: LagModel, cycle: SymmetricCycle, solution: Solution
+) -> float:
     """Return the root mean square of half cycles minus those of a solution [y]."""
     since, y = half_cycles(whole)
     stride = max(1, since.size // _SHAPE_SAMPLES)
@@ -339,7 +352,7 @@ def _by_shape(
         return solution
 
     def misfit(constants: tuple[float, ...]) -> float:
-        return _misfit(whole, model, cycle, Solution(solution.gain, constants))
+        return shape_misfit(whole, model, cycle, Solution(solution.gain, constants))
 
     first, *rest = sorted((solution.constants, *solution.others), key=misfit)
     return Solution(solution.gain, first, tuple(rest))
