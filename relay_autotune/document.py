@@ -8,7 +8,9 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cycles import limit_cycle
-from relay_autotune.record import Outcome
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification.shape import shape_of_record
+from relay_autotune.record import Outcome, Record
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
@@ -20,6 +22,7 @@ _LIMIT_CYCLE = (
     *("period", "period_high", "period_low", "peak_max", "peak_min"),
     *("time_to_peak_max", "time_to_peak_min", "mean_measurement", "mean_command"),
 )
+_SHAPE = ("sharpness", "plateau", "growth", "rise", "rise_half")
 _GAINS = (
     *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
     *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
@@ -90,6 +93,19 @@ def _limit_cycle(analysis: Analysis) -> dict[str, Any] | None:
         **{name: _number(getattr(cycle, name)) for name in _LIMIT_CYCLE},
         "cycles": len(cycle.cycles),
         "converged": cycle.converged,
+        **_shape(analysis.record),
+    }
+
+
+def _shape(record: Record) -> dict[str, Any]:
+    """Return category and shape factors; null where the record does not show them."""
+    try:
+        shape = shape_of_record(record)
+    except RelayAutotuneError:
+        return dict.fromkeys(("category", *_SHAPE))
+    return {
+        "category": shape.category,
+        **{name: _number(getattr(shape, name)) for name in _SHAPE},
     }
 
 
