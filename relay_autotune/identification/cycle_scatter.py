@@ -64,7 +64,9 @@ class RelayTest:
         quantile = float(stdtrit(max(count - 1, 1), 0.975))
         if count < _LEAST_CYCLES:
             return None, quantile
-        away = np.array(found) - np.mean(found, axis=0)
+        # From the first one, so that what is given has no rounding for scatter.
+        away = np.array(found) - found[0]
+        away = away - np.mean(away, axis=0)
         return away.T @ away / (count * (count - 1)), quantile
 
 
