@@ -65,7 +65,7 @@ def covariance(case: Case, *, limit_cycle: bool) -> FloatArray:
     """
     run = simulate_relay(case.model, case.settings(0.0), cycles=14)
     begin = run.cycles[7].start if limit_cycle else 0.0
-    time = begin + case.period * np.arange(SAMPLES)
+    time = begin + case.period * np.arange(SAMPLES, dtype=np.float64)
     beside = [time - time.mean()]
     if limit_cycle:
         beside.append(np.exp(-(time - time[0]) / case.values[1]))
