@@ -45,12 +45,14 @@ class Chart:
         model. The gain, the dead time, structure and order are in the latter.
     :param required: names of the numbers without which it does nothing.
     :param optional: names of those that it can do without.
+    :param any_structure: True if it takes a known structure and order.
     """
 
     summary: str
     identify: ChartMethod
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
+    any_structure: bool = False
 
 
 # "gain" and "dead_time" reach the methods as what is known of the process.
@@ -92,18 +94,21 @@ CHART_METHODS: dict[str, Chart] = {
         identify_chang_chart,
         ("period", "amplitude", "relay", "dead_time"),
         ("gain", "hysteresis"),
+        any_structure=True,
     ),
     "atv": Chart(
         "lags by the describing function, from an unbiased relay (Luyben 1987)",
         identify_atv_chart,
         ("period", "amplitude", "relay", "dead_time"),
         ("gain", "hysteresis"),
+        any_structure=True,
     ),
     "li": Chart(
         "lags with their gain from two tests, one with a dead time added (Li et al. 1991)",
         identify_li_chart,
         ("period", "amplitude", "relay", "period_2", "amplitude_2", "extra_delay"),
         ("dead_time", "hysteresis", "relay_2"),
+        any_structure=True,
     ),
 }
 CHART_METHODS["wang"] = replace(CHART_METHODS["wang_biased"], summary="the same as wang_biased")
@@ -135,6 +140,8 @@ def identify_chart(method: str, numbers: Numbers, known: Known) -> Identificatio
     if unused:
         takes = ", ".join(option(n) for n in chart.required + chart.optional)
         raise SelectionError(f"{method} makes no use of {', '.join(unused)}; it takes {takes}")
+    if (known.structure or known.order) and not chart.any_structure:
+        raise SelectionError(f"{method} makes no use of --structure and --order")
     for name, value in numbers.items():
         _require_range(name, value)
     facts = replace(

@@ -1,0 +1,146 @@
+"""The identify command as its users meet it: the installed executable, run as a process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+
+import pytest
+from worked_cases import cases
+
+from relay_autotune.cli.chart import CHART_METHODS, NUMBERS, option
+from relay_autotune.identification import METHODS
+
+EXAMPLE = "--period 33.271862630047444 --amplitude 0.025968976458966186 --relay 0.04"
+
+
+def run(arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["identify", *arguments.split()], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def model_of(arguments: str) -> dict:
+    done = run(arguments + " --json")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("\n") == 1
+    return json.loads(done.stdout)
+
+
+def test_the_papers_example_as_a_table():
+    done = run(f"--method chang {EXAMPLE} --dead-time 10 --gain 1.65")
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert "1.650 e^(-10.00 s) / (1 + 20.00 s)   (fopdt, chang)" in done.stdout
+    assert "2.307 u/y" in done.stdout
+    assert "0.1837 rad/s" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("method", "tau"), [("chang", 20.0), ("atv", 16.2015903238), ("li", 20.0)]
+)
+def test_the_same_as_a_document(method, tau):
+    known = "--dead-time 10 --gain 1.65"
+    if method == "li":
+        # The limit cycle of 1.65 exp(-18 s)/(20 s + 1).
+        second = "--period-2 54.635565559598035 --amplitude-2 0.039166402457120456"
+        known = f"{second} --extra-delay 8 --dead-time 10"
+    found = model_of(f"--method {method} {EXAMPLE} {known}")
+    assert found["method"] == method
+    assert found["structure"] == "fopdt"
+    assert found["time_constants"] == pytest.approx([tau], rel=1e-5)
+    assert (found["gain"], found["dead_time"]) == pytest.approx((1.65, 10.0), rel=1e-5)
+    assert found["ci95"]["time_constant"] == [None, None]
+    assert found["ultimate_gain"] > 0.0
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T2"))
+def test_wangs_table_2(name, inputs, exact, tol):
+    p = inputs
+    found = model_of(
+        f"--method wang --period-high {p['Tu1']!r} --period-low {p['Tu2']!r} "
+        f"--peak-max {p['Au']!r} --peak-min {p['Ad']!r} --relay {p['mu']} --bias {p['mu0']} "
+        f"--hysteresis {p['eps']} --gain {p['K']}"
+    )
+    assert found["method"] == "wang_biased"
+    assert found["time_constants"][0] == pytest.approx(exact["T"], rel=tol)
+    assert found["dead_time"] == pytest.approx(exact["L"], rel=tol)
+
+
+def test_a_gain_from_the_means():
+    found = model_of(
+        "--method wang_biased --period-high 2.7877658470670195 --period-low 3.909156212273918 "
+        "--peak-max 0.8585446705942692 --peak-min -4.792723352971346e-1 --relay 1 --bias 3e-1 "
+        "--hysteresis 0.1 --mean-measurement -0.5 --mean-command -0.5"
+    )
+    assert found["gain"] == 1.0
+
+
+@pytest.mark.parametrize("arguments", ["--method chang", "--method atv"])
+def test_structures_and_hysteresis(arguments):
+    found = model_of(f"{arguments} {EXAMPLE} --dead-time 4 --structure lag_n --order 2")
+    assert len(found["time_constants"]) == 2
+    found = model_of(f"{arguments} {EXAMPLE} --dead-time 10 --gain -1.65 --hysteresis 0.002")
+    assert found["gain"] == -1.65
+    assert found["ultimate_gain"] < 0.0
+    assert found["warnings"]
+
+
+WANG = "--method wang --period-high 1 --period-low 1 --peak-max 1 --peak-min -1 --relay 1"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--method chang --period 33", "chang also needs --amplitude, --relay, --dead-time"),
+        (f"--method chang {EXAMPLE} --dead-time 10 --bias 1", "makes no use of --bias"),
+        ("--method nonsense --period 3", "unknown method 'nonsense'; known: "),
+        ("--method atv --period -3 --amplitude 1 --relay 1 --dead-time 1", "finite and > 0"),
+        ("--method atv --period 3 --amplitude 1 --relay 1 --dead-time -1", "finite and >= 0"),
+        ("--method chang --period x", "'x' is no number"),
+        (f"{WANG} --bias 0.1", "also needs --gain, or --mean-measurement and --mean-command"),
+        (f"{WANG} --bias 0.1 --structure sopdt", "makes no use of --structure"),
+        (f"--method chang {EXAMPLE} --dead-time 10 --order -1", "an order must be at least 1"),
+    ],
+)
+def test_a_command_line_that_does_not_fit(arguments, message):
+    done = run(arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (f"--method chang {EXAMPLE} --dead-time 17 --gain 1.65", "less than half the period"),
+        (f"--method chang {EXAMPLE} --dead-time 8 --structure fopdt", "no stable FOPDT"),
+        (f"--method atv {EXAMPLE} --dead-time 10 --gain 0.1", "K K_u"),
+        (f"--method chang {EXAMPLE} --dead-time 10 --structure ipdt", "no structure 'ipdt'"),
+    ],
+)
+def test_numbers_of_no_model(arguments, message):
+    done = run(arguments)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert done.stdout == ""
+
+
+def test_the_help_names_every_method_and_number():
+    done = run("--help")
+    assert done.returncode == 0
+    for name in (*CHART_METHODS, *map(option, NUMBERS)):
+        assert name in done.stdout
+
+
+def test_every_number_is_known_and_used():
+    for chart in CHART_METHODS.values():
+        assert set(chart.required + chart.optional) <= NUMBERS.keys()
+    used = {n for chart in CHART_METHODS.values() for n in chart.required + chart.optional}
+    assert used == NUMBERS.keys()
+
+
+def test_methods_are_named_as_those_of_records():
+    assert set(CHART_METHODS) - {"wang"} <= set(METHODS)
