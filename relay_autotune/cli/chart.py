@@ -11,6 +11,8 @@ from relay_autotune.cli.chart_chang import (
     identify_chang_chart,
     identify_li_chart,
 )
+from relay_autotune.cli.chart_luyben import identify_step_chart
+from relay_autotune.cli.chart_thyagarajan import identify_thyagarajan_chart
 from relay_autotune.cli.chart_wang import identify_biased_chart, identify_unbiased_chart
 from relay_autotune.errors import SelectionError
 from relay_autotune.identification.known import Known
@@ -74,6 +76,15 @@ NUMBERS: dict[str, Number] = {
     "relay_2": Number("u", "amplitude of the relay in the second test, if another", POSITIVE),
     "mean_measurement": Number("y", "mean over whole cycles, from the steady state"),
     "mean_command": Number("u", "mean over whole cycles, from the steady state"),
+    "time_to_peak": Number("s", "from a switch to the peak after it", POSITIVE),
+    "rise": Number(
+        "s", "from the steady state to the peak, if not the time from the switch", POSITIVE
+    ),
+    "time_half": Number("s", "from the steady state to half of the peak", POSITIVE),
+    "step": Number("u", "height of a step of the command", NOT_ZERO),
+    "t1": Number("s", "from the end of the dead time to the extremum", POSITIVE),
+    "t2": Number("s", "from the end of the dead time to the return", POSITIVE),
+    "extremum": Number("y", "minimum or maximum after a step, from the steady state", NOT_ZERO),
 }
 
 CHART_METHODS: dict[str, Chart] = {
@@ -109,6 +120,17 @@ CHART_METHODS: dict[str, Chart] = {
         ("period", "amplitude", "relay", "period_2", "amplitude_2", "extra_delay"),
         ("dead_time", "hysteresis", "relay_2"),
         any_structure=True,
+    ),
+    "thyagarajan": Chart(
+        "structure by the shape, from an unbiased relay (Thyagarajan and Yu 2003)",
+        identify_thyagarajan_chart,
+        ("period", "amplitude", "relay"),
+        ("time_to_peak", "time_half", "rise", "hysteresis", "dead_time"),
+    ),
+    "luyben_step": Chart(
+        "integrator with inverse response, from a step (Luyben 2003)",
+        identify_step_chart,
+        ("t1", "t2", "extremum", "step", "dead_time"),
     ),
 }
 CHART_METHODS["wang"] = replace(CHART_METHODS["wang_biased"], summary="the same as wang_biased")

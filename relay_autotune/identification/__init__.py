@@ -9,6 +9,7 @@ from relay_autotune.identification.atv import identify_atv
 from relay_autotune.identification.chang_method import identify_chang
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.li_method import identify_li, identify_li_jointly
+from relay_autotune.identification.luyben_method import identify_step
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.identification.thyagarajan_method import identify_thyagarajan
 from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
@@ -26,6 +27,7 @@ METHODS: dict[str, Method] = {
     "atv": identify_atv,
     "li": identify_li,
     "thyagarajan": identify_thyagarajan,
+    "luyben_step": identify_step,
 }
 # These take several records of one process.
 JOINT_METHODS: dict[str, JointMethod] = {
