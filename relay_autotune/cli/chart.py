@@ -126,6 +126,7 @@ CHART_METHODS: dict[str, Chart] = {
         identify_thyagarajan_chart,
         ("period", "amplitude", "relay"),
         ("time_to_peak", "time_half", "rise", "hysteresis", "dead_time"),
+        any_structure=True,
     ),
     "luyben_step": Chart(
         "integrator with inverse response, from a step (Luyben 2003)",

@@ -144,3 +144,49 @@ def test_every_number_is_known_and_used():
 
 def test_methods_are_named_as_those_of_records():
     assert set(CHART_METHODS) - {"wang"} <= set(METHODS)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "structure", "values"),
+    [
+        (f"{EXAMPLE} --time-to-peak 10", "fopdt", (1.65, 20.0, 10.0)),
+        (
+            "--period 1.4611314411345366 --amplitude 0.3498588075760029 --relay 1 "
+            "--time-to-peak 0.3",
+            "unstable_fopdt",
+            (-1.0, -1.0, 0.3),
+        ),
+        (
+            "--period 5.430275810176104 --amplitude 0.0014733080276485588 --relay 1 "
+            "--structure lag_n --order 2 --dead-time 0.05",
+            "lag_n",
+            (1.0, 25.0, 0.05),
+        ),
+    ],
+)
+def test_the_shapes_of_thyagarajan_and_yu(numbers, structure, values):
+    found = model_of(f"--method thyagarajan {numbers}")
+    assert found["structure"] == structure
+    model = found["gain"], found["time_constants"][0], found["dead_time"]
+    assert model == pytest.approx(values, rel=1e-7)
+
+
+def test_the_shape_must_be_told():
+    done = run(f"--method thyagarajan {EXAMPLE}")
+    assert done.returncode == 2
+    assert "--time-to-peak" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("luyben.ident.eqs4-6"))
+def test_luybens_step(name, inputs, exact, tol):
+    found = model_of(
+        f"--method luyben_step --t1 {inputs['t1']} --t2 {inputs['t2']} "
+        f"--extremum {inputs['ymin']} --step {inputs['du']} --dead-time {inputs['D']}"
+    )
+    assert found["structure"] == "integrator_inverse"
+    numbers = found["gain"], -found["zeros"][0], found["time_constants"][0]
+    assert numbers == pytest.approx([exact[k] for k in ("Kp", "tau1", "tau2")], rel=tol)
+    refused = run("--method luyben_step --t1 1 --t2 1.5 --extremum -1 --step 1 --dead-time 0")
+    assert refused.returncode == 1
+    assert "more than twice" in refused.stderr
