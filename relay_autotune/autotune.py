@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -99,7 +99,8 @@ def analyse(
         return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
     models = [chosen]
     if final:
-        models += _others(record, method, known)
+        models += _others(record, method, known, chosen)
+    simple = next((m.model for m in models if m.structure == "fopdt"), None)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
         return found
@@ -110,7 +111,7 @@ def analyse(
         )
     around = ensemble(chosen, rng=rng or np.random.default_rng(0))
     try:
-        first = tune(chosen, rule, around)
+        first = tune(chosen, rule, around, simple)
     except TuningError as error:
         return Analysis(record, cycles, found.models, 0, reason=f"no gains: {error}")
     gains = [first]
@@ -118,7 +119,7 @@ def analyse(
         if name == rule:
             continue
         try:
-            gains.append(tune(chosen, name, around))
+            gains.append(tune(chosen, name, around, simple))
         except TuningError:
             # A rule that does not apply has nothing to compare.
             continue
@@ -134,14 +135,21 @@ def _guarded(record: Record, method: str, known: Known) -> Identification:
         ) from error
 
 
-def _others(record: Record, method: str, known: Known) -> list[Identification]:
-    """Models of the other methods, for comparison; one that does not apply is left out."""
+def _others(
+    record: Record, method: str, known: Known, chosen: Identification
+) -> list[Identification]:
+    """Models of the other methods, for comparison; one that does not apply is left out.
+
+    The first is the FOPDT that fits best, on which most rules are built.
+    """
+    wanted = [(DEFAULT_METHOD, replace(known, structure="fopdt"))]
+    wanted += [(name, known) for name in METHODS if name not in (method, DEFAULT_METHOD)]
+    if chosen.method == DEFAULT_METHOD and chosen.structure == "fopdt":
+        wanted = wanted[1:]
     found = []
-    for name in METHODS:
-        if name == method:
-            continue
+    for name, facts in wanted:
         try:
-            found.append(_guarded(record, name, known))
+            found.append(_guarded(record, name, facts))
         except RelayAutotuneError:
             continue
     return found

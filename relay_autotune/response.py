@@ -56,13 +56,17 @@ def coordinates_at_changes(
     :return: shape (m, modes.size).
     """
     forward = modes.propagators(np.diff(changes))
+    growing = modes.growing
+    backward = backward and bool(np.any(growing))
+    if backward:
+        # What grows is followed the other way below.
+        forward[:, growing, :] = 0.0
     kicks = steps[:, None] * modes.input_direction
     z = np.empty((changes.size, modes.size), dtype=np.result_type(forward, kicks))
     z[0] = kicks[0]
     for k in range(1, changes.size):
         z[k] = forward[k - 1] @ z[k - 1] + kicks[k]
-    growing = modes.growing
-    if backward and bool(np.any(growing)):
+    if backward:
         back = modes.propagators(-np.diff(changes))
         z[-1, growing] = 0.0
         for k in range(changes.size - 1, 0, -1):

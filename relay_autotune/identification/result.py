@@ -39,6 +39,18 @@ class FitReport:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """Another structure that the data do not rule out.
+
+    :param model: its best fit.
+    :param support: its weight among all structures tried, 0 to 1.
+    """
+
+    model: TransferFunction
+    support: float
+
+
+@dataclass(frozen=True)
 class Identification:
     """A model identified by one method, with what is known of its accuracy.
 
@@ -59,6 +71,7 @@ class Identification:
     :param undetermined: parameters whose 95 % interval is wider than 20 % of the value.
     :param fitted: the model's measurement at the record's samples, with all that was estimated
         beside the model [y], shape (n,); NaN: not part of the fit; empty: not computed.
+    :param rivals: other structures with some support, the best first.
     """
 
     method: str
@@ -77,6 +90,7 @@ class Identification:
     warnings: tuple[str, ...] = ()
     undetermined: tuple[str, ...] = ()
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def structure(self) -> str:
@@ -87,6 +101,14 @@ class Identification:
     def std(self) -> FloatArray:
         """Standard deviations of the values, shape (p,); NaN: not estimated."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def is_logarithmic(parameter: str) -> bool:
+    """Return whether a parameter cannot change sign, so that its logarithm has the interval.
+
+    :param parameter: its name.
+    """
+    return parameter not in ("dead_time", "zero")
 
 
 def with_uncertainty(
@@ -131,9 +153,10 @@ def with_uncertainty(
         low, high = values / ratio, values * ratio
     low, high = np.minimum(low, high), np.maximum(low, high)
     for i, name in enumerate(parameters):
-        if name == "dead_time":
-            low[i] = max(values[i] - quantile * std[i], 0.0) if np.isfinite(std[i]) else math.nan
-            high[i] = values[i] + quantile * std[i]
+        if not is_logarithmic(name):
+            low[i], high[i] = values[i] - quantile * std[i], values[i] + quantile * std[i]
+        if name == "dead_time" and np.isfinite(low[i]):
+            low[i] = max(low[i], 0.0)
     wide = std * quantile > _DETERMINED * np.abs(values)
     undetermined = tuple(n for n, w in zip(parameters, wide, strict=True) if w)
     point = ultimate_point(model)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from relay_autotune.errors import TuningError
-from relay_autotune.identification.result import Identification
+from relay_autotune.identification.result import Identification, is_logarithmic
 from relay_autotune.models import TransferFunction
 from relay_autotune.tuning.analysis import frequencies, is_stable, sensitivity_on
 from relay_autotune.tuning.gains import Controller
@@ -33,7 +33,8 @@ def ensemble(
     covariance, values = identification.covariance, identification.values
     if not bool(np.all(np.isfinite(covariance))):
         return ()
-    logarithmic = np.array([n != "dead_time" for n in identification.parameters])
+    logarithmic = np.array([is_logarithmic(n) for n in identification.parameters])
+    delays = np.array([n == "dead_time" for n in identification.parameters])
     scale = np.where(logarithmic, values, 1.0)
     draws = rng.multivariate_normal(
         np.zeros(values.size), covariance / np.outer(scale, scale), count, method="eigh"
@@ -41,10 +42,9 @@ def ensemble(
     models = []
     for draw in draws:
         with np.errstate(over="ignore"):
-            drawn = np.where(
-                logarithmic, values * np.exp(np.clip(draw, -20.0, 20.0)), values + draw
-            )
-        drawn = np.where(logarithmic, drawn, np.maximum(drawn, 0.0))
+            factors = np.exp(np.clip(draw, -20.0, 20.0))
+        drawn = np.where(logarithmic, values * factors, values + draw)
+        drawn[delays] = np.maximum(drawn[delays], 0.0)
         models.append(identification.build(drawn))
     return tuple(models)
 

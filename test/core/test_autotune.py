@@ -93,7 +93,7 @@ def test_unknown_names_are_refused_at_once():
         analyse(_record(), rule="magic")
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(
     seed=st.integers(0, 1000),
     samples=st.integers(1, 60),

@@ -1,0 +1,192 @@
+"""Factors of a denominator, with the derivatives by their parameters that a fit needs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Polynomial = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lag:
+    """``(1 + tau s)^n`` with the parameter log tau.
+
+    :param multiplicity: n.
+    """
+
+    multiplicity: int = 1
+    parameters = 1
+    unstable = False
+
+    def polynomial(self, theta: FloatArray) -> Polynomial:
+        """Return ``1 + tau s``, lowest power first.
+
+        :param theta: (log tau,).
+        """
+        return np.array((1.0, math.exp(theta[0])))
+
+    def derivatives(self, theta: FloatArray) -> list[Polynomial]:
+        """Return the derivative of :meth:`polynomial` by log tau."""
+        return [np.array((0.0, math.exp(theta[0])))]
+
+    def constants(self, theta: FloatArray) -> list[complex]:
+        """Return the time constants of one power of the factor [s]."""
+        return [complex(math.exp(theta[0]))]
+
+
+@dataclass(frozen=True)
+class UnstableLag:
+    """``tau s - 1`` with the parameter log tau."""
+
+    multiplicity = 1
+    parameters = 1
+    unstable = True
+
+    def polynomial(self, theta: FloatArray) -> Polynomial:
+        """Return ``tau s - 1``, lowest power first.
+
+        :param theta: (log tau,).
+        """
+        return np.array((-1.0, math.exp(theta[0])))
+
+    def derivatives(self, theta: FloatArray) -> list[Polynomial]:
+        """Return the derivative of :meth:`polynomial` by log tau."""
+        return [np.array((0.0, math.exp(theta[0])))]
+
+    def constants(self, theta: FloatArray) -> list[complex]:
+        """Return the time constant in ``1 + T s`` [s], which is -tau."""
+        return [complex(-math.exp(theta[0]))]
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """``1 + 2 zeta s/w0 + (s/w0)^2`` with the parameters log(1/w0) and log zeta.
+
+    One smooth parametrisation from underdamped to overdamped; where two lags merge into a pair
+    nothing happens.
+    """
+
+    multiplicity = 1
+    parameters = 2
+    unstable = False
+
+    def polynomial(self, theta: FloatArray) -> Polynomial:
+        """Return the factor, lowest power first.
+
+        :param theta: (log(1/w0), log zeta).
+        """
+        t, zeta = math.exp(theta[0]), math.exp(theta[1])
+        return np.array((1.0, 2.0 * zeta * t, t * t))
+
+    def derivatives(self, theta: FloatArray) -> list[Polynomial]:
+        """Return the derivatives of :meth:`polynomial` by both parameters."""
+        t, zeta = math.exp(theta[0]), math.exp(theta[1])
+        return [
+            np.array((0.0, 2.0 * zeta * t, 2.0 * t * t)),
+            np.array((0.0, 2.0 * zeta * t, 0.0)),
+        ]
+
+    def constants(self, theta: FloatArray) -> list[complex]:
+        """Return the two time constants, a conjugate pair where zeta < 1 [s]."""
+        t, zeta = math.exp(theta[0]), math.exp(theta[1])
+        if zeta >= 1.0:
+            # The larger one without cancellation, the smaller from their product.
+            larger = t * (zeta + math.sqrt(zeta * zeta - 1.0))
+            return [complex(larger), complex(t * t / larger)]
+        root = math.sqrt(1.0 - zeta * zeta)
+        return [complex(t * zeta, t * root), complex(t * zeta, -t * root)]
+
+
+Factor = Lag | UnstableLag | Quadratic
+
+
+@dataclass(frozen=True)
+class Denominator:
+    """A product of factors, times integrators.
+
+    :param factors: in the order of their parameters.
+    :param integrators: poles at s = 0.
+    """
+
+    factors: tuple[Factor, ...]
+    integrators: int = 0
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of all factors."""
+        return sum(f.parameters for f in self.factors)
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        per_factor = (
+            f.multiplicity * (2 if isinstance(f, Quadratic) else 1) for f in self.factors
+        )
+        return sum(per_factor) + self.integrators
+
+    def split(self, theta: FloatArray) -> list[FloatArray]:
+        """Return each factor's own part of the parameters.
+
+        :param theta: shape (parameters,).
+        """
+        ends = np.cumsum([f.parameters for f in self.factors])
+        return [theta[e - f.parameters : e] for f, e in zip(self.factors, ends, strict=True)]
+
+    def constants(self, theta: FloatArray) -> tuple[complex, ...]:
+        """Return the time constants of all poles but the integrators [s]."""
+        parts = zip(self.factors, self.split(theta), strict=True)
+        return tuple(c for f, own in parts for c in f.constants(own) * f.multiplicity)
+
+    def extended_constants(self, theta: FloatArray) -> tuple[complex, ...]:
+        """Return the time constants with each factor one power higher [s]."""
+        parts = zip(self.factors, self.split(theta), strict=True)
+        return tuple(c for f, own in parts for c in f.constants(own) * (f.multiplicity + 1))
+
+    def numerators(
+        self, theta: FloatArray, powers: Sequence[int], *, by_dead_time: bool = True
+    ) -> FloatArray:
+        r"""Return numerators over the extended denominator, for responses and derivatives.
+
+        With Q the product of the factors ``f_j^{n_j}`` and R that of the ``f_j``, a basis
+        response ``s^k/Q`` is ``s^k R`` over the extended denominator Q R, its derivative by a
+        parameter of factor j is ``-n_j s^k f_j' R/f_j`` and by the dead time ``-s^{k+1} R``.
+
+        :param theta: shape (parameters,).
+        :param powers: k of each basis response, p of them.
+        :param by_dead_time: False: without the derivatives by the dead time.
+        :return: coefficients, lowest power first, shape (p (2 + parameters), d): all responses,
+            then their derivatives by each parameter in turn, then by the dead time.
+        """
+        own = self.split(theta)
+        factors = [f.polynomial(t) for f, t in zip(self.factors, own, strict=True)]
+        whole = _product(factors)
+        rows = [_shift(whole, k) for k in powers]
+        for j, (factor, part) in enumerate(zip(self.factors, own, strict=True)):
+            others = _product(factors[:j] + factors[j + 1 :])
+            for derivative in factor.derivatives(part):
+                change = -factor.multiplicity * np.convolve(derivative, others)
+                rows += [_shift(change, k) for k in powers]
+        if by_dead_time:
+            rows += [_shift(-whole, k + 1) for k in powers]
+        width = max(r.size for r in rows)
+        padded = np.zeros((len(rows), width))
+        for row, coefficients in zip(padded, rows, strict=True):
+            row[: coefficients.size] = coefficients
+        return padded
+
+
+def _product(polynomials: Sequence[Polynomial]) -> Polynomial:
+    product = np.ones(1)
+    for polynomial in polynomials:
+        product = np.convolve(product, polynomial)
+    return product
+
+
+def _shift(polynomial: Polynomial, power: int) -> Polynomial:
+    return np.concatenate((np.zeros(power), polynomial))

@@ -1,0 +1,216 @@
+"""Which structure the data speak for: every one fitted, the simplest that explains them chosen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification import structures as known_structures
+from relay_autotune.identification.lags import FOPDT
+from relay_autotune.identification.separable import (
+    Problem,
+    State,
+    information_criterion,
+    refine,
+)
+from relay_autotune.identification.starts import Starts, refine_best, start_fopdt
+from relay_autotune.identification.structures import RationalStructure, Reading, lag_n, lag_n_zero
+
+FloatArray = NDArray[np.float64]
+
+MOST_LAGS = 8
+_MOST_LAGS_WITH_ZERO = 4
+_INDIFFERENT = 2.0
+_SAMPLES_EACH = 8
+# A step that gains less than this share of the sum of squares changes no choice.
+_TRIAL = 1e-6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One structure with its best fit.
+
+    :param problem: what was fitted.
+    :param state: the fit.
+    :param reading: the fit in the terms of the field.
+    :param criterion: Bayesian information criterion; smaller is better.
+    """
+
+    problem: Problem
+    state: State
+    reading: Reading
+    criterion: float
+
+    @property
+    def structure(self) -> RationalStructure:
+        """The structure."""
+        return self.problem.structure
+
+
+class Selection:
+    """All structures on one record.
+
+    :param problem: samples and input, with a FOPDT structure.
+    :param floor: sum of squares that is rounding.
+    :param sign: the direction in which the relay worked, 1 or -1, which a model must share; 0:
+        not known.
+    """
+
+    def __init__(self, problem: Problem, floor: float, sign: int = 0) -> None:
+        self._problem, self._floor, self._sign = problem, floor, sign
+        self._fopdt = refine_best(problem, start_fopdt(problem))
+        self._starts = Starts(problem, self._fopdt)
+
+    def candidate(self, problem: Problem, state: State) -> Candidate | None:
+        """Return a fit as a candidate; None if it cannot be read as its structure."""
+        structure = problem.structure
+        reading = structure.read(state.theta, state.coefficients)
+        if reading is None and structure.name == "three_lags":
+            problem = replace(problem, structure=known_structures.LAG_COMPLEX)
+            reading = problem.structure.read(state.theta, state.coefficients)
+        if reading is None or not bool(np.all(np.isfinite(reading.values))):
+            return None
+        if reading.values[0] == 0.0 or (
+            self._sign and reading.build(reading.values).process_sign != self._sign
+        ):
+            return None
+        criterion = information_criterion(
+            state.cost, problem.time.size, state.parameters, self._floor
+        )
+        return Candidate(problem, state, reading, criterion)
+
+    def with_nuisances(self, found: Candidate) -> Candidate:
+        """Add drift and a free initial state to a fit where the data ask for them.
+
+        :param found: a fit with or without them.
+        """
+        best = found
+        for drift in (False, True):
+            for relaxation in (False, True):
+                if (drift, relaxation) == (found.problem.drift, found.problem.relaxation):
+                    continue
+                problem = replace(found.problem, drift=drift, relaxation=relaxation)
+                state = refine(problem, found.state.theta, tolerance=_TRIAL)
+                other = self.candidate(problem, state)
+                if other is not None and other.criterion < best.criterion:
+                    best = other
+        return best
+
+    def fit(self, name: str, order: int = 0) -> Candidate | None:
+        """Fit one structure; None if the data cannot be read as it.
+
+        :param name: of the structure.
+        :param order: of equal lags; 0: the best of them.
+        """
+        found = [c for c in self._family(name, order) if c is not None]
+        return min(found, key=lambda c: c.criterion) if found else None
+
+    def all(self) -> list[Candidate]:
+        """Fit every structure; the best first."""
+        names = (
+            *("fopdt", "lag_n", "sopdt", "three_lags", "two_equal_one"),
+            *("lag_n_zero", "sopdt_zero", "ipdt", "integrator_lag", "integrator_inverse"),
+            *("unstable_fopdt", "unstable_sopdt"),
+        )
+        # Drift and initial state are decided with the better of two flexible structures.
+        simple = [c for name in ("fopdt", "sopdt") if (c := self.fit(name)) is not None]
+        if not simple:
+            return []
+        base = self.with_nuisances(min(simple, key=lambda c: c.criterion))
+        problem = replace(
+            self._problem, drift=base.problem.drift, relaxation=base.problem.relaxation
+        )
+        # A FOPDT has the longest dead time of all, since it counts every small lag to it.
+        first = refine(replace(problem, structure=FOPDT), self._fopdt.theta, tolerance=_TRIAL)
+        self._problem = after_the_unknown(problem, first)
+        found = [c for name in names for c in self._family(name, 0) if c is not None]
+        found.sort(key=lambda c: c.criterion)
+        return found
+
+    def _family(self, name: str, order: int) -> list[Candidate | None]:
+        starts = self._starts
+        match name:
+            case "fopdt":
+                return [self._best(FOPDT, [self._fopdt.theta])]
+            case "lag_n":
+                orders = [order] if order else range(2, MOST_LAGS + 1)
+                return [self._best(lag_n(n), [starts.lag_n(n)]) for n in orders]
+            case "lag_n_zero":
+                orders = [order] if order else range(2, _MOST_LAGS_WITH_ZERO + 1)
+                return [self._best(lag_n_zero(n), starts.lag_n_zero(n)) for n in orders]
+            case "sopdt":
+                return [self._best(known_structures.SOPDT, starts.sopdt())]
+            case "sopdt_zero":
+                return [self._best(known_structures.SOPDT_ZERO, starts.sopdt())]
+            case "two_equal_one":
+                return [self._best(known_structures.TWO_EQUAL_ONE, starts.two_equal_one())]
+            case "three_lags" | "lag_complex":
+                return [self._best(known_structures.THREE_LAGS, starts.third())]
+            case "ipdt":
+                return [self._best(known_structures.IPDT, [starts.integrator()])]
+            case "integrator_lag":
+                return [self._best(known_structures.INTEGRATOR_LAG, starts.integrator_lag())]
+            case "integrator_inverse":
+                return [self._best(known_structures.INTEGRATOR_INVERSE, starts.integrator_lag())]
+            case "unstable_fopdt":
+                return [self._unstable()]
+            case "unstable_sopdt":
+                first = self._unstable()
+                if first is None:
+                    return []
+                chosen = starts.unstable_second(first.state.theta)
+                return [self._best(known_structures.UNSTABLE_SOPDT, chosen)]
+        return []
+
+    def _unstable(self) -> Candidate | None:
+        problem = replace(self._problem, structure=known_structures.UNSTABLE_FOPDT)
+        return self._best(problem.structure, self._starts.unstable(problem))
+
+    def _best(self, structure: RationalStructure, thetas: list[FloatArray]) -> Candidate | None:
+        problem = replace(self._problem, structure=structure)
+        if _SAMPLES_EACH * (structure.order + 4) > problem.time.size and structure.order > 1:
+            # So few samples tell no more than a first order.
+            return None
+        state = refine_best(problem, thetas, tolerance=_TRIAL)
+        return self.candidate(problem, state)
+
+
+def after_the_unknown(problem: Problem, state: State) -> Problem:
+    """Return the samples whose input is known; all of them where the process was at rest.
+
+    What was fed to a process that was not at rest before the record is not known, and acts for
+    one dead time.
+
+    :param problem: the problem.
+    :param state: a fit, for its dead time.
+    """
+    if not problem.relaxation:
+        return problem
+    known = problem.time >= problem.time[0] + float(state.theta[-1])
+    if np.count_nonzero(known) <= 4 * state.parameters:
+        return problem
+    return problem.part(known)
+
+
+def choose(candidates: list[Candidate]) -> Candidate:
+    """Return the simplest structure that the criterion cannot tell from the best.
+
+    :param candidates: the best first, at least one.
+    """
+    best = candidates[0].criterion
+    rivals = [c for c in candidates if c.criterion <= best + _INDIFFERENT]
+    return min(rivals, key=lambda c: (c.state.parameters, c.structure.order, c.criterion))
+
+
+def support(candidates: list[Candidate]) -> list[float]:
+    """Return the weight of each candidate, from its criterion; their sum is 1.
+
+    :param candidates: the best first.
+    """
+    best = candidates[0].criterion
+    weights = [math.exp(-0.5 * min(c.criterion - best, 1400.0)) for c in candidates]
+    total = sum(weights)
+    return [w / total for w in weights]

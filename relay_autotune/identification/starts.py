@@ -1,0 +1,195 @@
+"""Where a fit begins: a grid for FOPDT, and from its fit every other structure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.separable import Problem, State, evaluate, refine
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant
+from relay_autotune.ultimate import ultimate_point
+
+FloatArray = NDArray[np.float64]
+
+_GRID_SAMPLES = 240
+_BEST = 3
+_COARSE = 1e-4
+_EXACT = 1e-15
+
+# Dead times tried at the start, as shares of the longest one.
+_SHARES = (0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95)
+
+
+def time_scales(time: FloatArray, u: PiecewiseConstant) -> tuple[float, float]:
+    """Return the shortest time that samples resolve, and the longest that a dead time can be.
+
+    :param time: sample times [s], shape (n,).
+    :param u: the input, which changes within them.
+    """
+    gaps = np.diff(time)
+    shortest = float(np.median(gaps[gaps > 0.0]))
+    inside = u.times[(u.times >= time[0]) & (u.times < time[-1])]
+    rest = float(time[-1] - inside[0])
+    if inside.size < 4:
+        return shortest, rest
+    # In a relay test the process answers one switch before the next.
+    return shortest, min(1.1 * float(np.max(np.diff(inside))), rest)
+
+
+def coarse(problem: Problem) -> Problem:
+    """Return the problem of a few hundred samples."""
+    return problem.part(slice(None, None, max(1, problem.time.size // _GRID_SAMPLES)))
+
+
+def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> State:
+    """Return the best fit that any of the starts leads to: first on few samples, then on all.
+
+    :param problem: the problem.
+    :param thetas: starts, at least one.
+    :param tolerance: relative gain of a step that is not worth another one; 0: rounding.
+    """
+    few = coarse(problem)
+    reached = [refine(few, theta, tolerance=_COARSE) for theta in thetas]
+    theta = min(reached, key=lambda s: s.cost).theta
+    return refine(problem, theta, tolerance=tolerance or _EXACT)
+
+
+def start_fopdt(problem: Problem) -> list[FloatArray]:
+    """Return the best few of a grid of (log tau, D) for a FOPDT.
+
+    :param problem: with a FOPDT structure.
+    """
+    shortest, longest = time_scales(problem.time, problem.u)
+    few = coarse(problem)
+    taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
+    dead_times = longest * np.array(_SHARES)
+    costs = np.array([_costs(few, tau, dead_times) for tau in taus])
+    best: list[FloatArray] = []
+    for flat in np.argsort(costs, axis=None, kind="stable"):
+        i, j = np.unravel_index(flat, costs.shape)
+        theta = np.array((math.log(taus[i]), dead_times[j] + 1e-3 * longest))
+        if all(_apart(theta, other) for other in best):
+            best.append(theta)
+        if len(best) == _BEST:
+            break
+    return best
+
+
+def _apart(a: FloatArray, b: FloatArray) -> bool:
+    return abs(a[0] - b[0]) > 0.5 or abs(math.log(a[1] / b[1])) > 0.5
+
+
+def _costs(problem: Problem, tau: float, dead_times: FloatArray) -> FloatArray:
+    """Return the sums of squares that a lag and an offset leave, for each dead time."""
+    # A dead time only moves the response, so that one pass over moved samples gives all of them.
+    moved = (problem.time - dead_times[:, None]).ravel()
+    order = np.argsort(moved, kind="stable")
+    columns, _ = problem.structure.columns(np.array((math.log(tau), 0.0)), moved[order], problem.u)
+    r = np.empty(moved.size)
+    r[order] = columns[0]
+    table = r.reshape(dead_times.size, -1)
+    table = table - table.mean(axis=1, keepdims=True)
+    y = problem.y - problem.y.mean()
+    power = np.einsum("dn,dn->d", table, table)
+    power[power == 0.0] = 1.0
+    return np.asarray(float(y @ y) - (table @ y) ** 2 / power)
+
+
+class Starts:
+    """Starts of every structure from the FOPDT that fits best.
+
+    :param problem: the problem with its FOPDT structure.
+    :param fopdt: its best fit.
+    """
+
+    def __init__(self, problem: Problem, fopdt: State) -> None:
+        self._unstable: list[FloatArray] | None = None
+        shortest, self.longest = time_scales(problem.time, problem.u)
+        # A FOPDT that fits badly may run off to an integrator, which tells the others nothing.
+        self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
+        self.dead_time = float(fopdt.theta[1])
+        self._least = 0.1 * shortest
+        point = ultimate_point(
+            TransferFunction.fopdt(1.0, self.tau, max(self.dead_time, self._least))
+        )
+        # Where the fit is judged: about the frequency at which a relay test oscillates.
+        self._w = point.frequency if point is not None else 1.0 / self.longest
+
+    def lag_n(self, order: int) -> FloatArray:
+        """Return (log tau, D) of n equal lags of the same gain and phase at one frequency."""
+        w = self._w
+        square = (1.0 + (w * self.tau) ** 2) ** (1.0 / order) - 1.0
+        tau = max(math.sqrt(square) / w, self._least)
+        phase = w * self.dead_time + math.atan(w * self.tau) - order * math.atan(w * tau)
+        return np.array((math.log(tau), max(phase / w, self._least)))
+
+    def lag_n_zero(self, order: int) -> list[FloatArray]:
+        """Return starts of equal lags with a zero, which can look like dead time or hide it."""
+        theta = self.lag_n(order)
+        return [
+            np.array((theta[0] + math.log(scale), share * theta[1]))
+            for scale, share in ((1.0, 1.0), (1.0, 0.3), (0.6, 0.6), (0.6, 0.15))
+        ]
+
+    def sopdt(self) -> list[FloatArray]:
+        """Return starts of a second order: overdamped, critical, underdamped."""
+        tau, dead_time = self.lag_n(2)
+        small = max(0.3 * self.dead_time, self._least)
+        pair = math.sqrt(self.tau * small)
+        ratio = max((self.tau + small) / (2.0 * pair), 1.05)
+        return [
+            np.array((math.log(pair), math.log(ratio), max(self.dead_time - small, self._least))),
+            np.array((tau, math.log(0.9), dead_time)),
+            np.array((tau, math.log(0.4), dead_time)),
+        ]
+
+    def third(self) -> list[FloatArray]:
+        """Return starts of a second order with one more lag."""
+        tau, dead_time = self.lag_n(3)
+        return [np.array((tau, damping, tau, dead_time)) for damping in (0.3, -0.05, -1.0)]
+
+    def two_equal_one(self) -> list[FloatArray]:
+        """Return starts of two equal lags and another: near each other, and either one small."""
+        tau, dead_time = self.lag_n(3)
+        slow = math.log(self.tau)
+        fast = math.log(max(0.3 * self.dead_time, self._least))
+        rest = max(0.5 * self.dead_time, self._least)
+        return [
+            np.array((tau, tau, dead_time)),
+            np.array((slow, fast, rest)),
+            np.array((fast, slow, rest)),
+        ]
+
+    def integrator(self) -> FloatArray:
+        """Return (D,) of an integrator with dead time."""
+        return np.array((max(self.dead_time, self._least),))
+
+    def integrator_lag(self) -> list[FloatArray]:
+        """Return starts of an integrator with a lag that shares the dead time, or is longer."""
+        d = max(self.dead_time, self._least)
+        return [np.array((math.log(s * d), max(1.0 - s, 0.2) * d)) for s in (0.2, 0.7, 3.0)]
+
+    def unstable(self, problem: Problem) -> list[FloatArray]:
+        """Return the best few of a grid of (log tau, D) for an unstable FOPDT.
+
+        :param problem: with an unstable FOPDT structure.
+        """
+        if self._unstable is not None:
+            return self._unstable
+        few = coarse(problem)
+        grid = [
+            np.array((math.log(tau * self.longest), share * self.longest))
+            for tau in (0.4, 1.0, 2.5, 6.0, 20.0)
+            for share in (0.05, 0.2, 0.4, 0.7)
+        ]
+        states = [evaluate(few, theta) for theta in grid]
+        self._unstable = [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
+        return self._unstable
+
+    def unstable_second(self, first: FloatArray) -> list[FloatArray]:
+        """Return starts of an unstable pole with a lag, from an unstable FOPDT's theta."""
+        d = max(float(first[1]), self._least)
+        return [np.array((first[0], math.log(s * d), max(1.0 - s, 0.2) * d)) for s in (0.2, 0.7)]

@@ -1,0 +1,156 @@
+"""Every structure of the waveform fit: responses, derivatives, recovery, choice."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from relay_autotune.identification.factors import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.lags import FOPDT
+from relay_autotune.identification.rational import free_motion, responses
+from relay_autotune.identification.structures import lag_n
+from relay_autotune.identification.waveform import identify_waveform
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.response import response
+from relay_autotune.simulation import simulate_relay
+from relay_autotune.ultimate import ultimate_point
+
+TIME = np.linspace(0.0, 60.0, 400)
+INPUT = PiecewiseConstant(
+    np.array([1.0, 9.0, 22.0, 31.0, 44.0]), np.array([1.0, -1.0, 1.0, -1.0, 1.0]), 0.0
+)
+
+DENOMINATORS = {
+    "lag": (Denominator((Lag(),)), (0,), [1.6, 2.03]),
+    "eight lags": (Denominator((Lag(8),)), (0, 1), [0.1, 2.03]),
+    "overdamped": (Denominator((Quadratic(),)), (0, 1), [0.3, 0.5, 2.03]),
+    "nearly critical": (Denominator((Quadratic(),)), (0, 1), [0.3, 0.001, 2.03]),
+    "underdamped": (Denominator((Quadratic(),)), (0, 1), [0.3, -1.0, 2.03]),
+    "two equal and one": (Denominator((Lag(2), Lag())), (0,), [0.5, 1.5, 2.03]),
+    "third order": (Denominator((Quadratic(), Lag())), (0,), [0.5, 0.2, 1.5, 2.03]),
+    "integrator": (Denominator((), 1), (0,), [2.03]),
+    "integrator and lag": (Denominator((Lag(),), 1), (0, 1), [0.7, 2.03]),
+    "unstable": (Denominator((UnstableLag(),)), (0,), [1.1, 0.53]),
+    "unstable and lag": (Denominator((UnstableLag(), Lag())), (0,), [1.1, 0.2, 0.53]),
+}
+
+
+@pytest.mark.parametrize("name", DENOMINATORS)
+def test_derivatives_are_the_limits_of_differences(name):
+    denominator, powers, point = DENOMINATORS[name]
+    theta = np.array(point)
+    _, derivatives = responses(denominator, powers, theta, TIME, INPUT)
+    _, free_derivatives = free_motion(denominator, theta, TIME)
+    for i in range(theta.size):
+        h = np.zeros(theta.size)
+        h[i] = 1e-6
+        up, down = (responses(denominator, powers, theta + s * h, TIME, INPUT)[0] for s in (1, -1))
+        error = np.abs((up - down) / 2e-6 - derivatives[i])
+        # Samples beside a change, which crosses them as the dead time moves, are left out.
+        assert np.quantile(error, 0.97) < 1e-5 * (1.0 + np.abs(derivatives[i]).max())
+        up, down = (free_motion(denominator, theta + s * h, TIME)[0] for s in (1, -1))
+        if up.size:
+            error = np.abs((up - down) / 2e-6 - free_derivatives[i])
+            assert error.max() < 1e-5 * (1.0 + np.abs(free_derivatives[i]).max())
+
+
+@pytest.mark.parametrize("name", [n for n in DENOMINATORS if "unstable" not in n])
+def test_responses_are_those_of_the_transfer_function(name):
+    denominator, powers, point = DENOMINATORS[name]
+    theta = np.array(point)
+    found, _ = responses(denominator, powers, theta, TIME, INPUT)
+    constants = denominator.constants(theta[:-1])
+    model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
+    np.testing.assert_allclose(found[0], response(model, TIME, INPUT), atol=1e-9)
+
+
+def test_the_closed_form_of_a_lag_is_the_general_one():
+    theta = np.array((1.6, 2.03))
+    for quick, general in zip(
+        FOPDT.columns(theta, TIME, INPUT), lag_n(1).columns(theta, TIME, INPUT), strict=True
+    ):
+        np.testing.assert_allclose(quick, general, atol=1e-12)
+
+
+PROCESSES = {
+    "fopdt": TransferFunction.fopdt(1.65, 20.0, 10.0),
+    "lag_n": TransferFunction.lag_n(1.0, 1.0, 3, 10.0),
+    "lag_n, order 8": TransferFunction.lag_n(1.0, 6.0, 8, 0.6),
+    "lag_n_zero": TransferFunction.lag_n_zero(1.0, 2.0, 3, -1.0, 1.0),
+    "sopdt": TransferFunction.sopdt(1.0, (5.0, 1.0), 1.0),
+    "sopdt, underdamped": TransferFunction.oscillator(1.0, 1.0, 0.4, 0.5),
+    "two_equal_one": TransferFunction.two_equal_one(1.0, 10.0, 3.0, 2.0),
+    "three_lags": TransferFunction.three_lags(1.0, (10.0, 3.0, 1.0), 2.0),
+    "lag_complex": TransferFunction.lag_complex(1.0, 2.0, 1.0, 0.4, 1.0),
+    "ipdt": TransferFunction.ipdt(0.5, 1.0),
+    "integrator_lag": TransferFunction.integrator_lag(0.5, 2.0, 1.0),
+    "integrator_inverse": TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+    "unstable_fopdt": TransferFunction.unstable_fopdt(1.0, 1.0, 0.3),
+    "unstable_sopdt": TransferFunction.unstable_sopdt(1.0, 2.0, 0.2, 0.2),
+}
+
+
+def _record(model: TransferFunction, noise: float = 0.0, seed: int = 0) -> Record:
+    relay = RelaySettings(0.0, 0.0, 1.0)
+    end = simulate_relay(model, relay, cycles=5).command.times[-1]
+    run = simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, 1000))
+    signal = float(np.mean(np.abs(run.measurement)))
+    std = noise * signal * math.sqrt(math.pi / 2.0)
+    return run.record(noise_std=std, rng=np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_without_noise_the_true_structure_is_found_exactly(name):
+    model = PROCESSES[name]
+    found = identify_waveform(_record(model))
+    assert found.structure == model.structure
+    assert found.model.order == model.order
+    assert found.model.gain == pytest.approx(model.gain, rel=1e-7)
+    assert found.model.dead_time == pytest.approx(model.dead_time, rel=1e-7, abs=1e-7)
+    for a, b in zip(
+        sorted(found.model.time_constants, key=lambda c: (c.real, c.imag)),
+        sorted(model.time_constants, key=lambda c: (c.real, c.imag)),
+        strict=True,
+    ):
+        assert abs(a - b) < 1e-6 * abs(b)
+    assert found.ultimate_gain == pytest.approx(ultimate_point(model).gain, rel=1e-8)
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_in_noise_the_choice_gives_the_ultimate_point(name):
+    model = PROCESSES[name]
+    truth = ultimate_point(model)
+    for seed in (0, 1):
+        found = identify_waveform(_record(model, 0.1, seed))
+        assert found.ultimate_gain == pytest.approx(truth.gain, rel=0.02)
+        assert found.ultimate_frequency == pytest.approx(truth.frequency, rel=0.01)
+        assert abs(found.ultimate_gain - truth.gain) < 4.5 * found.ultimate_gain_std
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_the_true_structure_given_its_errors_are_those_stated(name):
+    model = PROCESSES[name]
+    known = Known(structure=model.structure, order=model.order if "lag_n" in name else 0)
+    truth = identify_waveform(_record(model), known)
+    for seed in (2, 3):
+        found = identify_waveform(_record(model, 0.02, seed), known)
+        assert found.parameters == truth.parameters
+        assert np.all(np.isfinite(found.std))
+        pulls = (found.values - truth.values) / found.std
+        assert np.abs(pulls).max() < 5.0
+
+
+def test_rivals_are_told_with_their_support():
+    found = identify_waveform(_record(PROCESSES["lag_n, order 8"], 0.1))
+    assert any(r.model.structure == "lag_n" for r in found.rivals)
+    assert all(0.0 < r.support < 1.0 for r in found.rivals)
+
+
+def test_a_structure_that_is_not_in_the_data_can_be_forced():
+    found = identify_waveform(_record(PROCESSES["lag_n"], 0.02), Known(structure="fopdt"))
+    assert found.structure == "fopdt"
+    assert any("not white" in w for w in found.warnings)
