@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +15,11 @@ from relay_autotune.identification import (
     Identification,
     Known,
     identify,
+    identify_jointly,
     method_named,
 )
 from relay_autotune.identification.known import NOTHING
+from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES, Gains, ensemble, rule_named, tune
 
@@ -109,11 +112,52 @@ def analyse(
         return Analysis(
             record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
         )
+    return _tuned(found, rule, rng, simple)
+
+
+def analyse_jointly(
+    records: Sequence[Record],
+    *,
+    method: str,
+    rule: str = DEFAULT_RULE,
+    known: Known = NOTHING,
+    rng: np.random.Generator | None = None,
+) -> Analysis:
+    """Identify one model from several records of a process and, where all were completed, tune.
+
+    :param records: the experiments, at least one; the first stands for all in the result.
+    :param method: one of ``JOINT_METHODS``.
+    :param rule: the rule whose gains count.
+    :param known: what is known of the process beforehand.
+    :param rng: as for :func:`analyse`.
+    :raises RelayAutotuneError: if method or rule are unknown.
+    """
+    rule_named(rule)
+    first = records[0]
+    cycles: tuple[Cycle, ...] = ()
+    try:
+        cycles = cycles_of(first)
+        chosen = identify_jointly(records, method, known)
+    except RelayAutotuneError as error:
+        return Analysis(first, cycles, reason=_with_outcome(first, str(error)))
+    found = Analysis(first, cycles, (chosen,), 0)
+    for record in records:
+        if record.outcome in _NO_GAINS:
+            why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
+            return replace(found, reason=why)
+    return _tuned(found, rule, rng, chosen.model if chosen.structure == "fopdt" else None)
+
+
+def _tuned(
+    found: Analysis, rule: str, rng: np.random.Generator | None, simple: TransferFunction | None
+) -> Analysis:
+    """Add the gains of every rule that applies to the selected model, the chosen rule's first."""
+    chosen = found.models[0]
     around = ensemble(chosen, rng=rng or np.random.default_rng(0))
     try:
         first = tune(chosen, rule, around, simple)
     except TuningError as error:
-        return Analysis(record, cycles, found.models, 0, reason=f"no gains: {error}")
+        return replace(found, reason=f"no gains: {error}")
     gains = [first]
     for name in RULES:
         if name == rule:
@@ -123,7 +167,7 @@ def analyse(
         except TuningError:
             # A rule that does not apply has nothing to compare.
             continue
-    return Analysis(record, cycles, found.models, 0, tuple(gains), 0)
+    return replace(found, gains=tuple(gains), recommended=0)
 
 
 def _guarded(record: Record, method: str, known: Known) -> Identification:

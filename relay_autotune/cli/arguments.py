@@ -7,8 +7,12 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError
+
+if TYPE_CHECKING:
+    from relay_autotune.identification.known import Known
 
 DONE, NOTHING_FOUND, USAGE = 0, 1, 2
 
@@ -51,3 +55,19 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         return 130
     return status
+
+
+def known_facts(options: argparse.Namespace) -> Known:
+    """Return what the options say to be known of the process.
+
+    :param options: with gain and dead_time, None where they were not given; structure, order.
+    :raises ParameterError: if a value cannot be.
+    """
+    from relay_autotune.identification.known import Known
+
+    return Known(
+        gain=math.nan if options.gain is None else options.gain,
+        dead_time=math.nan if options.dead_time is None else options.dead_time,
+        structure=options.structure,
+        order=options.order,
+    )

@@ -8,11 +8,21 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.arguments import (
+    DONE,
+    NOTHING_FOUND,
+    USAGE,
+    finite,
+    guarded,
+    known_facts,
+    say,
+)
 from relay_autotune.errors import RelayAutotuneError, SelectionError
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
+    from relay_autotune.identification.known import Known
+    from relay_autotune.record import Record
 
 PROGRAM = "replay"
 
@@ -29,6 +39,8 @@ Examples:
   replay ~/.ros/relay_autotune/20261120T234315Z_2c010118
   replay --measurement /tank/level --command /tank/valve robot_bag
   replay --json log.csv --measurement level --command valve --time t
+  replay --method chang --gain 1.65 --dead-time 10 robot_bag
+  replay --method li without_extra_delay with_extra_delay     (several tests, one model)
 """
 
 
@@ -64,6 +76,10 @@ def _parser() -> argparse.ArgumentParser:
         "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
     )
     parser.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
+    parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
+    parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
+    parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
+    parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
     parser.add_argument("--rule", default="thyagarajan", help="how to tune (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
     return parser
@@ -71,36 +87,67 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace) -> int:
     from relay_autotune.autotune import check_names
+    from relay_autotune.identification import JOINT_METHODS
 
     try:
         check_names(options.method, options.rule)
+        known = known_facts(options)
     except RelayAutotuneError as error:
         raise SelectionError(str(error)) from error
     start, end = options.start, options.end
     if start is not None and end is not None and start >= end:
         raise SelectionError(f"--start {start:g} is not before --end {end:g}")
     selection = Selection(options.measurement, options.command, options.time, start, end)
-    return max(_replay(bag, selection, options) for bag in options.bags)
+    if options.method in JOINT_METHODS:
+        return _replay_jointly(selection, options, known)
+    return max(_replay(bag, selection, options, known) for bag in options.bags)
 
 
-def _replay(bag: str, selection: Selection, options: argparse.Namespace) -> int:
+def _replay(bag: str, selection: Selection, options: argparse.Namespace, known: Known) -> int:
     """Read, identify, tune and print one bag; return the exit status it deserves."""
     from relay_autotune.autotune import analyse
 
     try:
-        recording = read_experiments(bag, selection)
+        records = _read(bag, selection)
     except RelayAutotuneError as error:
-        text = str(error) if bag in str(error) else f"{bag}: {error}"
-        say(PROGRAM, text)
-        if options.json:
-            _print_document(bag, error=text)
-        return USAGE if isinstance(error, SelectionError) else NOTHING_FOUND
+        return _unreadable(bag, error, options)
+    return _show(
+        bag,
+        [analyse(r, method=options.method, rule=options.rule, known=known) for r in records],
+        options,
+    )
+
+
+def _replay_jointly(selection: Selection, options: argparse.Namespace, known: Known) -> int:
+    """Take the experiments of all bags for tests of one process."""
+    from relay_autotune.autotune import analyse_jointly
+
+    records: list[Record] = []
+    for bag in options.bags:
+        try:
+            records += _read(bag, selection)
+        except RelayAutotuneError as error:
+            return _unreadable(bag, error, options)
+    analysis = analyse_jointly(records, method=options.method, rule=options.rule, known=known)
+    return _show(", ".join(options.bags), [analysis], options)
+
+
+def _read(bag: str, selection: Selection) -> tuple[Record, ...]:
+    recording = read_experiments(bag, selection)
     for note in recording.notes:
         say(PROGRAM, f"{bag}: {note}")
-    analyses = [
-        analyse(record, method=options.method, rule=options.rule)
-        for record in recording.experiments
-    ]
+    return recording.experiments
+
+
+def _unreadable(bag: str, error: RelayAutotuneError, options: argparse.Namespace) -> int:
+    text = str(error) if bag in str(error) else f"{bag}: {error}"
+    say(PROGRAM, text)
+    if options.json:
+        _print_document(bag, error=text)
+    return USAGE if isinstance(error, SelectionError) else NOTHING_FOUND
+
+
+def _show(bag: str, analyses: Sequence[Analysis], options: argparse.Namespace) -> int:
     if options.json:
         _print_document(bag, analyses)
     else:
