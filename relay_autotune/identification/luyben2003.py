@@ -96,7 +96,7 @@ def from_step(t1: float, t2: float, extremum: float, step: float) -> tuple[float
                 f"a return {ratio:g} times later than the extremum is no response of this "
                 "structure: its lag would vanish"
             )
-    z = float(brentq(excess, 0.0, high, xtol=1e-300, rtol=1e-15))
+    z = float(brentq(excess, 0.0, high, xtol=1e-16, rtol=1e-15))
     if z == 0.0:
         raise IdentificationError(
             "the return comes at just twice the time of the extremum, so that the inverse "

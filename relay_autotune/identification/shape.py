@@ -189,7 +189,7 @@ def _turning_point(y: Curve, low: float, high: float) -> float:
 
     if not rate(low) > 0.0 > rate(high):
         return low if rate(low) <= 0.0 else high
-    return float(brentq(rate, low, high, xtol=1e-300, rtol=1e-15))
+    return float(brentq(rate, low, high, xtol=1e-15 * (high - low), rtol=1e-15))
 
 
 def _crossing(y: Curve, level: float, path: FloatArray) -> float:
@@ -206,9 +206,10 @@ def _crossing(y: Curve, level: float, path: FloatArray) -> float:
         return _at(y, t) - level
 
     a, b = sorted((float(path[i - 1]), float(path[i])))
-    return (
-        a if excess(a) * excess(b) >= 0.0 else float(brentq(excess, a, b, xtol=1e-300, rtol=1e-15))
-    )
+    if excess(a) * excess(b) >= 0.0:
+        return a
+    # A crossing may lie at zero, where no relative accuracy would do.
+    return float(brentq(excess, a, b, xtol=1e-15 * abs(float(path[-1] - path[0])), rtol=1e-15))
 
 
 def shape_of_half_cycle(cycle: HalfCycle) -> Shape:

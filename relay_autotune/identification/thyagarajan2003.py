@@ -175,7 +175,7 @@ def _reach(period: float, amplitude: float, time_to_peak: float, level: float) -
             f"a peak {time_to_peak:g} s after the switch is at the very beginning of the half "
             f"period of {0.5 * period:g} s: no FOPDT process does that"
         )
-    return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-300, rtol=1e-15))
+    return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
 
 
 def first_guess(frequency: float, dead_time: float) -> float:
