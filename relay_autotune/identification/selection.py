@@ -25,6 +25,8 @@ MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _INDIFFERENT = 2.0
 _SAMPLES_EACH = 8
+# Drift and initial state belong to a fit only on strong evidence, since they blur the gain.
+_EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
 
@@ -95,7 +97,9 @@ class Selection:
                 problem = replace(found.problem, drift=drift, relaxation=relaxation)
                 state = refine(problem, found.state.theta, tolerance=_TRIAL)
                 other = self.candidate(problem, state)
-                if other is not None and other.criterion < best.criterion:
+                if other is None or other.criterion > found.criterion - _EVIDENCE:
+                    continue
+                if other.criterion < best.criterion:
                     best = other
         return best
 

@@ -132,21 +132,18 @@ def refine(problem: Problem, theta: FloatArray, *, tolerance: float = _LEAST_GAI
         jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
         normal = jacobian @ jacobian.T
         gradient = jacobian @ state.residual
-        diagonal = np.diag(np.maximum(np.diag(normal), 1e-300))
-        step = _solve(normal + damping * diagonal, gradient)
+        step = _solve(normal, gradient, damping)
         least = -float(state.theta[-1] / scale[-1])
         if step[-1] < least:
             # The dead time stops at zero, and the others go where that leaves them to go.
-            others = normal + damping * diagonal
-            step = np.append(
-                _solve(others[:-1, :-1], gradient[:-1] - normal[:-1, -1] * least), least
-            )
+            rest = gradient[:-1] - normal[:-1, -1] * least
+            step = np.append(_solve(normal[:-1, :-1], rest, damping), least)
         trial = evaluate(problem, problem.structure.move(state.theta, step))
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         if not trial.cost < state.cost:
             damping *= 10.0
             # Where even the undamped step promises less than rounding, no other will be seen.
-            promised = float(gradient @ _solve(normal, gradient))
+            promised = float(gradient @ _solve(normal, gradient, 0.0))
             if promised <= tolerance * state.cost or damping > _MOST_DAMPING or smallest:
                 break
             continue
@@ -158,8 +155,11 @@ def refine(problem: Problem, theta: FloatArray, *, tolerance: float = _LEAST_GAI
     return state
 
 
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
+def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """Solve the normal equations, each direction in its own units, with Marquardt's damping."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal / np.outer(size, size) + damping * np.eye(size.size)
+    return np.asarray(np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size)
 
 
 def information_criterion(cost: float, samples: int, parameters: int, floor: float) -> float:

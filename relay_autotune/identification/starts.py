@@ -20,7 +20,11 @@ _COARSE = 1e-4
 _EXACT = 1e-15
 
 # Dead times tried at the start, as shares of the longest one.
-_SHARES = (0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95)
+# Noise may make a relay switch faster than the process answers, hence those beyond 1.
+_SHARES = (
+    *(0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95),
+    *(1.2, 1.5, 1.9, 2.4),
+)
 
 
 def time_scales(time: FloatArray, u: PiecewiseConstant) -> tuple[float, float]:
