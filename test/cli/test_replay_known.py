@@ -1,0 +1,109 @@
+"""What is known of the process, and several tests for one model, in `replay`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_bags import START, definition, experiment_message, serialize, write_samples
+
+from relay_autotune.autotune import analyse, analyse_jointly
+from relay_autotune.bag.decode import EXPERIMENT
+from relay_autotune.bag.definitions import Definition
+from relay_autotune.bag.writer import BagWriter, Topic
+from relay_autotune.cli import replay
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification import Known
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.sampled_relay import simulate_sampled_relay
+
+MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
+
+
+def unbiased(extra_delay: float = 0.0) -> Record:
+    relay = RelaySettings(50.0, 30.0, 3.0, 0.0, 0.1, extra_delay)
+    noise = np.random.default_rng(5).normal(0.0, 0.01, 1400)
+    record = simulate_sampled_relay(MODEL, relay, period=0.2, noise=noise)
+    return replace(record, noise_std=0.01, experiment_id=f"run-{extra_delay:g}", start=START / 1e9)
+
+
+def write_bag(path, folder, *records):
+    text = definition(EXPERIMENT, folder).text
+    experiments = Topic("/relay_experiment", EXPERIMENT, definition=Definition(text))
+    topics = [Topic("/measurement"), Topic("/command"), experiments]
+    with BagWriter(path, topics, start_ns=START) as bag:
+        for record in records:
+            write_samples(bag, record)
+            data = serialize(EXPERIMENT, text, experiment_message(record))
+            bag.write("/relay_experiment", START, START, data)
+    return path
+
+
+def run(capsys, *arguments) -> tuple[int, list[dict], str]:
+    status = replay.main([str(a) for a in ("--json", *arguments)])
+    out, err = capsys.readouterr()
+    return status, [json.loads(line) for line in out.splitlines()], err
+
+
+def test_known_facts_reach_the_method(tmp_path, capsys):
+    record = unbiased()
+    bag = write_bag(tmp_path / "bag", tmp_path, record)
+    known = ("--gain", "1.65", "--dead-time", "10", "--structure", "fopdt")
+    status, (found,), _ = run(capsys, "--method", "chang", *known, bag)
+    assert status == 0
+    model = found["experiments"][0]["models"][0]
+    assert (model["method"], model["gain"], model["dead_time"]) == ("chang", 1.65, 10.0)
+    expected = analyse(record, method="chang", known=Known(1.65, 10.0, "fopdt")).model
+    assert model["time_constants"] == [t.real for t in expected.model.time_constants]
+    assert model["time_constants"] == pytest.approx([20.0], rel=0.05)
+
+
+def test_a_fact_that_cannot_be_is_one_line(tmp_path, capsys):
+    status, found, err = run(capsys, "--dead-time", "-1", tmp_path / "none")
+    assert (status, found) == (2, [])
+    assert err == "replay: a known dead time must be finite and >= 0 s, found -1 s\n"
+
+
+@pytest.mark.parametrize("one_bag", [True, False])
+def test_two_tests_give_one_model(tmp_path, capsys, one_bag):
+    records = unbiased(), unbiased(8.0)
+    if one_bag:
+        bags = [write_bag(tmp_path / "both", tmp_path, *records)]
+    else:
+        bags = [write_bag(tmp_path / str(k), tmp_path, r) for k, r in enumerate(records)]
+    status, (found,), err = run(capsys, "--method", "li", *bags)
+    assert (status, err) == (0, "")
+    assert found["bag"] == ", ".join(map(str, bags))
+    (experiment,) = found["experiments"]
+    (model,) = experiment["models"]
+    assert (model["method"], model["structure"]) == ("li", "fopdt")
+    assert model["ultimate_gain"] == pytest.approx(2.3072, rel=0.03)
+    assert experiment["gains"][0]["rule"] == "thyagarajan"
+
+
+def test_one_test_is_not_enough(tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag", tmp_path, unbiased())
+    status, (found,), err = run(capsys, "--method", "li", bag)
+    assert status == 1
+    assert found["experiments"][0]["models"] == []
+    assert "extra_delay" in err
+    status, (found,), err = run(capsys, "--method", "li", bag, tmp_path / "none")
+    assert status == 1
+    assert "none" in found["error"]
+
+
+def test_tests_that_were_aborted_give_no_gains():
+    records = unbiased(), replace(unbiased(8.0), outcome=Outcome.ABORTED, reason="a hand did it")
+    found = analyse_jointly(records, method="li")
+    assert found.model is not None
+    assert found.gains == ()
+    assert found.reason == "the experiment was aborted: no gains. a hand did it"
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(RelayAutotuneError, match="unknown rule"):
+        analyse_jointly([unbiased()], method="li", rule="none")
+    assert "these do: li" in analyse_jointly([unbiased()], method="chang").reason
