@@ -236,11 +236,10 @@ def _smoothed(
 
 def _binned(phase: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Average neighbouring samples where there are more than the curve needs."""
-    order = np.argsort(phase, kind="stable")
-    x, value = phase[order], y[order]
-    if x.size <= _MOST_POINTS:
-        return x, value, np.ones(x.size)
-    places = np.arange(_MOST_POINTS) * (float(x[-1]) / _MOST_POINTS)
-    begins = np.unique(np.searchsorted(x, places))
-    count = np.diff(np.append(begins, x.size)).astype(np.float64)
-    return np.add.reduceat(x, begins) / count, np.add.reduceat(value, begins) / count, count
+    if phase.size <= _MOST_POINTS:
+        return phase, y, np.ones(phase.size)
+    number = np.floor(phase * (_MOST_POINTS / float(phase.max()))).astype(np.int64)
+    count = np.bincount(number).astype(np.float64)
+    used = count > 0.0
+    x, value = (np.bincount(number, v)[used] / count[used] for v in (phase, y))
+    return x, value, count[used]

@@ -110,10 +110,9 @@ def category(shape: Shape) -> str:
 
 def _widened(shape: Shape) -> float:
     """How much larger q is for the unstable FOPDT through this peak than for a stable one."""
-    late = 0.5 * shape.half_period * (1.0 - shape.level / shape.amplitude)
-    if not 0.0 < shape.time_to_peak < late:
-        return 1.0
     ratio, e = shape.time_to_peak / shape.half_period, shape.level / shape.amplitude
+    if not (abs(e) < 1.0 and 0.0 < ratio < 0.5 * (1.0 - e)):
+        return 1.0
 
     def excess(v: float) -> float:
         return math.log((1.0 + v) / (1.0 + e * v)) / (2.0 * math.atanh(v)) - ratio

@@ -213,6 +213,11 @@ def _unstable(dead_time: float) -> Solver:
 
 def _integrating() -> Solver:
     def solve(s: Shape, level: float) -> FloatArray:
+        if not (s.time_to_peak > 0.0 and s.amplitude > level):
+            raise IdentificationError(
+                f"the peak of {s.amplitude:g} comes {s.time_to_peak:g} s after the switch at "
+                f"{level:g}: this is no limit cycle of a process with dead time"
+            )
         # Half a period takes y from epsilon up to a, in D, and down to -epsilon.
         return np.array(((s.amplitude - level) / s.time_to_peak, s.time_to_peak))
 

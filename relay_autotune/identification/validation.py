@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.errors import ModelError
+from relay_autotune.errors import IdentificationError, ModelError
 from relay_autotune.identification.fold import Fold, fold
 from relay_autotune.identification.wang1997 import steady_state
 from relay_autotune.models import TransferFunction
@@ -93,6 +93,10 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: float) -> Validatio
     edges = [] if math.isnan(seen.edge) else [seen.edge, high + seen.edge]
     peaks = np.append(recorded, seen(np.array(edges)))
     size = 0.5 * float(np.ptp(peaks))
+    if not size > 0.0:
+        raise IdentificationError(
+            "the measurement is constant over the cycles: there is no limit cycle to compare with"
+        )
     if model.process_sign * (-1 if settings.reverse_acting else 1) < 0:
         return Validation(reason="the model's gain is against the direction of the relay")
     try:

@@ -172,3 +172,28 @@ def test_unequal_halves_are_remarked():
     time = np.linspace(0.0, end, 1200)
     run = simulate_relay(model, settings, cycles=6, operating_point=4.8, time=time)
     assert any("half periods differ" in w for w in thyagarajan(run.record()).warnings)
+
+
+@pytest.mark.parametrize("method", ["thyagarajan", "luyben_step"])
+def test_nonsense_is_refused_or_identified_but_never_an_accident(method):
+    rng = np.random.default_rng(0)
+    for k in range(120):
+        n = int(rng.choice([3, 5, 12, 30, 100]))
+        time = np.cumsum(rng.exponential(0.1, n))
+        y = (
+            np.zeros(n),
+            rng.standard_normal(n),
+            np.sin(3.0 * time) + k % 3,
+            1e9 * rng.standard_normal(n),
+            np.round(np.sin(3.0 * time)),
+        )[k % 5]
+        command = np.where((np.arange(n) // int(rng.integers(1, 20))) % 2 == 0, 1.0, -1.0)
+        starts = tuple(int(i) for i in np.flatnonzero(np.diff(command) > 0.0) + 1)
+        relay = RelaySettings(0.0, 0.0, 1.0, hysteresis=0.1 * (k % 2), reverse_acting=k % 7 == 0)
+        record = Record(time, y, command, settings=relay, cycle_start=starts if k % 4 else ())
+        try:
+            found = identify(record, method)
+        except IdentificationError as refusal:
+            assert len(str(refusal)) > 30
+        else:
+            assert np.all(np.isfinite(found.values))
