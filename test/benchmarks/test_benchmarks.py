@@ -18,6 +18,7 @@ QUICK = {
     "replay_time": ("--quick",),
     "lockstep": ("--quick",),
     "latency": ("--quick",),
+    "chang_studies": ("--quick",),
 }
 
 
