@@ -21,7 +21,6 @@ __all__ = [
     "cycle_from_samples",
     "cycles_of",
     "find_cycles",
-    "first_harmonic",
     "infer_settings",
     "limit_cycle",
     "next_cycle",
@@ -320,37 +319,3 @@ def _steady_cycles(cycles: tuple[Cycle, ...], min_cycles: int) -> tuple[tuple[Cy
             first -= 1
         chosen = cycles[max(0, first + 1 - min_cycles) : last + 1]
     return tuple(c for c in chosen if not c.disturbed) or chosen, last is not None
-
-
-def first_harmonic(
-    record: Record, *, min_cycles: int = MIN_CYCLES, tolerance: float = TOLERANCE
-) -> tuple[float, complex]:
-    """Return the frequency response at the fundamental frequency of the limit cycle.
-
-    It is the quotient of the Fourier integrals of measurement and command over whole cycles
-    (those of :func:`limit_cycle` from the first to the last), the command as held and the
-    measurement by the trapezoidal rule. For a periodic oscillation it is exact, whatever the
-    waveforms (Wang, Hang & Zou 1997, eq 19); the describing function knows the command's first
-    harmonic only.
-
-    :param record: the record of an experiment.
-    :returns: frequency [rad/s] and response [y/u].
-    :raises RecordError: if there is no whole cycle, or the command has no such component.
-    """
-    average = limit_cycle(record, min_cycles=min_cycles, tolerance=tolerance)
-    bounds = _bounds(record)
-    first, last = bounds[average.cycles[0]], bounds[average.cycles[-1] + 1]
-    part = slice(first, last + 1)
-    t = record.time[part] - record.time[first]
-    y, u = record.measurement[part], record.command[part]
-    if t[-1] <= 0.0:
-        raise RecordError("found no time between the first and the last sample of the cycles")
-    turns = average.cycles[-1] + 1 - average.cycles[0]
-    frequency = 2.0 * math.pi * turns / float(t[-1])
-    wave = np.exp(-1j * frequency * t)
-    interval = np.diff(t)
-    output = np.sum(0.5 * (y[:-1] * wave[:-1] + y[1:] * wave[1:]) * interval)
-    held = np.sum(u[:-1] * (wave[:-1] - wave[1:])) / (1j * frequency)
-    if abs(held) <= 1e-12 * float(np.max(np.abs(u))) * float(t[-1]):
-        raise RecordError("the command has no component at the frequency of the cycles")
-    return frequency, complex(output / held)

@@ -129,6 +129,14 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
         "ultimate_frequency_std": _number(identification.ultimate_frequency_std),
         "warnings": list(identification.warnings),
         "undetermined": list(identification.undetermined),
+        "rivals": [
+            {
+                "structure": r.model.structure,
+                "support": _number(r.support),
+                **model_fields(r.model),
+            }
+            for r in identification.rivals
+        ],
     }
 
 

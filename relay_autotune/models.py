@@ -152,8 +152,7 @@ class TransferFunction:
     ) -> TransferFunction:
         """Build a transfer function from coefficients of powers of s, highest first.
 
-        :param numerator: shape (m,), not all zero.
-        :param denominator: shape (n,), not all zero.
+        :param numerator: shape (m,), not all zero, as the denominator, shape (n,).
         :param dead_time: D >= 0 [s].
         :raises ModelError: if a polynomial is empty, zero or not finite, or the function improper.
         """
@@ -318,7 +317,7 @@ class TransferFunction:
             return float(_exactly(1, tau)[0].real)
 
         def zero() -> float:
-            return float(_exactly(1, zeros)[0].real)
+            return float(_exactly(1, zeros, "zeros")[0].real)
 
         match structure:
             case "fopdt":
@@ -382,9 +381,11 @@ def _at_least_one(order: int) -> int:
     return order
 
 
-def _exactly(count: int, constants: Sequence[complex]) -> tuple[complex, ...]:
+def _exactly(
+    count: int, constants: Sequence[complex], name: str = "time_constants"
+) -> tuple[complex, ...]:
     if len(constants) != count:
-        raise ModelError(f"this structure needs {count} constant(s), found {len(constants)}")
+        raise ModelError(f"the structure needs {name} of length {count}, found {len(constants)}")
     return tuple(complex(c) for c in constants)
 
 

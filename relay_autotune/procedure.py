@@ -136,7 +136,7 @@ class Procedure:
             State.SETTLING: "while settling",
             State.KICK: f"while waiting for the measurement to leave its rest {self.rest.mean:g}",
             State.PROBE: "while finding the sign of the process gain",
-        }.get(self.state, f"after {len(self.cycles)} whole cycles")
+        }.get(self.state, f"after {_count(len(self.cycles))}")
 
     # SETTLING
 
@@ -329,3 +329,7 @@ class Procedure:
             f"for the hysteresis or the set-point, a load may have come, or process_gain_sign "
             f"(taken as {_SIGNS[self.sign]}) may be wrong",
         )
+
+
+def _count(cycles: int) -> str:
+    return f"{cycles} whole cycle{'' if cycles == 1 else 's'}"

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from relay_autotune.tuning import Gains
 
 _WIDTH = 99
+# Rivals beyond these are told in the JSON document alone.
+_RIVALS = 3
 _INDENT = "  "
 _LABEL = 16
 
@@ -121,10 +123,14 @@ def _limit_cycle(analysis: Analysis) -> list[str]:
         _line(
             "limit cycle",
             f"period {digits(cycle.period)} s (high {digits(cycle.period_high)} s, "
-            f"low {digits(cycle.period_low)} s), {len(cycle.cycles)} cycles, {state}",
+            f"low {digits(cycle.period_low)} s), {_count(len(cycle.cycles))}, {state}",
         ),
         _line("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)}"),
     ]
+
+
+def _count(cycles: int) -> str:
+    return f"{cycles} cycle{'' if cycles == 1 else 's'}"
 
 
 def identification_lines(found: Identification) -> list[str]:
@@ -145,6 +151,10 @@ def identification_lines(found: Identification) -> list[str]:
             interval = f"± {digits(1.96 * std, 2)}" if math.isfinite(std) else ""
             lines.append(_row(label, value, unit, interval))
     lines.append(_line("fit", _fit(found)))
+    for i, rival in enumerate(found.rivals[:_RIVALS]):
+        share = f"{100.0 * rival.support:.2g} % of the support"
+        text = f"{process_text(rival.model)}   ({rival.model.structure}, {share})"
+        lines.append(_line("rivals" if i == 0 else "", text))
     for warning in found.warnings:
         lines += _wrapped("warning", warning)
     return lines

@@ -76,7 +76,7 @@ def growth_time(peaks: Envelope, noise_std: float = 0.0) -> float:
     :param peaks: of a relay test.
     :param noise_std: standard deviation of the noise of a sample [y].
     :return: 0 where the peaks do not differ beyond their scatter, so that they are steady at
-        once; NaN for fewer than 6 peaks.
+        once; NaN for fewer than 6 peaks, or if they do not follow one another.
     """
     n = peaks.height.size
     if n < _LEAST_PEAKS:
@@ -92,6 +92,8 @@ def growth_time(peaks: Envelope, noise_std: float = 0.0) -> float:
         return cost(np.column_stack((fixed, np.exp(-time / math.exp(log_time)))))
 
     half = float(np.median(np.diff(time)))
+    if not half > 0.0:
+        return math.nan
     ends = math.log(_QUICKEST * half), math.log(max(float(time[-1]), half))
     trials = np.linspace(*ends, _TRIALS)
     i = int(np.argmin([fit(x) for x in trials]))

@@ -104,12 +104,19 @@ class Fold:
         return np.asarray(y / unit if derivative else y)
 
 
-def fold(record: Record, cycles: tuple[int, ...] = (), like: Fold | None = None) -> Fold:
+def fold(
+    record: Record,
+    cycles: tuple[int, ...] = (),
+    like: Fold | None = None,
+    *,
+    sharp: bool = False,
+) -> Fold:
     """Average the steady cycles of a relay test.
 
     :param record: with at least one whole cycle.
     :param cycles: numbers of the cycles to be averaged; default: those of the limit cycle.
     :param like: an average whose knots are kept, and near whose kink that of this one is sought.
+    :param sharp: True if there is a kink for certain, so that only its place is decided.
     :raises IdentificationError: if the record holds no whole cycle, or too few samples in it.
     """
     settings = record.settings or infer_settings(record)
@@ -130,7 +137,9 @@ def fold(record: Record, cycles: tuple[int, ...] = (), like: Fold | None = None)
         high = low = 0.5 * (high + low)
     usable = np.where(is_high, since < high, since < low)
     time = (since + np.where(is_high, 0.0, high))[usable]
-    return _smoothed(time, y[usable] - settings.setpoint, high, low, settings, mirrored, like)
+    return _smoothed(
+        time, y[usable] - settings.setpoint, high, low, settings, mirrored, like, sharp
+    )
 
 
 def _overlaid(
@@ -191,6 +200,7 @@ def _smoothed(
     settings: RelaySettings,
     mirrored: bool,
     like: Fold | None,
+    sharp: bool,
 ) -> Fold:
     if y.size < _SAMPLES_PER_KNOT * 2 * _KNOTS[0]:
         raise IdentificationError(
@@ -224,7 +234,7 @@ def _smoothed(
         if half <= _SEARCHED:
             edge = spline.searched(places)
         edge = spline.refined(edge, places)
-        for place in (math.nan, edge):
+        for place in (edge,) if sharp else (math.nan, edge):
             coefficients, cost = spline.fitted(place)
             k = coefficients.size + (not math.isnan(place))
             criterion = n * math.log(max(cost, floor)) + k * math.log(n)

@@ -258,14 +258,15 @@ def shape_of_record(record: Record) -> Shape:
     return shape_of_fold(whole, _growth(record, whole.period))
 
 
-def read_shape(record: Record) -> Reading:
+def read_shape(record: Record, *, sharp: bool = False) -> Reading:
     """Return the shape of a relay test, and how certain it is.
 
     :param record: with at least one whole cycle.
+    :param sharp: True if the peaks are known to be sharp, however much noise there is.
     :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
     """
     cycles = limit_cycle(record).cycles if cycles_of(record) else ()
-    whole = fold(record, cycles)
+    whole = fold(record, cycles, sharp=sharp)
     shape = shape_of_fold(whole, _growth(record, whole.period))
     parts = []
     for left_out in cycles if len(cycles) >= _LEAST_CYCLES else ():

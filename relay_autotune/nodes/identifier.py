@@ -65,6 +65,10 @@ class IdentifierNode(ServedNode):
             RelayExperiment, "relay_experiment", self._on_experiment, quality.latched(10)
         )
         self.add_on_set_parameters_callback(self._on_set)
+        self.get_logger().info(
+            f"ready: waiting for {self.resolve_topic_name('relay_experiment')}; model and gains "
+            f"go to {self._models.topic_name} and {self._gains.topic_name}"
+        )
 
     def _on_cycle(self, message: Any) -> None:
         if message.experiment_id == self._ended:

@@ -88,6 +88,11 @@ class RelayNode(ServedNode):
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
         self.add_on_set_parameters_callback(self._on_set)
+        self._name = self.get_fully_qualified_name()
+        self.get_logger().info(
+            f"ready: {self._ends.measurement.topic_name} in, {self._ends.command.topic_name} out; "
+            f"start a tune with the service {self._name}/start_tune"
+        )
 
     # The hot path.
 
@@ -153,7 +158,7 @@ class RelayNode(ServedNode):
     def _ready(self, amplitude: float) -> tuple[ExperimentParameters, float]:
         if self._session is not None:
             raise NotReadyError(
-                f"tune {self._session.id} is running; wait for its end or call ~/abort"
+                f"tune {self._session.id} is running; wait for its end or call {self._name}/abort"
             )
         values = values_of(self, EXPERIMENT_PARAMETERS)
         if amplitude != 0.0:
@@ -256,7 +261,7 @@ class RelayNode(ServedNode):
             if self._session is not None and any(c.name in names for c in changes):
                 raise ParameterError(
                     f"parameters stay as they are while tune {self._session.id} runs; "
-                    f"wait for its end or call ~/abort"
+                    f"wait for its end or call {self._name}/abort"
                 )
             values = merged(self, TUNE_PARAMETERS, changes)
             experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}

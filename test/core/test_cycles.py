@@ -16,7 +16,6 @@ from relay_autotune.cycles import (
     cycle_from_samples,
     cycles_of,
     find_cycles,
-    first_harmonic,
     infer_settings,
     limit_cycle,
 )
@@ -195,17 +194,6 @@ def test_disturbed_cycles_are_left_out_if_others_remain():
 def test_no_cycle_is_an_error_with_a_sentence():
     with pytest.raises(RecordError, match="no whole cycle"):
         limit_cycle([])
-    with pytest.raises(RecordError, match="no whole cycle"):
-        first_harmonic(square([0.0, 1.0], 10))
-
-
-def test_the_first_harmonic_is_the_frequency_response():
-    gain, tau, dead_time = -2.0, 1.0, 0.7
-    record = tuned(gain=gain, ratio=dead_time, period=0.002)
-    frequency, response = first_harmonic(record)
-    s = 1j * frequency
-    assert response == pytest.approx(gain * np.exp(-dead_time * s) / (1 + tau * s), rel=2e-4)
-    assert frequency == pytest.approx(2 * math.pi / limit_cycle(record).period)
 
 
 def test_the_static_gain_is_the_quotient_of_the_means():
