@@ -19,6 +19,9 @@ QUICK = {
     "lockstep": ("--quick",),
     "latency": ("--quick",),
     "chang_studies": ("--quick",),
+    "structure_choice": ("--quick",),
+    "coverage": ("--quick",),
+    "ah_batch": ("--quick",),
 }
 
 
