@@ -16,6 +16,7 @@ from relay_autotune.record import Record, RelaySettings
 FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
+_LEAST_SAMPLES = 4
 
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 
@@ -75,7 +76,7 @@ def relay_test(method: str, record: Record) -> RelayTest:
 
     :param method: on whose behalf, for the message.
     :param record: the record.
-    :raises IdentificationError: if it holds no whole cycle.
+    :raises IdentificationError: if it holds no whole cycle, too few samples in one, or no motion.
     """
     settings = record.settings or infer_settings(record)
     bounds = record.cycle_start or find_cycles(record)
@@ -86,6 +87,17 @@ def relay_test(method: str, record: Record) -> RelayTest:
         )
     cycles = cycles_of(record)
     average = limit_cycle(record)
+    samples = (bounds[average.cycles[-1] + 1] - bounds[average.cycles[0]]) / len(average.cycles)
+    if samples < _LEAST_SAMPLES or not average.period > 0.0:
+        raise IdentificationError(
+            f"a cycle of {average.period:g} s holds {samples:.3g} samples; {method} needs at "
+            f"least {_LEAST_SAMPLES}: sample faster, or use a relay with more hysteresis"
+        )
+    if not average.peak_max > average.peak_min:
+        raise IdentificationError(
+            "the measurement is constant while the relay switches: check the sensor, the "
+            "actuator and that both topics belong to one loop"
+        )
 
     def stretch(first: int, last: int, cycle: LimitCycle) -> Stretch:
         part = replace(record, settings=settings, cycle_start=bounds[first : last + 2])

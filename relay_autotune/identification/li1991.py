@@ -95,12 +95,17 @@ def fit_jointly(
     """
     require_difference(tests)
     errors = errors or (CHART_ERRORS,) * len(tests)
-    longest = min(0.5 * t.period - t.dead_time for t in tests)
+    longest = 0.999 * min(0.5 * t.period - t.dead_time for t in tests)
     fitted = math.isnan(dead_time)
-    if not longest > (0.0 if fitted else dead_time):
+    if not longest > 0.0:
         raise IdentificationError(
-            f"a dead time of {dead_time:g} s beside the one added is more than half a period: it "
-            f"must be below {longest:g} s"
+            "the dead time added is more than half the period of its test, in which a switch "
+            "must take effect: the numbers are wrong"
+        )
+    if dead_time >= longest:
+        raise IdentificationError(
+            f"a dead time of {dead_time:g} s, beside the one added, leaves less than half a "
+            f"period for a switch to take effect: it must be below {longest:g} s"
         )
     residuals = _exact_residuals if exact else _point_residuals
 

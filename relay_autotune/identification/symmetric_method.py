@@ -232,11 +232,14 @@ def _choice(
         """Allow for the scatter of the cycles, and half a sample interval of dead time."""
 
         def value(stretch: Stretch) -> FloatArray:
-            return np.array([method.mismatch(order, read(stretch), gain)])
+            found = method.mismatch(order, read(stretch), gain)
+            if not math.isfinite(found):
+                raise IdentificationError("this cycle alone has no time constant")
+            return np.array([found])
 
         allowed = method.agreement
         covariance, quantile = test.scatter(value)
-        if covariance is not None and np.isfinite(covariance[0, 0]):
+        if covariance is not None:
             allowed = max(allowed, quantile * math.sqrt(covariance[0, 0]))
         for shift in (-0.5, 0.5):
             moved = replace(cycle, dead_time=max(cycle.dead_time + shift * interval, 0.0))

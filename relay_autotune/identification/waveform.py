@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.checks import disagreeing_point, unequal_gains
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.lags import FOPDT
 from relay_autotune.identification.residuals import covariance_meat, ljung_box
@@ -195,6 +196,12 @@ def _report(
         warnings=_warnings(record, fit, coloured, scale, problem),
         fitted=fitted,
     )
+    gain_std = found.ultimate_gain_std / abs(found.ultimate_gain)
+    notes = (
+        unequal_gains(record, found.model),
+        disagreeing_point(record, found.model, gain_std),
+    )
+    found = replace(found, warnings=(*found.warnings, *(n for n in notes if n)))
     rivals = _rivals(candidates, problem, scale)
     stable = [r for r in rivals if r.model.is_stable and r.support > _OPEN]
     if found.model.integrators and stable:

@@ -1,0 +1,105 @@
+"""Checks that tell a linear model from a process that is none, on the data it was fitted to."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.cycles import cycles_of
+from relay_autotune.errors import IdentificationError, RecordError
+from relay_autotune.identification.fourier import frequency_point
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant, Record
+from relay_autotune.response import response
+
+FloatArray = NDArray[np.float64]
+
+_SURE = 4.5
+_LEAST_ASYMMETRY = 0.05
+_LEAST_DISAGREEMENT = 0.03
+_LEAST_CYCLES = 3
+# With fewer samples in a cycle, straight lines between them miss more than a percent.
+_LEAST_SAMPLES = 24
+
+
+def unequal_gains(record: Record, model: TransferFunction) -> str | None:
+    """Say whether the process answers commands above and below the baseline differently.
+
+    The response to the part of the command above the baseline and to the part below it get a
+    gain each, in the least-squares sense, beside an offset and a drift; a heater that heats faster
+    than the room cools has two that differ.
+
+    :param record: the record, with the relay's settings.
+    :param model: the model fitted to it, with a stable or integrating process.
+    :return: a sentence, or None where the two agree.
+    """
+    settings = record.settings
+    if settings is None or any(t.real < 0.0 for t in model.time_constants):
+        return None
+    u = record.input()
+    parts = []
+    for keep in (np.maximum, np.minimum):
+        values = keep(u.values - settings.baseline, 0.0)
+        initial = float(keep(u.initial - settings.baseline, 0.0))
+        if not bool(np.any(values)):
+            return None
+        parts.append(response(model, record.time, PiecewiseConstant(u.times, values, initial)))
+    line = record.time - record.time.mean()
+    columns = np.stack((*parts, np.ones(len(record)), line))
+    size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
+    scaled = columns / np.where(size > 0.0, size, 1.0)[:, None]
+    factors, *_ = np.linalg.lstsq(scaled.T, record.measurement, rcond=None)
+    residual = record.measurement - factors @ scaled
+    above, below = factors[:2] / size[:2]
+    covariance = np.linalg.pinv(scaled @ scaled.T) * float(residual @ residual) / len(record)
+    weights = np.array((1.0 / size[0], -1.0 / size[1], 0.0, 0.0))
+    uncertainty = math.sqrt(max(float(weights @ covariance @ weights), 0.0))
+    difference = abs(above - below)
+    if difference <= max(_SURE * uncertainty, _LEAST_ASYMMETRY):
+        return None
+    return (
+        f"commands above the baseline act {above:.2f} times as strongly as in the model, those "
+        f"below it {below:.2f} times: the process is not linear, and one set of gains is a "
+        "compromise; the weaker direction sets how fast the loop can be"
+    )
+
+
+def disagreeing_point(record: Record, model: TransferFunction, gain_std: float) -> str | None:
+    """Say whether the model misses the frequency response that Fourier integrals give.
+
+    The point at the fundamental (Wang et al. 1997, eq 23) needs no structure; its scatter from
+    cycle to cycle is its uncertainty.
+
+    :param record: the record, with whole cycles.
+    :param model: the model fitted to it.
+    :param gain_std: relative standard deviation of the model's K_u, which lies near the point.
+    :return: a sentence, or None where the two agree, or the record has no settled limit cycle of
+        enough samples.
+    """
+    bounds = record.cycle_start
+    if len(bounds) <= _LEAST_CYCLES or not math.isfinite(gain_std):
+        return None
+    last = bounds[-_LEAST_CYCLES - 1 :]
+    if min(np.diff(last)) < _LEAST_SAMPLES or not cycles_of(record)[-1].converged:
+        return None
+    try:
+        whole = frequency_point(replace(record, cycle_start=last))
+        singles = [
+            frequency_point(replace(record, cycle_start=pair)) for pair in itertools.pairwise(last)
+        ]
+    except (IdentificationError, RecordError):
+        return None
+    ratios = np.array([s.value / complex(model(1j * s.frequency)) for s in singles])
+    scatter = float(np.std(ratios, ddof=1)) / math.sqrt(len(singles))
+    miss = abs(whole.value / complex(model(1j * whole.frequency)) - 1.0)
+    if miss <= max(_SURE * math.hypot(scatter, gain_std), _LEAST_DISAGREEMENT):
+        return None
+    return (
+        f"the Fourier integrals of the last cycles give a frequency response that is "
+        f"{100.0 * miss:.2g} % off the model's at {whole.frequency:.4g} rad/s: K_u is less "
+        "certain than its interval says"
+    )
