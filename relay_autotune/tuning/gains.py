@@ -55,6 +55,9 @@ class Controller:
 
     def transfer_function(self) -> TransferFunction:
         """Return the controller from measurement to command, without its sign."""
+        if self.ti > 0.0 and self.td == self.tf == 0.0:
+            # The form that is asked for a hundred times, once for each model of an ensemble.
+            return TransferFunction(self.kc / self.ti, (self.ti,), (), 1)
         bottom = [0.5 * self.tf**2, self.tf, 1.0]
         if self.ti > 0.0:
             top = [self.kc * self.td * self.ti, self.kc * self.ti, self.kc]
