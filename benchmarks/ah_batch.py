@@ -12,19 +12,22 @@ from dataclasses import dataclass
 
 from ah_processes import FAMILIES
 from markdown import table
-from processes import noise_std, true_point
+from processes import true_point
 
 # isort: split
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import Identification, identify
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
+from relay_autotune.record import Record
 from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.simulation import Plant, simulate_relay
+from relay_autotune.simulation import Plant
+
+FloatArray = NDArray[np.float64]
 
 RATIO = 0.05
 PER_PERIOD = 100
@@ -56,30 +59,38 @@ class Outcome:
         return all(abs(e) <= limit for e, limit in zip(self.errors, limits, strict=True))
 
 
-def experiment(model: TransferFunction, ratio: float, seed: int) -> Record:
+def experiment(model: TransferFunction, noise: FloatArray) -> Record:
     """Return the record of a sampled relay that sees the noise.
 
     :param model: the process, at rest before the first sample.
-    :param ratio: noise-to-signal ratio in the limit cycle of an ideal relay without hysteresis.
-    :param seed: of the noise.
+    :param noise: what is added to each sample [y], shape (n,); the relay stops by itself before.
     """
-    parameters = ExperimentParameters(amplitude=AMPLITUDE)
-    relay = RelaySettings(0.0, 0.0, AMPLITUDE, parameters.relay_bias)
     period = 2.0 * math.pi / true_point(model).frequency / PER_PERIOD
-    time = period * np.arange(5 * PER_PERIOD)
-    std = noise_std(simulate_relay(model, relay, cycles=6, time=time), ratio)
-    noise = std * np.random.default_rng(seed).standard_normal(MOST_SAMPLES)
-    loop, plant, command = RelayExperiment(parameters, 0.0), Plant(model), 0.0
-    for k in range(MOST_SAMPLES):
-        command = loop.step(k * period, plant.advance(k * period, command) + noise[k])
+    loop = RelayExperiment(ExperimentParameters(amplitude=AMPLITUDE), 0.0)
+    plant, command = Plant(model), 0.0
+    for k, added in enumerate(noise):
+        command = loop.step(k * period, plant.advance(k * period, command) + added)
         if loop.finished:
             break
     return loop.record()
 
 
+def noisy(model: TransferFunction, ratio: float, seed: int) -> Record:
+    """Return an experiment with a noise-to-signal ratio.
+
+    :param model: the process.
+    :param ratio: mean|noise|/mean|signal|, of the same experiment without noise, in its cycles.
+    :param seed: of the noise.
+    """
+    clean = experiment(model, np.zeros(MOST_SAMPLES))
+    signal = np.abs(clean.measurement[clean.cycle_start[0] :])
+    std = ratio * float(np.mean(signal)) * math.sqrt(math.pi / 2.0)
+    return experiment(model, std * np.random.default_rng(seed).standard_normal(MOST_SAMPLES))
+
+
 def outcome(title: str, model: TransferFunction, ratio: float, seed: int) -> Outcome:
     """Run one process and identify it."""
-    record = experiment(model, ratio, seed)
+    record = noisy(model, ratio, seed)
     size = f"{len(record)} samples, {max(len(record.cycle_start) - 1, 0)} cycles"
     truth = true_point(model)
     try:
@@ -127,6 +138,7 @@ def main() -> int:
     results: dict[str, list[Outcome]] = {}
     for family, processes in list(FAMILIES.items())[: 1 if options.quick else None]:
         some = processes[5:7] if options.quick else processes
+        print(family, file=sys.stderr, flush=True)
         results[family] = [outcome(*p, options.ratio, options.seed) for p in some]
     everything = [o for outcomes in results.values() for o in outcomes]
     rows = [shares(family, outcomes) for family, outcomes in results.items()]

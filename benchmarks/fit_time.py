@@ -18,13 +18,19 @@ from relay_autotune.identification import Known, identify
 from relay_autotune.record import Record
 from relay_autotune.simulation import simulate_relay
 
-TARGET = 0.060
+# Of structure and number of samples [ms].
+TARGETS = {
+    ("FOPDT", 1_000): 60,
+    ("FOPDT", 1_000_000): 10_000,
+    ("any", 1_000): 500,
+    ("any", 1_000_000): 20_000,
+}
 RATIOS = (0.0, 0.1)
 STRUCTURES = {"FOPDT": Known(structure="fopdt"), "any": Known()}
 # Turns of each number of samples.
 TURNS = {
     "FOPDT": {1_000: 41, 10_000: 15, 100_000: 7, 1_000_000: 3},
-    "any": {1_000: 7, 10_000: 5, 100_000: 3},
+    "any": {1_000: 7, 10_000: 5, 100_000: 3, 1_000_000: 3},
 }
 QUICK = {"FOPDT": {1_000: 3, 10_000: 1}}
 
@@ -58,7 +64,7 @@ def rows(structure: str, samples: int, turns: int) -> tuple[list[tuple[object, .
     records = {ratio: record(samples, ratio) for ratio in RATIOS}
     works = {f"{r:g}": partial(identify, records[r], "waveform", known) for r in RATIOS}
     timings = take_turns(works, turns)
-    target = f"<= {1e3 * TARGET:g}" if (structure, samples) == ("FOPDT", 1_000) else ""
+    target = TARGETS.get((structure, samples))
     found: list[tuple[object, ...]] = []
     for ratio in RATIOS:
         timing = timings[f"{ratio:g}"]
@@ -69,7 +75,7 @@ def rows(structure: str, samples: int, turns: int) -> tuple[list[tuple[object, .
                 f"{ratio:g}",
                 turns,
                 three(1e3 * timing.seconds),
-                target,
+                "" if target is None else f"<= {target:,}",
                 three(timing.multiple),
                 three(1e6 * timing.seconds / samples),
                 three(peak_memory(records[ratio], known)),
