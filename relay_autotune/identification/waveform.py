@@ -54,6 +54,8 @@ _WHITE = 1e-3
 _LEAST_SAMPLES = 12
 _MOST_FOR_CHOICE = 16_384
 _WORTH_TELLING = 1e-3
+_OUTLIER = 6.0
+_MOST_OUTLIERS = 0.02
 _OPEN = 0.01
 
 
@@ -75,17 +77,52 @@ def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
     # In units of its own range, so that no unit of measurement is too large or too small.
     scale = max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6)
     problem = Problem(time, (y - y[0]) / scale, u, FOPDT)
-    # What is decided on some thousand samples would not be decided otherwise on a million.
-    few = problem.part(slice(None, None, 1 + time.size // _MOST_FOR_CHOICE))
     sign = 0 if record.settings is None else -1 if record.settings.reverse_acting else 1
+    fitted, state, candidates = _fit(problem, known, sign)
+    outlying = _outliers(fitted, state, problem.time.size)
+    if np.any(outlying):
+        # They would pull both the choice and the fit.
+        fitted, state, candidates = _fit(problem.part(~outlying), known, sign)
+    _require_response(fitted, state)
+    found = _report(record, fitted, state, scale, candidates)
+    if not np.any(outlying):
+        return found
+    told = (
+        f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
+        "off every model and were left out: check the sensor for spikes"
+    )
+    return replace(found, warnings=(*found.warnings, told))
+
+
+def _fit(problem: Problem, known: Known, sign: int) -> tuple[Problem, State, list[Candidate]]:
+    # What is decided on some thousand samples would not be decided otherwise on a million.
+    few = problem.part(slice(None, None, 1 + problem.time.size // _MOST_FOR_CHOICE))
     chosen, candidates = _choose(few, known, sign)
-    state = refine(replace(chosen.problem, time=time, y=problem.y), chosen.state.theta)
-    problem = replace(chosen.problem, time=time, y=problem.y)
+    problem = replace(chosen.problem, time=problem.time, y=problem.y)
+    state = refine(problem, chosen.state.theta)
     if problem.relaxation:
         problem = after_the_unknown(problem, state)
         state = refine(problem, state.theta)
-    _require_response(problem, state)
-    return _report(record, problem, state, scale, candidates)
+    return problem, state, candidates
+
+
+def _outliers(problem: Problem, state: State, samples: int) -> NDArray[np.bool_]:
+    """Return which samples no noise of the residual's own width explains, shape (samples,).
+
+    :param problem: what was fitted: the last ones of the samples.
+    :param state: the fit.
+    :param samples: how many there were.
+    """
+    found = np.zeros(samples, dtype=bool)
+    error = np.abs(state.residual - np.median(state.residual))
+    # For normal noise the standard deviation is 1.4826 times the median of the absolute error.
+    width = 1.4826 * float(np.median(error))
+    far = error > max(_OUTLIER * width, _NEGLIGIBLE)
+    # Many of them, or several in a row, are no spikes but something that the model lacks.
+    alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
+    if width > _NEGLIGIBLE and np.sum(far) == np.sum(alone) <= _MOST_OUTLIERS * samples:
+        found[samples - problem.time.size :] = far
+    return found
 
 
 def _choose(problem: Problem, known: Known, sign: int) -> tuple[Candidate, list[Candidate]]:
@@ -175,9 +212,9 @@ def _report(
     # From linear coefficients and theta to the parameters of the field, to first order.
     gradient = _gradient(problem, state, scale)
     spread = scale * math.sqrt(float(np.mean((problem.y - problem.y.mean()) ** 2)))
-    # The samples of the fit are the last ones of the record.
     fitted = np.full(len(record), math.nan)
-    fitted[-n:] = record.measurement[-n:] - scale * state.residual
+    used = np.searchsorted(record.time, problem.time)
+    fitted[used] = record.measurement[used] - scale * state.residual
     fit = FitReport(
         residual_rms=rms,
         noise_std=record.noise_std,

@@ -266,3 +266,23 @@ def test_the_long_run_variance_of_coloured_noise():
     x = lfilter([1.0], [1.0, -0.7], e)
     meat = covariance_meat(x[None, :], x)[0, 0] / x.size
     assert meat == pytest.approx(1.0 / 0.3**2, rel=0.25)
+
+
+def test_spikes_of_the_sensor_are_left_out_and_told():
+    process = (1.65, 20.0, 10.0)
+    record = _noisy(_run(*process), 0.05, 0)
+    rng = np.random.default_rng(8)
+    spoiled = record.measurement.copy()
+    spoiled[rng.choice(np.arange(10, 990, 7), 9, replace=False)] += 5.0
+    clean, found = (
+        identify_waveform(r, FOPDT) for r in (record, replace(record, measurement=spoiled))
+    )
+    assert any("9 of the samples" in w for w in found.warnings)
+    assert found.ultimate_gain == pytest.approx(clean.ultimate_gain, rel=1e-3)
+    assert int(np.sum(np.isnan(found.fitted))) == 9
+
+
+def test_clean_records_have_no_outliers():
+    for seed in range(20):
+        found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)
+        assert not any("left out" in w for w in found.warnings)
