@@ -10,7 +10,7 @@ SOURCES = setup.py relay_autotune test tools $(wildcard bags benchmarks)
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 
-.PHONY: setup demo test test-oldest lint clean
+.PHONY: setup demo test test-core test-oldest lint clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
@@ -19,8 +19,12 @@ demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
 test: setup
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint test-oldest
-	@$(ENTER) && python3 -m pytest
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-core test-oldest
+	@$(ENTER) && python3 -m pytest --ignore=test/core
+
+# the numeric core, while the other processor does the same with the oldest libraries
+test-core: lint
+	@$(ENTER) && python3 -m pytest -q test/core
 
 # the numeric core with the oldest numeric libraries, without ROS
 test-oldest:
