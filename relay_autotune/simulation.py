@@ -262,6 +262,11 @@ def simulate_relay(
             measured[inside] = segment.output(samples[inside] - now)
             z, now = modes.move(z, step), now + step
         if switching:
+            if now <= switches[-1][0]:
+                raise ModelError(
+                    f"the relay switches twice at t = {now:g} s: without dead time and hysteresis "
+                    "it needs a kick to leave the set-point"
+                )
             half.end = now
             halves.append(half)
             is_high = not is_high

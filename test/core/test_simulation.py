@@ -145,6 +145,14 @@ def test_no_limit_cycle_is_said():
         )
 
 
+def test_without_dead_time_and_hysteresis_a_kick_is_needed():
+    model = TransferFunction.lag_n(1.0, 1.0, 3, 0.0)
+    with pytest.raises(ModelError, match="kick"):
+        simulate_relay(model, IDEAL, cycles=1)
+    run = simulate_relay(model, IDEAL, cycles=40, kick=0.01)
+    assert run.cycles[-1].period == pytest.approx(run.cycles[-2].period, rel=1e-9)
+
+
 def test_a_sampled_relay_tends_to_the_ideal_one():
     model = TransferFunction.fopdt(1.0, 2.0, 1.0)
     relay = RelaySettings(0.0, 0.0, 1.0, 0.3, 0.1)
