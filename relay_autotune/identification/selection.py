@@ -63,7 +63,7 @@ class Selection:
 
     def __init__(self, problem: Problem, floor: float, sign: int = 0) -> None:
         self._problem, self._floor, self._sign = problem, floor, sign
-        self._fopdt = refine_best(problem, start_fopdt(problem))
+        self._fopdt = refine_best(problem, start_fopdt(problem, sign))
         self._starts = Starts(problem, self._fopdt)
 
     def candidate(self, problem: Problem, state: State) -> Candidate | None:

@@ -61,16 +61,17 @@ def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float 
     return refine(problem, theta, tolerance=tolerance or _EXACT)
 
 
-def start_fopdt(problem: Problem) -> list[FloatArray]:
+def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     """Return the best few of a grid of (log tau, D) for a FOPDT.
 
     :param problem: with a FOPDT structure.
+    :param sign: of the gain, 1 or -1; 0: not known.
     """
     shortest, longest = time_scales(problem.time, problem.u)
     few = coarse(problem)
     taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
     dead_times = longest * np.array(_SHARES)
-    costs = np.array([_costs(few, tau, dead_times) for tau in taus])
+    costs = np.array([_costs(few, tau, dead_times, sign) for tau in taus])
     best: list[FloatArray] = []
     for flat in np.argsort(costs, axis=None, kind="stable"):
         i, j = np.unravel_index(flat, costs.shape)
@@ -86,8 +87,12 @@ def _apart(a: FloatArray, b: FloatArray) -> bool:
     return abs(a[0] - b[0]) > 0.5 or abs(math.log(a[1] / b[1])) > 0.5
 
 
-def _costs(problem: Problem, tau: float, dead_times: FloatArray) -> FloatArray:
-    """Return the sums of squares that a lag and an offset leave, for each dead time."""
+def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> FloatArray:
+    """Return the sums of squares that a lag and an offset leave, for each dead time.
+
+    A limit cycle looks much the same half a period later with the other sign; a lag with the
+    wrong one explains nothing here.
+    """
     # A dead time only moves the response, so that one pass over moved samples gives all of them.
     moved = (problem.time - dead_times[:, None]).ravel()
     order = np.argsort(moved, kind="stable")
@@ -99,7 +104,8 @@ def _costs(problem: Problem, tau: float, dead_times: FloatArray) -> FloatArray:
     y = problem.y - problem.y.mean()
     power = np.einsum("dn,dn->d", table, table)
     power[power == 0.0] = 1.0
-    return np.asarray(float(y @ y) - (table @ y) ** 2 / power)
+    along = table @ y
+    return np.asarray(float(y @ y) - np.where(sign * along < 0.0, 0.0, along**2 / power))
 
 
 class Starts:
