@@ -123,12 +123,24 @@ class Selection:
         simple = [c for name in ("fopdt", "sopdt") if (c := self.fit(name)) is not None]
         if not simple:
             return []
-        base = self.with_nuisances(min(simple, key=lambda c: c.criterion))
-        problem = replace(
-            self._problem, drift=base.problem.drift, relaxation=base.problem.relaxation
-        )
+        whole = self._problem
+        base = self.with_nuisances(min(simple, key=lambda c: c.criterion)).problem
+        found = self._fit_beside(base, names)
+        if found and (base.drift or base.relaxation):
+            # What these two leave unexplained may pass for a drift: the best one is asked again.
+            best = found[0]
+            self._problem = whole
+            plain = self._best(best.structure, [best.state.theta])
+            again = base if plain is None else self.with_nuisances(plain).problem
+            if (again.drift, again.relaxation) != (base.drift, base.relaxation):
+                return self._fit_beside(again, names) or found
+        return found
+
+    def _fit_beside(self, nuisances: Problem, names: tuple[str, ...]) -> list[Candidate]:
+        """Fit structures to all samples with the drift and initial state of a problem."""
+        problem = replace(nuisances, structure=FOPDT)
         # A FOPDT has the longest dead time of all, since it counts every small lag to it.
-        first = refine(replace(problem, structure=FOPDT), self._fopdt.theta, tolerance=_TRIAL)
+        first = refine(problem, self._fopdt.theta, tolerance=_TRIAL)
         self._problem = after_the_unknown(problem, first)
         found = [c for name in names for c in self._family(name, 0) if c is not None]
         found.sort(key=lambda c: c.criterion)

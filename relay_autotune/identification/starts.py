@@ -157,9 +157,15 @@ class Starts:
         ]
 
     def third(self) -> list[FloatArray]:
-        """Return starts of a second order with one more lag."""
+        """Return starts of a second order with one more lag, near each other or slow."""
         tau, dead_time = self.lag_n(3)
-        return [np.array((tau, damping, tau, dead_time)) for damping in (0.3, -0.05, -1.0)]
+        slow = math.log(self.tau)
+        fast = math.log(max(0.3 * self.dead_time, self._least))
+        rest = max(0.5 * self.dead_time, self._least)
+        return [
+            *(np.array((tau, damping, tau, dead_time)) for damping in (0.3, -0.05, -1.0)),
+            np.array((fast, -0.4, slow, rest)),
+        ]
 
     def two_equal_one(self) -> list[FloatArray]:
         """Return starts of two equal lags and another: near each other, and either one small."""
