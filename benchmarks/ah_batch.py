@@ -75,7 +75,7 @@ def experiment(model: TransferFunction, noise: FloatArray) -> Record:
     return loop.record()
 
 
-def noisy(model: TransferFunction, ratio: float, seed: int) -> Record:
+def noisy(model: TransferFunction, ratio: float, seed: tuple[int, ...]) -> Record:
     """Return an experiment with a noise-to-signal ratio.
 
     :param model: the process.
@@ -88,7 +88,7 @@ def noisy(model: TransferFunction, ratio: float, seed: int) -> Record:
     return experiment(model, std * np.random.default_rng(seed).standard_normal(MOST_SAMPLES))
 
 
-def outcome(title: str, model: TransferFunction, ratio: float, seed: int) -> Outcome:
+def outcome(title: str, model: TransferFunction, ratio: float, seed: tuple[int, ...]) -> Outcome:
     """Run one process and identify it."""
     record = noisy(model, ratio, seed)
     size = f"{len(record)} samples, {max(len(record.cycle_start) - 1, 0)} cycles"
@@ -139,7 +139,11 @@ def main() -> int:
     for family, processes in list(FAMILIES.items())[: 1 if options.quick else None]:
         some = processes[5:7] if options.quick else processes
         print(family, file=sys.stderr, flush=True)
-        results[family] = [outcome(*p, options.ratio, options.seed) for p in some]
+        # No two processes share their noise.
+        results[family] = [
+            outcome(*p, options.ratio, (options.seed, *family.encode(), *p[0].encode()))
+            for p in some
+        ]
     everything = [o for outcomes in results.values() for o in outcomes]
     rows = [shares(family, outcomes) for family, outcomes in results.items()]
     rows.append(shares("all", everything))
