@@ -1,0 +1,54 @@
+"""The structure chosen from what the relay experiment records, its settling and kick with it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from relay_autotune.identification.waveform import identify_waveform
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Record
+from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.simulation import Plant
+from relay_autotune.ultimate import UltimatePoint, ultimate_point
+
+
+def _point(model: TransferFunction) -> UltimatePoint:
+    point = ultimate_point(model)
+    assert point is not None
+    return point
+
+
+def _record(model: TransferFunction, noise_std: float, seed: int) -> Record:
+    period = 2.0 * math.pi / _point(model).frequency / 100.0
+    rng = np.random.default_rng(seed)
+    experiment = RelayExperiment(ExperimentParameters(amplitude=1.0), 0.0)
+    plant, command = Plant(model), 0.0
+    for k in range(10_000):
+        y = plant.advance(k * period, command) + noise_std * rng.standard_normal()
+        command = experiment.step(k * period, y)
+        if experiment.finished:
+            break
+    return experiment.record()
+
+
+def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
+    model = TransferFunction.sopdt(2.0, (2.0, 0.99), 0.01)
+    record = _record(model, 5e-4, 0)
+    swing = np.diff(record.input().times)
+    assert swing.max() > 3.0 * np.median(swing)
+    found = identify_waveform(record)
+    assert found.structure == "sopdt"
+    assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=0.04)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pair_faster_than_its_lag_is_no_drift(seed):
+    model = TransferFunction.lag_complex(1.0, 1.0, 10.0, 0.7, 0.0)
+    found = identify_waveform(_record(model, 0.005, seed))
+    assert found.structure == "lag_complex"
+    assert found.model.gain == pytest.approx(1.0, rel=0.03)
+    assert found.ultimate_frequency == pytest.approx(_point(model).frequency, rel=0.01)
+    assert not any("drift" in w for w in found.warnings)
