@@ -109,6 +109,10 @@ class RelayRun:
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    ends = function(low), function(high)
+    if ends[0] * ends[1] >= 0.0:
+        # The change of sign that was seen over many points at once was rounding.
+        return low if abs(ends[0]) <= abs(ends[1]) else high
     # Relative to the cell, since a root may lie at its very beginning, which may be zero.
     return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15, maxiter=1000))
 

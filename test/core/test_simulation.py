@@ -173,3 +173,11 @@ def test_a_relay_blind_to_the_noise_switches_as_without_it():
     np.testing.assert_array_equal(blind.command, quiet.command)
     np.testing.assert_allclose(blind.measurement - quiet.measurement, noise, atol=1e-15)
     assert np.any(seeing.command != quiet.command)
+
+
+def test_a_change_of_sign_that_was_rounding_is_no_error():
+    model = TransferFunction.lag_complex(1.0, 1.0, 1.0 / 0.9, 0.7, 0.0)
+    biased = RelaySettings(0.0, 0.0, 1.0, 0.3)
+    with pytest.raises(ModelError, match="kick"):
+        simulate_relay(model, biased, cycles=6)
+    assert len(simulate_relay(model, biased, cycles=6, kick=0.01).cycles) == 6
