@@ -33,6 +33,8 @@ from relay_autotune.identification.symmetric_method import (
 )
 from relay_autotune.record import Record
 
+_LEAST_PHASE = 1e-6
+
 
 def ultimate_estimate(period: float, amplitude: float, relay: float) -> tuple[float, float]:
     """Return (K_u, w_u) by the describing function (eqs 2 and 1).
@@ -62,7 +64,7 @@ def phase_of_lags(
             "that the relay cannot have switched: check the numbers"
         )
     phase = math.pi - math.asin(hysteresis / amplitude) - 2.0 * math.pi * dead_time / period
-    if not phase > 0.0:
+    if not phase > _LEAST_PHASE:
         raise IdentificationError(
             f"a dead time of {dead_time:g} s alone has more phase than the period of {period:g} s "
             "allows: the dead time is misread"

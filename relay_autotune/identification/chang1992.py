@@ -23,7 +23,8 @@ from relay_autotune.identification.square_wave import level, peak, slope_sign
 
 _STEP = 1.1
 _LONGEST = 1e10
-_NEARLY_ONE = 1.0 - 1e-9
+_NEARLY_ONE = 1.0 - 1e-12
+_WITH_LAG = 1.0 - 1e-6
 
 
 def time_constant_from_period(
@@ -248,7 +249,7 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
 
 
 def _require_dead_time(period: float, dead_time: float) -> None:
-    if not 0.0 <= dead_time < 0.5 * period * _NEARLY_ONE:
+    if not 0.0 <= dead_time < 0.5 * period * _WITH_LAG:
         raise IdentificationError(
             f"a dead time of {dead_time:g} s cannot be: a switch takes effect only after it, so "
             f"that it is less than half the period, {0.5 * period:g} s"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
 _LEAST_SAMPLES = 4
+# So many cycles tell their scatter within 10 %.
+_MOST_SINGLES = 60
 
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 
@@ -40,7 +43,7 @@ class RelayTest:
     """A relay test, as the methods see it that need a limit cycle only.
 
     :param whole: the cycles that agree, averaged.
-    :param singles: each of them by itself.
+    :param singles: each of them by itself; where they are very many, some, evenly spread.
     """
 
     whole: Stretch
@@ -68,7 +71,9 @@ class RelayTest:
         # From the first one, so that what is given has no rounding for scatter.
         away = np.array(found) - found[0]
         away = away - np.mean(away, axis=0)
-        return away.T @ away / (count * (count - 1)), quantile
+        # The mean is over all cycles, of which those here may be some.
+        averaged = count * len(self.whole.cycle.cycles) / len(self.singles)
+        return away.T @ away / ((count - 1) * averaged), quantile
 
 
 def relay_test(method: str, record: Record) -> RelayTest:
@@ -86,7 +91,7 @@ def relay_test(method: str, record: Record) -> RelayTest:
             "use the method waveform, which takes any input"
         )
     cycles = cycles_of(record)
-    average = limit_cycle(record)
+    average = limit_cycle(cycles)
     samples = (bounds[average.cycles[-1] + 1] - bounds[average.cycles[0]]) / len(average.cycles)
     if samples < _LEAST_SAMPLES or not average.period > 0.0:
         raise IdentificationError(
@@ -99,11 +104,21 @@ def relay_test(method: str, record: Record) -> RelayTest:
             "actuator and that both topics belong to one loop"
         )
 
+    u = record.input()
+
     def stretch(first: int, last: int, cycle: LimitCycle) -> Stretch:
-        part = replace(record, settings=settings, cycle_start=bounds[first : last + 2])
+        # A copy that shares the columns, which are many and read-only.
+        part = copy.copy(record)
+        for name, value in (
+            ("settings", settings),
+            ("cycle_start", bounds[first : last + 2]),
+            ("held_input", u),
+        ):
+            object.__setattr__(part, name, value)
         return Stretch(part, settings, cycle)
 
+    stride = -(-len(average.cycles) // _MOST_SINGLES)
     return RelayTest(
         stretch(average.cycles[0], average.cycles[-1], average),
-        tuple(stretch(i, i, limit_cycle(cycles[i : i + 1])) for i in average.cycles),
+        tuple(stretch(i, i, limit_cycle(cycles[i : i + 1])) for i in average.cycles[::stride]),
     )

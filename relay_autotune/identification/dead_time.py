@@ -9,92 +9,119 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import Stretch
+from relay_autotune.identification.cycle_scatter import RelayTest, Stretch
+from relay_autotune.identification.fold import Fold, fold
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.symmetric_cycle import half_cycles
 from relay_autotune.kick import ResponseDetector
 from relay_autotune.record import Record, RelaySettings
 from relay_autotune.settling import RestState
 
 FloatArray = NDArray[np.float64]
 
-# Thyagarajan and Yu 2003: time from the peak to 0.9 of it over that to half of it. A FOPDT process
-# has 0.18 to 0.20 at any dead time, smooth peaks 0.37 and more.
-_SHARP = 0.25
-_BINS = 100
+# The rate of one lag jumps by more than its largest value where the command arrives.
+_JUMP = 0.6
+_BESIDE = 0.01
+_MOST_SINGLES = 8
 
 
 @dataclass(frozen=True)
 class DeadTime:
     """Where the dead time of the process comes from.
 
-    :param value: s; NaN: the time from the switch to the peak of each cycle, less ``extra``.
-    :param extra: dead time that the relay added [s].
+    :param value: s.
+    :param std: standard deviation of what was read [s]; 0: it was given.
     :param source: a sentence for the user; empty: it was given.
     """
 
     value: float
-    extra: float
-    source: str
-
-    def of(self, stretch: Stretch) -> float:
-        """Return the dead time of the process by one stretch [s]."""
-        if not math.isnan(self.value):
-            return self.value
-        return max(time_to_peak(stretch) - self.extra, 0.0)
+    std: float = 0.0
+    source: str = ""
 
 
-def time_to_peak(stretch: Stretch) -> float:
-    """Return the mean time from a switch to the peak after it [s]."""
-    return 0.5 * (stretch.cycle.time_to_peak_max + stretch.cycle.time_to_peak_min)
-
-
-def read_dead_time(stretch: Stretch, record: Record, known: Known) -> DeadTime:
+def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool) -> DeadTime:
     """Return the dead time that is known, or read it from the record.
 
-    One lag turns at once when the command arrives, so that the time from a switch to the peak is
-    the dead time; it is taken where the peaks are sharp. Otherwise it is the time from the first
-    kick to the first sample outside the noise.
+    One lag turns at once when the command arrives, so that the measurement has an edge there in
+    each half cycle; where the averaged half cycles have one, it is taken. Otherwise the time
+    from the first kick to the first sample outside the noise is.
 
-    :param stretch: the cycles.
+    :param test: the relay test.
     :param record: the whole record, with the samples before the kick.
     :param known: a known dead time.
+    :param noisy: True if there is noise to speak of.
     :raises IdentificationError: if it is not known and the record does not show it.
     """
-    extra = stretch.settings.extra_delay
     if not math.isnan(known.dead_time):
-        return DeadTime(known.dead_time, extra, "")
-    if _peaks_are_sharp(stretch):
-        value = time_to_peak(stretch) - extra
+        return DeadTime(known.dead_time)
+    settings = test.whole.settings
+    edge, sharp = _edge(test.whole)
+    if sharp:
+        value = max(edge - settings.extra_delay, 0.0)
         source = (
             f"the dead time of {value:.4g} s was read as the time from the switch to the sharp "
             "peak; give it where it is known better, since these equations are sensitive to it"
         )
-        return DeadTime(math.nan, extra, source)
-    first = _first_response(record, stretch.settings)
+        return DeadTime(value, _scatter_of_edge(test, noisy), source)
+    first, interval = _first_response(record, settings)
     if math.isnan(first):
         raise IdentificationError(
             "the dead time is not known, and neither sharp peaks nor a first kick from rest show "
             "it in the record: give the dead time, or use the method waveform"
         )
-    value = max(first - extra, 0.0)
+    value = max(first - settings.extra_delay, 0.0)
     source = (
         f"the dead time of {value:.4g} s was read from the first response to the kick, which a "
         "slow beginning or noise delays; give it where it is known better"
     )
-    return DeadTime(value, extra, source)
+    return DeadTime(value, interval / math.sqrt(12.0), source)
 
 
-def _first_response(record: Record, settings: RelaySettings) -> float:
-    """Return the time from the first kick to the response; NaN: there was no kick from rest."""
+def _edge(stretch: Stretch) -> tuple[float, bool]:
+    """Return the time from a switch to the edge after it, and whether it is that of one lag."""
+    try:
+        curve = fold(stretch.record, tuple(range(len(stretch.record.cycle_start) - 1)))
+    except IdentificationError:
+        return math.nan, False
+    if math.isnan(curve.edge):
+        return math.nan, False
+    return curve.edge, _is_sharp(curve)
+
+
+def _is_sharp(curve: Fold) -> bool:
+    beside = _BESIDE * 0.5 * curve.period
+    before, after = curve.slope(np.array((curve.edge - beside, curve.edge + beside)))
+    # Away from the edges, where a spline in noise has its largest rates.
+    steepest = np.abs(curve.slope(np.linspace(0.0, curve.period, 101)))
+    return bool(abs(after - before) > _JUMP * float(np.percentile(steepest, 90.0)))
+
+
+def _scatter_of_edge(test: RelayTest, noisy: bool) -> float:
+    """Return the standard deviation of the edge [s].
+
+    In noise single cycles tell it; without, it is somewhere between two samples.
+    """
+    if not noisy:
+        interval = float(np.median(np.diff(test.whole.record.time)))
+        return interval / math.sqrt(12.0 * len(test.whole.cycle.cycles))
+    stride = -(-len(test.singles) // _MOST_SINGLES)
+    edges = np.array([_edge(single)[0] for single in test.singles[::stride]])
+    edges = edges[np.isfinite(edges)]
+    if edges.size < 2:
+        return 0.0
+    return float(np.std(edges, ddof=1)) / math.sqrt(len(test.whole.cycle.cycles))
+
+
+def _first_response(record: Record, settings: RelaySettings) -> tuple[float, float]:
+    """Return the time from the first kick to the response, and the interval in which it began.
+
+    NaN: there was no kick from rest.
+    """
     u = record.input()
     resting = abs(u.initial - settings.baseline) < 0.5 * settings.amplitude
     if u.times.size == 0 or not resting or u.times[0] < record.time[0]:
-        return math.nan
+        return math.nan, math.nan
     kick = float(u.times[0])
     before = record.measurement[record.time <= kick]
-    if before.size == 0:
-        return math.nan
     noise = record.noise_std
     if math.isnan(noise):
         noise = float(np.std(before)) if before.size >= 10 else 0.0
@@ -109,30 +136,9 @@ def _first_response(record: Record, settings: RelaySettings) -> float:
         range_seen=float(np.ptp(before)),
     )
     detector = ResponseDetector(rest, kick)
-    for time, y in zip(record.time.tolist(), record.measurement.tolist(), strict=True):
-        if time > kick and detector.add(time, y):
-            return 0.5 * (detector.last_inside + detector.first_outside) - kick
-    return math.nan
-
-
-def _peaks_are_sharp(stretch: Stretch) -> bool:
-    since, y = half_cycles(stretch)
-    if y.size < 4:
-        return False
-    half = 0.5 * stretch.cycle.period
-    bins = min(_BINS, max(y.size // 4, 4))
-    number = np.minimum((since / half * bins).astype(np.int64), bins - 1)
-    count = np.bincount(number, minlength=bins)
-    used = count > 0
-    level = np.bincount(number, y, bins)[used] / count[used]
-    time = np.bincount(number, since, bins)[used] / count[used]
-    top = int(np.argmax(level))
-    falling, after = level[top:] / level[top], time[top:] - time[top]
-    if not falling[-1] < 0.5 or not level[top] > 0.0:
-        return False
-
-    def reached(share: float) -> float:
-        k = int(np.argmax(falling < share))
-        return float(np.interp(-share, -falling[k - 1 : k + 1], after[k - 1 : k + 1]))
-
-    return reached(0.9) < _SHARP * reached(0.5)
+    after = slice(int(np.searchsorted(record.time, kick, side="right")), None)
+    for time, y in zip(record.time[after], record.measurement[after], strict=True):
+        if detector.add(float(time), float(y)):
+            seen = 0.5 * (detector.last_inside + detector.first_outside) - kick
+            return seen, detector.first_outside - detector.last_inside
+    return math.nan, math.nan

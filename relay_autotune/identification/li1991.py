@@ -45,6 +45,8 @@ _DEAD_TIMES = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98)
 _STARTS = 3
 _SPREAD = 3.0
 _PENALTY = 1e3
+_TINY = 1e-30
+_MOST_STEPS = 60
 _LEAST_APART = 1e-3
 
 
@@ -69,7 +71,13 @@ def frequency_point(cycle: SymmetricCycle) -> tuple[float, complex]:
     """Return (w, G(j w)) of the process, by the describing function.
 
     :param cycle: a limit cycle whose ``dead_time`` is what was added to the relay.
+    :raises IdentificationError: if the hysteresis is not below the amplitude.
     """
+    if not cycle.hysteresis < cycle.amplitude:
+        raise IdentificationError(
+            f"an amplitude of {cycle.amplitude:g} is not above the hysteresis of "
+            f"{cycle.hysteresis:g}, so that the relay cannot have switched: check the numbers"
+        )
     size = math.pi * cycle.amplitude / (4.0 * cycle.relay)
     turn = cycle.frequency * cycle.dead_time + math.asin(cycle.hysteresis / cycle.amplitude)
     return cycle.frequency, -size * cmath.exp(1j * turn)
@@ -123,7 +131,9 @@ def fit_jointly(
     ranked = sorted(starts, key=lambda s: float(np.sum(misfit(s) ** 2)))
     best = None
     for start in ranked[:_STARTS]:
-        found = least_squares(misfit, start, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
+        found = least_squares(
+            misfit, start, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=_MOST_STEPS
+        )
         if best is None or found.cost < best.cost:
             best = found
         if best.cost < 1e-20:
@@ -217,14 +227,15 @@ def _exact_residuals(
 
         def excess(period: float, test: SymmetricCycle = test) -> float:
             part = 1.0 - 2.0 * (dead_time + test.dead_time) / period
-            return level(lags, period, part) - test.level / (gain * test.relay)
+            return level(lags, period, max(part, 0.0)) - test.level / (gain * test.relay)
 
         # The level at the switch grows with the period that is given to a model.
         step = 1e-4
         rise = (excess(test.period * (1 + step)) - excess(test.period * (1 - step))) / (2 * step)
         missed = excess(test.period) / max(rise, 1e-9)
         found.append(min(max(missed / period_error, -_PENALTY), _PENALTY))
-        amplitude = gain * test.relay * peak(lags, test.period)
+        # Of lags beyond all proportion nothing is left but rounding.
+        amplitude = max(gain * test.relay * peak(lags, test.period), _TINY * test.amplitude)
         found.append(math.log(amplitude / test.amplitude) / amplitude_error)
     return np.array(found)
 

@@ -64,7 +64,8 @@ def slope_sign(time_constants: Sequence[float], period: float, part: float) -> f
 def peak_part(time_constants: Sequence[float], period: float) -> float:
     """Return when the measurement peaks: the part of a half period after the command arrived.
 
-    A square wave through real lags has one maximum in each period.
+    A square wave through real lags has one maximum in each period and one minimum half a period
+    later, so that there is one of the two. In the limit cycle of a relay it is a minimum.
 
     :param time_constants: as for :func:`level` [s].
     :param period: P [s].
@@ -93,7 +94,7 @@ def peak(time_constants: Sequence[float], period: float, harmonics: int | None =
         part = peak_part(time_constants, period)
         if part == 0.0 and len(time_constants) > 1:
             return 1.0
-        return -level(time_constants, period, part)
+        return abs(level(time_constants, period, part))
     if harmonics == 1:
         return fundamental(time_constants, period)
     # One maximum in each half period, though ripples of the cut sum may lie on it.

@@ -119,9 +119,15 @@ class CycleReader:
 
         :param stretch: the cycles.
         :param dead_time: of the process [s].
+        :raises IdentificationError: if they do not stand out of the noise.
         """
         settings = stretch.settings
         period, amplitude = features(stretch).tolist()
+        if not amplitude > self.excess:
+            raise IdentificationError(
+                f"an amplitude of {amplitude:g} is no more than noise alone gives: raise the "
+                "amplitude of the relay"
+            )
         delay = dead_time + settings.extra_delay
         level = _level_at_switch(stretch, self.noisy)
         return SymmetricCycle(

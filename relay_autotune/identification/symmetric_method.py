@@ -21,7 +21,7 @@ from relay_autotune.identification.cycle_scatter import (
     Stretch,
     relay_test,
 )
-from relay_autotune.identification.dead_time import read_dead_time
+from relay_autotune.identification.dead_time import DeadTime, read_dead_time
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.lag_models import (
     MODEL_1,
@@ -55,6 +55,7 @@ MOST_EQUAL = 20
 _ALIKE = 1.02
 _ALIKE_SHARE = 3e-3
 _SHAPE_SAMPLES = 300
+_SMALL = 0.1
 
 
 @dataclass(frozen=True)
@@ -108,11 +109,11 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
     require_unbiased(method.name, whole.settings)
     sign = -1 if whole.settings.reverse_acting else 1
     gain = known_gain(known, sign)
-    dead_time = read_dead_time(whole, record, known)
     reader = CycleReader.of(whole)
+    dead_time = read_dead_time(test, record, known, noisy=reader.noisy)
 
     def read(stretch: Stretch) -> SymmetricCycle:
-        return reader.read(stretch, dead_time.of(stretch))
+        return reader.read(stretch, dead_time.value)
 
     cycle = read(whole)
     model, remark = _choice(method, test, read, gain, known)
@@ -120,9 +121,15 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
 
     def values(stretch: Stretch) -> FloatArray:
         single = _alike(method.solve(model, read(stretch), gain), solution)
-        return single.values(sign, dead_time.of(stretch))
+        return single.values(sign, dead_time.value)
+
+    def values_at(delay: float) -> FloatArray:
+        moved = replace(cycle, dead_time=delay + whole.settings.extra_delay)
+        return _alike(method.solve(model, moved, gain), solution).values(sign, delay)
 
     covariance, quantile = test.scatter(values)
+    if covariance is not None and dead_time.std > 0.0:
+        covariance = covariance + _covariance_of(values_at, dead_time)
     remarks = [
         dead_time.source,
         remark,
@@ -134,7 +141,7 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
         method.name,
         model.build,
         model.parameters,
-        solution.values(sign, dead_time.of(whole)),
+        solution.values(sign, dead_time.value),
         covariance,
         quantile,
         warnings=tuple(r for r in remarks if r),
@@ -144,6 +151,27 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
         return Found(identification, model, cycle)
     period_std, amplitude_std = (float(s) for s in np.sqrt(np.diag(spread)))
     return Found(identification, model, cycle, period_std, amplitude_std)
+
+
+def _covariance_of(values_at: Callable[[float], FloatArray], dead_time: DeadTime) -> FloatArray:
+    """Return what the uncertainty of a dead time that was read adds to that of the values.
+
+    :param values_at: from a dead time [s] to the values.
+    :param dead_time: as it was read.
+    """
+    ends = []
+    for side in (-1.0, 1.0):
+        delay = max(dead_time.value + side * _SMALL * dead_time.std, 0.0)
+        try:
+            ends.append((delay, values_at(delay)))
+        except IdentificationError:
+            # At the end of where there is a solution one side tells as much.
+            ends.append((dead_time.value, values_at(dead_time.value)))
+    (low, below), (high, above) = ends
+    if not high > low:
+        return np.full((below.size, below.size), math.nan)
+    rate = dead_time.std * (above - below) / (high - low)
+    return np.outer(rate, rate)
 
 
 def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -> Found:
