@@ -245,6 +245,10 @@ def _smallest(order: int, period: float, part: float, excess: Callable[[float], 
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    at_low, at_high = function(low), function(high)
+    if at_low * at_high > 0.0:
+        # At the very end of where there is a solution, rounding may put it outside.
+        return low if abs(at_low) < abs(at_high) else high
     return float(brentq(function, low, high, xtol=1e-300, rtol=1e-15))
 
 

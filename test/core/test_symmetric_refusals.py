@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.errors import IdentificationError
@@ -31,6 +31,7 @@ PROCESS = TransferFunction.fopdt(2.0, 3.0, 1.0)
     gain=st.sampled_from([math.nan, 1.0, -1.0, 1e3]),
     structure=st.sampled_from(["", "fopdt", "sopdt", "two_equal_one", "lag_n 2", "lag_n 9"]),
 )
+@example(amplitude=1.0, dead_time=0.0, share=1.0, gain=1000.0, structure="sopdt")
 def test_any_numbers_give_a_model_or_a_sentence(amplitude, dead_time, share, gain, structure):
     name, _, order = structure.partition(" ")
     cycle = SymmetricCycle(1.0, amplitude, 1.0, share * amplitude, dead_time)
