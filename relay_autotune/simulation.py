@@ -243,7 +243,8 @@ def simulate_relay(
     half = _HalfCycle(0.0, is_high)
     halves: list[_HalfCycle] = []
     segment = _Segment(modes, z, level, corners)
-    while sum(1 for h in halves[1:] if h.level_is_high != direct) < cycles + (not direct):
+    # The half that starts from rest and the one after it lead to the first whole cycle.
+    while sum(1 for h in halves[1:] if h.level_is_high != direct) <= cycles:
         length = on_the_way[0][0] - now if on_the_way else 60.0 * slowest
         rising = is_high == direct
 

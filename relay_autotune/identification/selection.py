@@ -16,7 +16,12 @@ from relay_autotune.identification.separable import (
     information_criterion,
     refine,
 )
-from relay_autotune.identification.starts import Starts, refine_best, start_fopdt
+from relay_autotune.identification.starts import (
+    Starts,
+    refine_best,
+    start_fopdt,
+    time_scales,
+)
 from relay_autotune.identification.structures import RationalStructure, Reading, lag_n, lag_n_zero
 
 FloatArray = NDArray[np.float64]
@@ -25,6 +30,8 @@ MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _INDIFFERENT = 2.0
 _SAMPLES_EACH = 8
+# How many times smaller the mean square must be for the beginning to be left out.
+_MUCH_BETTER = 4.0
 # Drift and initial state belong to a fit only on strong evidence, since they blur the gain.
 _EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
@@ -64,7 +71,25 @@ class Selection:
     def __init__(self, problem: Problem, floor: float, sign: int = 0) -> None:
         self._problem, self._floor, self._sign = problem, floor, sign
         self._fopdt = refine_best(problem, start_fopdt(problem, sign))
-        self._starts = Starts(problem, self._fopdt)
+        self._leave_out_the_unknown()
+        self._starts = Starts(self._problem, self._fopdt)
+
+    def _leave_out_the_unknown(self) -> None:
+        """Begin later where a record that was cut out of a movement explains itself better so."""
+        whole = replace(self._problem, relaxation=True)
+        _, longest = time_scales(whole.time, whole.u)
+        later = whole.part(whole.time >= whole.time[0] + longest)
+        if 2 * later.time.size < whole.time.size or not bool(
+            np.any(later.u.times > later.time[0])
+        ):
+            return
+        first = refine(whole, self._fopdt.theta, tolerance=_TRIAL)
+        least = self._floor / whole.time.size
+        if first.cost <= _MUCH_BETTER * least * whole.time.size:
+            return
+        second = refine_best(later, start_fopdt(later, self._sign), tolerance=_TRIAL)
+        if _MUCH_BETTER * second.cost / later.time.size < first.cost / whole.time.size:
+            self._problem, self._fopdt = later, second
 
     def candidate(self, problem: Problem, state: State) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure."""

@@ -99,11 +99,8 @@ def _fit(problem: Problem, known: Known, sign: int) -> tuple[Problem, State, lis
     few = problem.part(slice(None, None, 1 + problem.time.size // _MOST_FOR_CHOICE))
     chosen, candidates = _choose(few, known, sign)
     problem = replace(chosen.problem, time=problem.time, y=problem.y)
-    state = refine(problem, chosen.state.theta)
-    if problem.relaxation:
-        problem = after_the_unknown(problem, state)
-        state = refine(problem, state.theta)
-    return problem, state, candidates
+    problem = after_the_unknown(problem, chosen.state)
+    return problem, refine(problem, chosen.state.theta), candidates
 
 
 def _outliers(problem: Problem, state: State, samples: int) -> NDArray[np.bool_]:

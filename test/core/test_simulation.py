@@ -113,6 +113,15 @@ def test_samples_equal_the_response_to_the_recorded_command():
     np.testing.assert_allclose(run.measurement, exact, atol=1e-11)
 
 
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("cycles", [1, 2, 5])
+def test_as_many_whole_cycles_are_run_as_asked_for(cycles, reverse):
+    model = TransferFunction.lag_complex(-1.0 if reverse else 1.0, 2.0, 1.0, 0.4, 1.0)
+    relay = RelaySettings(0.0, 0.0, 1.0, 0.1, 0.05, reverse_acting=reverse)
+    run = simulate_relay(model, relay, cycles=cycles)
+    assert [c.index for c in run.cycles] == list(range(cycles))
+
+
 def test_set_point_and_kick_move_the_first_switch():
     model = TransferFunction.fopdt(1.0, 10.0, 1.0)
     off = RelaySettings(0.2, 0.0, 1.0, 0.0, 0.05)

@@ -159,14 +159,15 @@ def test_a_start_away_from_rest_is_estimated():
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-6)
 
 
-def test_a_record_cut_out_of_an_oscillation():
+@pytest.mark.parametrize("start", [600, 700, 800, 900])
+def test_a_record_cut_out_of_an_oscillation(start):
     record = _run(1.65, 20.0, 10.0, 0.3, 2000).record()
-    part = slice(700, 2000)
-    inside = record.held_input.times > record.time[700]
+    part = slice(start, 2000)
+    inside = record.held_input.times > record.time[start]
     u = PiecewiseConstant(
         record.held_input.times[inside],
         record.held_input.values[inside],
-        float(record.command[700]),
+        float(record.command[start]),
     )
     cut = Record(record.time[part], record.measurement[part], record.command[part], held_input=u)
     found = identify_waveform(cut)
