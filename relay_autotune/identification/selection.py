@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification import structures as known_structures
 from relay_autotune.identification.lags import FOPDT
+from relay_autotune.identification.residuals import autocorrelation
 from relay_autotune.identification.separable import (
     Problem,
     State,
@@ -32,6 +33,11 @@ _INDIFFERENT = 2.0
 _SAMPLES_EACH = 8
 # How many times smaller the mean square must be for the beginning to be left out.
 _MUCH_BETTER = 4.0
+# Standard errors from which a correlation of neighbours counts as one.
+_CORRELATED = 4.0
+# Parts of the measurement's range: left by an exact structure, and by one that is good enough.
+_EXACT = 1e-7
+_ENOUGH = 4e-3
 # Drift and initial state belong to a fit only on strong evidence, since they blur the gain.
 _EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
@@ -169,7 +175,30 @@ class Selection:
         self._problem = after_the_unknown(problem, first)
         found = [c for name in names for c in self._family(name, 0) if c is not None]
         found.sort(key=lambda c: c.criterion)
-        return found
+        return self._weighed(found)
+
+    def _weighed(self, found: list[Candidate]) -> list[Candidate]:
+        """Return the candidates by what their samples are worth, the best first.
+
+        Where even the best residual is correlated, by jitter or by what no structure holds, n
+        samples tell no more than ``n (1 - rho)/(1 + rho)`` independent ones.
+        """
+        if not found or found[0].state.cost <= self._floor:
+            return found
+        n = found[0].problem.time.size
+        rho = float(autocorrelation(found[0].state.residual, 1)[0])
+        if rho <= _CORRELATED / math.sqrt(n):
+            return found
+        worth = max((1.0 - rho) / (1.0 + rho), 1.0 / n)
+        weighed = [
+            replace(
+                c,
+                criterion=n * worth * math.log(max(c.state.cost, self._floor) / n)
+                + c.state.parameters * math.log(max(n * worth, 3.0)),
+            )
+            for c in found
+        ]
+        return sorted(weighed, key=lambda c: c.criterion)
 
     def _family(self, name: str, order: int) -> list[Candidate | None]:
         starts = self._starts
@@ -242,8 +271,29 @@ def choose(candidates: list[Candidate]) -> Candidate:
     :param candidates: the best first, at least one.
     """
     best = candidates[0].criterion
+    enough = _good_enough(candidates)
+    if enough is not None:
+        return enough
     rivals = [c for c in candidates if c.criterion <= best + _INDIFFERENT]
     return min(rivals, key=lambda c: (c.state.parameters, c.structure.order, c.criterion))
+
+
+def _good_enough(candidates: list[Candidate]) -> Candidate | None:
+    """Return a FOPDT that leaves so little that jitter or rounding explains the rest as well.
+
+    Below that, what the criterion prefers is made of the errors of the instants, which are
+    not white. Where a structure is exact, nothing is left to such errors.
+    """
+
+    def rms(candidate: Candidate) -> float:
+        return math.sqrt(candidate.state.cost / candidate.problem.time.size)
+
+    fopdt = next((c for c in candidates if c.structure.name == "fopdt"), None)
+    integrator = next((c for c in candidates if c.structure.name == "ipdt"), None)
+    if fopdt is None or rms(candidates[0]) < _EXACT or rms(fopdt) > _ENOUGH:
+        return None
+    slower = integrator is not None and integrator.criterion < fopdt.criterion
+    return None if slower else fopdt
 
 
 def support(candidates: list[Candidate]) -> list[float]:

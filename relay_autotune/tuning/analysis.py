@@ -19,6 +19,7 @@ FloatArray = NDArray[np.float64]
 _POINTS = 4096
 _MOST_POINTS = 1 << 18
 _IAE_TOLERANCE = 2e-4
+_RINGING = 2.5
 
 
 def is_stable(controller: Controller, model: TransferFunction) -> bool:
@@ -128,11 +129,13 @@ def load_response(
     return time[inside], error[inside]
 
 
-def load_iae(controller: Controller, model: TransferFunction) -> float:
+def load_iae(controller: Controller, model: TransferFunction, *, settles: bool = False) -> float:
     """Return the integral of the absolute error after a unit step of the load [y s/u].
 
     :param controller: the gains, of a stable loop, with integral action.
     :param model: the process.
+    :param settles: True: an error that dies away too slowly to be followed does not ring, and its
+        integral is ti/kc, as for any error of one sign.
     :raises TuningError: if the integral does not settle.
     """
     slowest = max((abs(t) for t in model.time_constants), default=0.0)
@@ -145,6 +148,8 @@ def load_iae(controller: Controller, model: TransferFunction) -> float:
         if abs(iae - before) <= _IAE_TOLERANCE * iae:
             return iae
         before, duration, points = iae, 2.0 * duration, 2 * points
+    if settles and controller.ti > 0.0:
+        return max(before, controller.ti / abs(controller.kc))
     raise TuningError("the error after a load step does not die away in any reasonable time")
 
 
@@ -173,5 +178,5 @@ def analyse_loop(controller: Controller, model: TransferFunction) -> Performance
         gain_margin=min(above) if above else math.inf,
         phase_margin=min((abs(m) for m in lag), default=math.pi),
         delay_margin=min(delays, default=math.inf),
-        iae_load=load_iae(controller, model),
+        iae_load=load_iae(controller, model, settles=ms < _RINGING),
     )

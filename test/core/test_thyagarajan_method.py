@@ -122,7 +122,7 @@ def test_a_dead_time_that_the_relay_added_is_not_the_processs():
 
 def test_a_peak_at_a_quarter_of_the_period_tells_gain_over_time_constant_only():
     model = TransferFunction.fopdt(100.0, 100.0, 1.0)
-    found = thyagarajan(record_of(model, 0.3, 0.1))
+    found = thyagarajan(record_of(model, 0.3, 0.1, cycles=5))
     assert found.structure == "ipdt"
     assert found.values == pytest.approx([1.0, 1.0], rel=0.05)
     assert "biased relay would tell" in found.warnings[0]

@@ -178,9 +178,12 @@ def test_real_time(rig: Rig) -> None:
     assert np.all(received >= taken)
     assert np.all(answered >= received)
     assert np.median(answered - taken) < 0.01
-    assert model.gain == pytest.approx(2.0, rel=0.05)
-    assert model.time_constants[0] == pytest.approx(0.4, rel=0.1)
-    assert model.dead_time == pytest.approx(0.2, abs=0.02)
+    # A busy machine steps the plant late, which is part of what is measured here; how exact the
+    # numbers can be is for lockstep to show.
+    assert model.structure == "fopdt"
+    assert model.gain == pytest.approx(2.0, rel=0.15)
+    assert model.time_constants[0] == pytest.approx(0.4, rel=0.2)
+    assert model.dead_time == pytest.approx(0.2, abs=0.03)
 
     shown = replay(str(rig.bag(answer)))["experiments"][-1]
     again = shown["models"][shown["selected"]]
