@@ -90,8 +90,7 @@ class Selection:
         ):
             return
         first = refine(whole, self._fopdt.theta, tolerance=_TRIAL)
-        least = self._floor / whole.time.size
-        if first.cost <= _MUCH_BETTER * least * whole.time.size:
+        if first.cost <= _MUCH_BETTER * self._floor:
             return
         second = refine_best(later, start_fopdt(later, self._sign), tolerance=_TRIAL)
         if _MUCH_BETTER * second.cost / later.time.size < first.cost / whole.time.size:
