@@ -136,7 +136,7 @@ def _count(cycles: int) -> str:
 def identification_lines(found: Identification) -> list[str]:
     """Return an identified model with its accuracy, as lines."""
     name = f"{found.structure}, {found.method}"
-    lines = [_line("process", f"{process_text(found.model)}   ({name})")]
+    lines = _process("process", found.model, name)
     rows = list(zip(found.parameters, found.values, found.ci95_low, found.ci95_high, strict=True))
     for label, value, low, high in rows:
         interval = f"95 %: {digits(low)} to {digits(high)}" if np.isfinite(low) else ""
@@ -153,8 +153,8 @@ def identification_lines(found: Identification) -> list[str]:
     lines.append(_line("fit", _fit(found)))
     for i, rival in enumerate(found.rivals[:_RIVALS]):
         share = f"{100.0 * rival.support:.2g} % of the support"
-        text = f"{process_text(rival.model)}   ({rival.model.structure}, {share})"
-        lines.append(_line("rivals" if i == 0 else "", text))
+        note = f"{rival.model.structure}, {share}"
+        lines += _process("rivals" if i == 0 else "", rival.model, note)
     for warning in found.warnings:
         lines += _wrapped("warning", warning)
     return lines
@@ -163,10 +163,10 @@ def identification_lines(found: Identification) -> list[str]:
 def _others(analysis: Analysis) -> list[str]:
     """Return what the other methods found, a line for each."""
     others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
-    return [
-        _line("also" if i == 0 else "", f"{process_text(m.model)}   ({m.structure}, {m.method})")
-        for i, m in enumerate(others)
-    ]
+    lines = []
+    for i, m in enumerate(others):
+        lines += _process("also" if i == 0 else "", m.model, f"{m.structure}, {m.method}")
+    return lines
 
 
 def _fit(found: Identification) -> str:
@@ -228,6 +228,14 @@ def _gains(gains: Gains) -> list[str]:
 
 def _row(label: str, value: float, unit: str, interval: str) -> str:
     return _line("  " + label, f"{digits(value):>9} {unit:<6} {interval}".rstrip())
+
+
+def _process(label: str, model: TransferFunction, note: str) -> list[str]:
+    """Return a transfer function with a note, on one line where it fits."""
+    whole = _line(label, f"{process_text(model)}   ({note})")
+    if len(whole) <= _WIDTH:
+        return [whole]
+    return [*_wrapped(label, process_text(model)), *_wrapped("", f"({note})")]
 
 
 def _line(label: str, text: str) -> str:
