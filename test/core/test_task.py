@@ -1,0 +1,49 @@
+"""What may be asked of a controller, and what is refused with the limit that was crossed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from relay_autotune.errors import TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.task import DesignOptions, DesignTask
+
+
+@pytest.mark.parametrize(
+    ("asked", "limit"),
+    [
+        ({"ms": 1.19}, "1.2 to 4"),
+        ({"ms": 4.01}, "1.2 to 4"),
+        ({"ms": math.nan}, "1.2 to 4"),
+        ({"mt": 1.0}, "above 1"),
+        ({"mt": math.nan}, "above 1"),
+        ({"controller": "pd"}, "known: auto, pi, pid"),
+        ({"sample_period": -1.0}, ">= 0 s"),
+        ({"loop_delay": math.nan}, ">= 0 s"),
+        ({"noise_std": -1.0}, "NaN where it is not known"),
+        ({"amplitude": math.inf}, "NaN where it is not known"),
+        ({"noise_share": 0.0}, "> 0"),
+        ({"filter_ratio": math.nan}, "> 0"),
+        ({"resonance": -2.0}, "> 0"),
+        ({"closed_loop_time": 0.0}, "> 0 s"),
+        ({"phase_peak": -120.0}, "-180 and -90 degrees"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_with_its_limit(asked, limit):
+    with pytest.raises(TuningError, match=limit):
+        DesignOptions(**asked)
+
+
+def test_the_bound_on_the_complementary_sensitivity_follows_the_process():
+    stable, integrating = TransferFunction.fopdt(1.0, 1.0, 1.0), TransferFunction.ipdt(1.0, 1.0)
+    assert DesignOptions().largest_mt(stable) == 1.4
+    # +2 dB
+    assert DesignOptions().largest_mt(integrating) == pytest.approx(10**0.1, rel=2e-3)
+    assert DesignOptions(mt=1.7).largest_mt(integrating) == 1.7
+
+
+def test_a_held_sample_lags_by_half_a_period():
+    assert DesignOptions(sample_period=0.2, loop_delay=0.3).added_delay == pytest.approx(0.4)
+    assert DesignTask(model=TransferFunction.ipdt(1.0, 1.0)).options.added_delay == 0.0
