@@ -16,11 +16,11 @@ from typing import Any
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.autotune import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
-from relay_autotune.cli.table import digits, process_text
 from relay_autotune.document import document, model_fields, to_json
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.models import TransferFunction
 from relay_autotune.nodes.domain import free_domain
+from relay_autotune.notation import digits, process_text
 from relay_autotune.report import draw
 from relay_autotune.ultimate import ultimate_point
 

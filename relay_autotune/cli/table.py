@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from relay_autotune.cycles import limit_cycle
+from relay_autotune.notation import digits, process_text
 from relay_autotune.record import Outcome, Record
 
 if TYPE_CHECKING:
@@ -39,38 +40,6 @@ def table(bag: str, analyses: Sequence[Analysis]) -> str:
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
         blocks.append("\n".join(_experiment(analysis, which)))
     return "\n\n".join(blocks) + "\n"
-
-
-def process_text(model: TransferFunction) -> str:
-    """Return a transfer function on one line, such as ``1.65 e^(-10 s) / (1 + 20 s)``."""
-    above = [digits(model.gain), *_factors(model.zeros)]
-    if model.dead_time:
-        above.append(f"e^(-{digits(model.dead_time)} s)")
-    below = _factors(model.time_constants)
-    if model.integrators:
-        below.insert(0, "s" if model.integrators == 1 else f"s^{model.integrators}")
-    if not below:
-        return " ".join(above)
-    return f"{' '.join(above)} / {below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
-
-
-def digits(value: float, count: int = 4) -> str:
-    """Return a number with ``count`` significant digits; a dash for none."""
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:#.{count}g}".rstrip(".") if value else "0"
-
-
-def _factors(time_constants: Iterable[complex]) -> list[str]:
-    factors = []
-    for value in time_constants:
-        if value.imag > 0.0:
-            # With its conjugate: (1 + z s)(1 + z* s) = 1 + 2 Re(z) s + |z|^2 s^2.
-            factors.append(f"(1 + {digits(2.0 * value.real)} s + {digits(abs(value) ** 2)} s^2)")
-        elif value.imag == 0.0:
-            sign = "-" if value.real < 0.0 else "+"
-            factors.append(f"(1 {sign} {digits(abs(value.real))} s)")
-    return factors
 
 
 def _experiment(analysis: Analysis, which: str) -> list[str]:
