@@ -2,6 +2,7 @@
 # make demo    tune a simulated loop over real DDS; leaves demo_output/
 # make test    lint, type check, and the tests in both environments
 # make lint    ruff and mypy alone
+# make docs    build the user guide as a web site in docs/_build/html
 # make clean   remove everything that the above have made
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ SOURCES = setup.py relay_autotune test tools $(wildcard bags benchmarks)
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 
-.PHONY: setup demo test test-core test-oldest lint clean
+.PHONY: setup demo test test-core test-oldest lint docs clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
@@ -36,6 +37,10 @@ lint: setup
 	@$(ENTER) && ruff format --check $(SOURCES)
 	@$(ENTER) && mypy
 
+docs:
+	@$(PYTHON) tools/prepare.py docs
+	@$(PYTHON) tools/build_docs.py
+
 clean:
-	rm -rf .venv .venv-* build install log demo_output .hypothesis .*_cache *.egg-info
+	rm -rf .venv .venv-* build install log demo_output docs/_build .hypothesis .*_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -3,6 +3,7 @@
     prepare.py          the main one: .venv/ and install/, with the ROS 2 Jazzy that is sourced, or
                         else with Jazzy's wheels
     prepare.py oldest   the second one: .venv-oldest/, no ROS, the oldest numeric libraries
+    prepare.py docs     what builds the user guide: .venv-docs/, Sphinx and nothing else
 
 What is up to date is left alone. The first lines run on any Python 3, to say that it is too old.
 """
@@ -25,6 +26,7 @@ from typing import NoReturn
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 VENV_OLDEST = ROOT / ".venv-oldest"
+VENV_DOCS = ROOT / ".venv-docs"
 INSTALL = ROOT / "install"
 REQUIREMENTS = ROOT / "requirements"
 # what each package is built from; the Python files of the second are linked, not copied
@@ -49,8 +51,11 @@ def main() -> None:
     fcntl.flock(lock, fcntl.LOCK_EX)  # two calls of make at a time would undo each other
     if sys.argv[1:] == ["oldest"]:
         prepare_oldest()
+    elif sys.argv[1:] == ["docs"]:
+        prepare_docs()
     elif sys.argv[1:]:
-        fail(f"prepare.py takes no argument or `oldest`, found {' '.join(sys.argv[1:])!r}")
+        given = " ".join(sys.argv[1:])
+        fail(f"prepare.py takes no argument, `oldest` or `docs`, found {given!r}")
     else:
         prepare_main()
 
@@ -102,6 +107,14 @@ def prepare_oldest() -> None:
         testers = re.findall(r"^(?:pytest|hypothesis)==.*$", pins, re.MULTILINE)
         make_venv(VENV_OLDEST, ["noble.txt"], "with the oldest numeric libraries", testers)
         mark(VENV_OLDEST, stamp)
+
+
+def prepare_docs() -> None:
+    """Make the environment that builds the user guide."""
+    stamp = digest([REQUIREMENTS / "docs.txt"], base_python())
+    if not is_current(VENV_DOCS, stamp):
+        make_venv(VENV_DOCS, ["docs.txt"], "with what builds the user guide")
+        mark(VENV_DOCS, stamp)
 
 
 def sourced_ros() -> str | None:
