@@ -21,10 +21,11 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from relay_autotune.cycles import next_cycle
 from relay_autotune.kick import DirectionWatch, ResponseDetector
-from relay_autotune.record import Cycle, RelaySettings
-from relay_autotune.relay_law import Patience, Relay
+from relay_autotune.levels import Levels
+from relay_autotune.oscillation import Oscillation, count_cycles
+from relay_autotune.record import Cycle, Outcome, RelaySettings
+from relay_autotune.relay_law import Relay
 from relay_autotune.relay_parameters import ExperimentParameters
 from relay_autotune.samples import Samples
 from relay_autotune.settling import NOT_SETTLED, RestState, Settling, rest_state
@@ -41,12 +42,11 @@ KICK_SETTLINGS = 50.0
 _LEAST_SETTLING_SAMPLES = 5
 # An interval of the probe has at least this many samples.
 _PROBE_SAMPLES = 2
-# A stay at the low level shorter than this part of the longest stay (less, in proportion to how
-# unequally a biased relay pushes), or of half the time that the process took to respond, cannot be
-# an answer of the process: it is noise at a switch, and no cycle begins after it.
-_SHORT_STAY = 0.2
-
-_SIGNS = {1: "positive", -1: "negative"}
+# An amplitude that is to be found begins to grow after this part of the settling, or so many
+# samples; each size lasts as long as all smaller ones together, so that a long dead time does not
+# make it much larger than the process needs.
+_GROWTH_SETTLINGS = 0.25
+_GROWTH_SAMPLES = 20
 
 
 class State(enum.IntEnum):
@@ -61,6 +61,9 @@ class State(enum.IntEnum):
     FAILED = 7
 
 
+_ENDS = {Outcome.COMPLETED: State.COMPLETED, Outcome.FAILED: State.FAILED}
+
+
 class Procedure:
     """Answer samples, one state after the other, until the procedure is over.
 
@@ -69,10 +72,16 @@ class Procedure:
     :param parameters: what the user set, valid.
     :param baseline: command of the operating point [u].
     :param samples: the samples so far; each is appended before it is answered.
+    :param until_converged: False: agreement of the cycles does not end it.
     """
 
     def __init__(
-        self, parameters: ExperimentParameters, baseline: float, samples: Samples
+        self,
+        parameters: ExperimentParameters,
+        baseline: float,
+        samples: Samples,
+        *,
+        until_converged: bool = True,
     ) -> None:
         self.state = State.SETTLING
         """The present state."""
@@ -80,27 +89,39 @@ class Procedure:
         """Why it ended, a sentence for people; empty before."""
         self.rest = NOT_SETTLED
         """The measurement at rest at the baseline."""
-        self.sign = parameters.process_gain_sign
-        """Sign of the process gain, 0 while unknown."""
         self.dead_time_seen = math.nan
         """Time from the kick to the last sample before the response [s]; NaN until it is seen."""
-        self.cycle_start: list[int] = []
-        """Index of the first sample of each cycle, the unfinished one included."""
-        self.cycles: list[Cycle] = []
-        """The whole cycles."""
         self.answer: Callable[[float, float], float] = partial(self._settle, Settling())
         """Take the time [s] and the measurement [y] of the last sample; return the command [u]."""
 
         self._parameters = parameters
         self._samples = samples
         self._baseline = baseline
-        self._low = baseline + parameters.relay_bias - parameters.amplitude
-        self._high = baseline + parameters.relay_bias + parameters.amplitude
+        self._levels = Levels(parameters, baseline)
+        self._until_converged = until_converged
+        self._sign = parameters.process_gain_sign
+        self._oscillation: Oscillation | None = None
         self._notes: list[str] = []
         self._settled_at = math.nan
         self._setpoint = math.nan
         self._hysteresis = math.nan
         self._response_time = math.nan
+        self._grow_after = math.inf
+
+    @property
+    def sign(self) -> int:
+        """Sign of the process gain, 0 while unknown."""
+        return self._oscillation.sign if self._oscillation else self._sign
+
+    @property
+    def cycles(self) -> list[Cycle]:
+        """The whole cycles."""
+        return self._oscillation.cycles if self._oscillation else []
+
+    @property
+    def cycle_start(self) -> list[int]:
+        """Index of the first sample of each cycle, the unfinished one included."""
+        return self._oscillation.cycle_start if self._oscillation else []
 
     @property
     def settings(self) -> RelaySettings | None:
@@ -113,9 +134,10 @@ class Procedure:
         return RelaySettings(
             setpoint=self._setpoint,
             baseline=self._baseline,
-            amplitude=self._parameters.amplitude,
-            bias=self._parameters.relay_bias,
+            amplitude=self._levels.amplitude,
+            bias=self._levels.bias,
             hysteresis=self._hysteresis,
+            extra_delay=self._parameters.extra_delay,
             sample_period=self._parameters.sample_period,
             reverse_acting=self.sign < 0,
         )
@@ -127,7 +149,8 @@ class Procedure:
         :param reason: why, a sentence for people.
         """
         self.state = state
-        self.reason = "; ".join((reason, *self._notes))
+        notes = self._oscillation.notes if self._oscillation else []
+        self.reason = "; ".join((reason, *self._notes, *notes))
         return self._baseline
 
     def where(self) -> str:
@@ -136,7 +159,7 @@ class Procedure:
             State.SETTLING: "while settling",
             State.KICK: f"while waiting for the measurement to leave its rest {self.rest.mean:g}",
             State.PROBE: "while finding the sign of the process gain",
-        }.get(self.state, f"after {_count(len(self.cycles))}")
+        }.get(self.state, f"after {count_cycles(self.cycles)}")
 
     # SETTLING
 
@@ -181,22 +204,37 @@ class Procedure:
     def _kick(self) -> float:
         t, y = self._samples.time[-1], self._samples.measurement[-1]
         # With the sign given, towards the set-point, if that is not where the measurement is.
-        is_high = self.sign == 0 or self._relay_from(t, y).is_high
-        level = self._high if is_high else self._low
+        is_high = self.sign == 0 or self._starts_high(t, y)
         detector = ResponseDetector(self.rest, t)
         self.state = State.KICK
-        self.answer = partial(self._await_response, detector, level, t)
-        return level
+        self._grow_after = max(
+            _GROWTH_SETTLINGS * self._settled_at, _GROWTH_SAMPLES * self._samples.interval
+        )
+        self.answer = partial(self._await_response, detector, is_high, t)
+        return self._level(is_high)
+
+    def _level(self, is_high: bool) -> float:
+        return self._levels.high if is_high else self._levels.low
+
+    def _starts_high(self, t: float, y: float) -> bool:
+        return Relay(self.sign, self._setpoint, self._hysteresis, t, y).is_high
 
     def _await_response(
-        self, detector: ResponseDetector, level: float, start: float, t: float, y: float
+        self, detector: ResponseDetector, is_high: bool, start: float, t: float, y: float
     ) -> float:
         if detector.add(t, y):
             self.dead_time_seen = detector.last_inside - start
             self._response_time = detector.first_outside - start
+            if self._levels.can_grow:
+                # What can just be told from the noise does not tell much more.
+                self._levels.grow()
             if self.sign == 0:
                 return self._probe(detector, t, y)
-            return self._relay(t, y, doubtful=False)
+            return self._relay(doubtful=False)
+        if self._levels.can_grow and t - start >= self._grow_after:
+            self._levels.grow()
+            self._grow_after *= 2.0
+        level = self._level(is_high)
         if t - self._settled_at <= self._kick_limit():
             return level
         still = (
@@ -224,112 +262,46 @@ class Procedure:
         watch.add(t, y)
         self.state = State.PROBE
         self.answer = partial(self._find_direction, watch, t + interval)
-        return self._high
+        return self._levels.high
 
     def _find_direction(
         self, watch: DirectionWatch, pulse_end: float, t: float, y: float
     ) -> float:
         sign = watch.add(t, y)
         if sign == 0:
-            return self._high if t < pulse_end else self._baseline
+            return self._levels.high if t < pulse_end else self._baseline
         if watch.remains < self.rest.noise_std:
             # The pulse left nothing behind: noise had looked like a response.
             return self._kick()
-        self.sign = sign
-        return self._relay(t, y, doubtful=True)
+        self._sign = sign
+        return self._relay(doubtful=True)
 
     # RELAY
 
-    def _relay(self, t: float, y: float, *, doubtful: bool) -> float:
-        p = self._parameters
-        relay = self._relay_from(t, y)
-        patience = Patience(p.amplitude, p.relay_bias)
-        patience.learn(self._response_time, self._samples.interval)
-        if p.hysteresis > 0.0 or not math.isnan(p.setpoint):
-            # How far the first switch is from the rest is then the user's choice, and the time
-            # to respond says nothing of it.
-            patience.limit = self._kick_limit()
+    def _relay(self, *, doubtful: bool) -> float:
         self.state = State.RELAY
-        self.answer = partial(self._follow, relay, patience, doubtful)
-        return self._high if relay.is_high else self._low
-
-    def _relay_from(self, t: float, y: float) -> Relay:
-        return Relay(self.sign, self._setpoint, self._hysteresis, t, y)
-
-    def _follow(
-        self, relay: Relay, patience: Patience, doubtful: bool, t: float, y: float
-    ) -> float:
-        if relay.update(t, y):
-            patience.learn(relay.last_stay, self._samples.interval)
-            if relay.is_high and not self._is_noise(relay):
-                return self._begin_cycle()
-        elif t - relay.since > patience.limit:
-            return self._no_return(doubtful, t, y)
-        return self._high if relay.is_high else self._low
-
-    def _is_noise(self, relay: Relay) -> bool:
-        p = self._parameters
-        balance = (p.amplitude - abs(p.relay_bias)) / (p.amplitude + abs(p.relay_bias))
-        longest = max(balance * relay.longest_stay, 0.5 * self._response_time)
-        return relay.last_stay < _SHORT_STAY * longest
-
-    def _begin_cycle(self) -> float:
-        self.cycle_start.append(len(self._samples) - 1)
-        if len(self.cycle_start) > 1:
-            self.cycles.append(self._cycle_that_ended())
-            if self.cycles[-1].converged:
-                return self._complete(
-                    f"{len(self.cycles)} cycles, of which the last {self._parameters.min_cycles} "
-                    f"agree within {self._parameters.cycle_tolerance:g} of half period and "
-                    f"amplitude, noise and sample interval allowed for"
-                )
-            if len(self.cycles) >= self._parameters.max_cycles:
-                return self._complete(
-                    f"max_cycles, {self._parameters.max_cycles}, reached; the last "
-                    f"{self._parameters.min_cycles} do not agree within "
-                    f"{self._parameters.cycle_tolerance:g} of half period and amplitude"
-                )
-        return self._high
-
-    def _cycle_that_ended(self) -> Cycle:
-        first, last = self.cycle_start[-2:]
-        time, measurement, command = self._samples.columns(first, last + 1)
-        return next_cycle(
-            self.cycles,
-            time,
-            measurement,
-            command,
-            middle=self._baseline + self._parameters.relay_bias,
-            reverse_acting=self.sign < 0,
-            noise_std=self.rest.noise_std,
-            min_cycles=self._parameters.min_cycles,
-            tolerance=self._parameters.cycle_tolerance,
+        self._oscillation = Oscillation(
+            self._parameters,
+            self._baseline,
+            self._samples,
+            self._levels,
+            self.rest,
+            setpoint=self._setpoint,
+            hysteresis=self._hysteresis,
+            sign=self._sign,
+            doubtful=doubtful,
+            response_time=self._response_time,
+            first_limit=self._kick_limit(),
+            until_converged=self._until_converged,
         )
+        self.answer = self._follow
+        return self._oscillation.command
 
-    def _complete(self, reason: str) -> float:
-        disturbed = sum(cycle.disturbed for cycle in self.cycles)
-        if disturbed:
-            self._notes.append(f"{disturbed} of the cycles have a long gap in their samples")
-        return self.end(State.COMPLETED, reason)
-
-    def _no_return(self, doubtful: bool, t: float, y: float) -> float:
-        """Fail, or, if the sign was found by the probe and no cycle bears it out, reverse it."""
-        if doubtful and not self.cycles:
-            self._notes.append(
-                f"the process gain was first taken for {_SIGNS[self.sign]}: the measurement did "
-                f"not come back; give process_gain_sign to spare the process that"
-            )
-            self.sign = -self.sign
-            self.cycle_start.clear()
-            return self._relay(t, y, doubtful=False)
-        return self.end(
-            State.FAILED,
-            f"no oscillation {self.where()}: the measurement is {y:g} and did not come back to "
-            f"{self._setpoint:g} -/+ {self._hysteresis:g} in time: the amplitude may be too small "
-            f"for the hysteresis or the set-point, a load may have come, or process_gain_sign "
-            f"(taken as {_SIGNS[self.sign]}) may be wrong",
-        )
-
-
-def _count(cycles: int) -> str:
-    return f"{cycles} whole cycle{'' if cycles == 1 else 's'}"
+    def _follow(self, t: float, y: float) -> float:
+        oscillation = self._oscillation
+        assert oscillation is not None
+        command = oscillation.answer(t, y)
+        if oscillation.verdict is None:
+            return command
+        outcome, reason = oscillation.verdict
+        return self.end(_ENDS[outcome], reason)

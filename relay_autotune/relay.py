@@ -7,12 +7,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from relay_autotune.errors import ParameterError
 from relay_autotune.procedure import Procedure, State
 from relay_autotune.record import Cycle, FloatArray, Outcome, Record, RelaySettings
 from relay_autotune.relay_parameters import PARAMETERS, ExperimentParameters, Parameter
+from relay_autotune.safe_command import ProportionalHold, SafePolicy
 from relay_autotune.samples import Samples
+from relay_autotune.sensor_watch import FrozenWatch
 
-__all__ = ["PARAMETERS", "ExperimentParameters", "Parameter", "RelayExperiment", "State"]
+__all__ = [
+    "PARAMETERS",
+    "ExperimentParameters",
+    "Parameter",
+    "RelayExperiment",
+    "SafePolicy",
+    "State",
+]
 
 # Numbers beyond this overflow when squared, and are no measurements of anything.
 _LARGEST = 1e100
@@ -26,29 +36,49 @@ _OUTCOMES = {
 }
 
 
+_BASELINE = SafePolicy()
+
+
 class RelayExperiment:
     """Run one relay experiment: call :meth:`step` for each measurement, send what it returns.
 
     :mod:`relay_autotune.procedure` has the states. Whatever the state, :meth:`abort` and a
-    measurement outside its limits end the experiment as ABORTED; a sample that cannot be used and
-    max_duration end it as FAILED. It does not raise on bad data: :attr:`reason` says why it
-    ended. It has no clock: time comes in with the samples, on any origin.
+    measurement outside its limits end the experiment as ABORTED; a sample that cannot be used, a
+    frozen sensor and max_duration end it as FAILED. It does not raise on bad data:
+    :attr:`reason` says why it ended. It has no clock: time comes in with the samples, on any
+    origin.
 
     :param parameters: what the user set.
-    :param baseline: command of the operating point [u], which is also the safe command.
+    :param baseline: command of the operating point [u].
     :param experiment_id: the id that the record will carry.
+    :param policy: how the process is left at the end.
+    :param until_converged: False: cycles that agree do not end it, but :meth:`conclude` or
+        max_cycles does.
     :raises ParameterError: if a parameter is out of range, or some contradict each other.
     """
 
     def __init__(
-        self, parameters: ExperimentParameters, baseline: float, experiment_id: str = ""
+        self,
+        parameters: ExperimentParameters,
+        baseline: float,
+        experiment_id: str = "",
+        *,
+        policy: SafePolicy = _BASELINE,
+        until_converged: bool = True,
     ) -> None:
         parameters.validate(baseline)
         self.parameters = parameters
         self.experiment_id = experiment_id
-        self.safe_command = float(baseline)
+        self.baseline = float(baseline)
+        self.safe_command = self.baseline if math.isnan(policy.command) else policy.command
+        """What is commanded after an abort or a failure, where nothing holds the process [u]."""
+        self._policy = policy
+        self._hold: ProportionalHold | None = None
         self._samples = Samples()
-        self._procedure = Procedure(parameters, self.safe_command, self._samples)
+        self._frozen = FrozenWatch()
+        self._procedure = Procedure(
+            parameters, self.baseline, self._samples, until_converged=until_converged
+        )
         self._origin = math.nan
         self._repeats = 0
 
@@ -185,42 +215,85 @@ class RelayExperiment:
 
         :param time: when the sample was taken [s], on any origin; equal times are allowed.
         :param measurement: the sample [y].
-        :returns: the command [u]; after the end always the baseline.
+        :returns: the command [u]; after the end that of :meth:`after_end`.
         """
         procedure, samples = self._procedure, self._samples
         if procedure.state in _OUTCOMES:
-            return self.safe_command
+            return self.after_end(measurement)
         problem = self._unusable(time, measurement)
         if problem is not None:
-            return procedure.end(State.FAILED, problem)
+            procedure.end(State.FAILED, problem)
+            return self._ended(math.nan)
         if not samples:
             self._origin = float(time)
         t, y = float(time) - self._origin, float(measurement)
         samples.time.append(t)
         samples.measurement.append(y)
-        p = self.parameters
-        if not p.measurement_min <= y <= p.measurement_max:
-            command = self._limit_passed(t, y)
-        elif 0.0 < p.max_duration < t:
-            command = self._too_long()
-        else:
-            command = procedure.answer(t, y)
+        command = self.baseline if self._passes_limit(t, y) else procedure.answer(t, y)
+        if procedure.state in _OUTCOMES:
+            command = self._ended(y)
+        elif self.parameters.command_rate > 0.0:
+            command = self._rate_limited(command)
         samples.command.append(command)
         return command
+
+    def after_end(self, measurement: float) -> float:
+        """Return the command that answers a measurement after the end [u].
+
+        :param measurement: [y]; NaN: there is none.
+        """
+        if self._hold is not None:
+            return self._hold.command(measurement)
+        if self._procedure.state is State.COMPLETED:
+            return self.baseline
+        return self.safe_command
+
+    def conclude(self, reason: str) -> float:
+        """Complete the experiment now, with the cycles there are; do nothing if it has ended.
+
+        :param reason: why, for people.
+        :returns: the command of :meth:`after_end` [u], to be sent now.
+        :raises ParameterError: if there is no whole cycle, from which nothing could be identified.
+        """
+        if not self.finished:
+            if not self.cycle_count:
+                raise ParameterError(
+                    "an experiment cannot be completed before its first whole cycle; abort it"
+                )
+            self._procedure.end(State.COMPLETED, reason)
+            self._ended(math.nan)
+        return self.after_end(self._last_measurement())
 
     def abort(self, reason: str, time: float | None = None) -> float:
         """End the experiment from outside; do nothing if it has ended already.
 
         :param reason: why, for people.
         :param time: when [s], on the axis of :meth:`step`; default: at the last sample.
-        :returns: the safe command, to be sent now.
+        :returns: the command of :meth:`after_end` [u], to be sent now.
         """
-        if self.finished:
-            return self.safe_command
-        at = self.elapsed if time is None or not self._samples else time - self._origin
-        return self._procedure.end(
-            State.ABORTED, f"{reason} (at {at:.6g} s, {self._procedure.where()})"
-        )
+        if not self.finished:
+            at = self.elapsed if time is None or not self._samples else time - self._origin
+            self._procedure.end(
+                State.ABORTED, f"{reason} (at {at:.6g} s, {self._procedure.where()})"
+            )
+            self._ended(math.nan)
+        return self.after_end(self._last_measurement())
+
+    def _last_measurement(self) -> float:
+        return self._samples.measurement[-1] if self._samples else math.nan
+
+    def _ended(self, measurement: float) -> float:
+        if self._policy.hold:
+            self._hold = ProportionalHold.after(self.settings, self._procedure.cycles)
+        return self.after_end(measurement)
+
+    def _rate_limited(self, wanted: float) -> float:
+        samples = self._samples
+        if len(samples) < 2:
+            return wanted
+        before = samples.command[-1]
+        step = self.parameters.command_rate * (samples.time[-1] - samples.time[-2])
+        return min(max(wanted, before - step), before + step)
 
     def _unusable(self, time: float, measurement: float) -> str | None:
         """Say why a sample cannot be used; None if it can."""
@@ -251,17 +324,36 @@ class RelayExperiment:
             f"clock that stamps the measurement"
         )
 
-    def _limit_passed(self, t: float, y: float) -> float:
-        p = self.parameters
-        return self._procedure.end(
-            State.ABORTED,
-            f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} to "
-            f"{p.measurement_max:g}",
-        )
+    def _passes_limit(self, t: float, y: float) -> bool:
+        """End the experiment if the last sample passes a limit; return True if it does."""
+        p, procedure = self.parameters, self._procedure
+        resting = procedure.state is State.SETTLING
+        if not p.measurement_min <= y <= p.measurement_max:
+            procedure.end(
+                State.ABORTED,
+                f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
+                f"to {p.measurement_max:g}",
+            )
+        elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:
+            procedure.end(
+                State.ABORTED,
+                f"the measurement {y:g} at {t:g} s is {self._deviation(y):g} away from the "
+                f"set-point, more than max_deviation, {p.max_deviation:g}",
+            )
+        elif 0.0 < p.max_duration < t:
+            procedure.end(
+                State.FAILED,
+                f"max_duration {p.max_duration:g} s was over {procedure.where()}: allow more time "
+                f"or fewer cycles",
+            )
+        elif self._frozen.add(y, at_rest=resting, in_cycles=bool(procedure.cycles)):
+            procedure.end(
+                State.FAILED,
+                f"the sensor is frozen: its last {self._frozen.run} samples are all {y:g}, "
+                f"{procedure.where()}; check the sensor",
+            )
+        return procedure.state in _OUTCOMES
 
-    def _too_long(self) -> float:
-        return self._procedure.end(
-            State.FAILED,
-            f"max_duration {self.parameters.max_duration:g} s was over "
-            f"{self._procedure.where()}: allow more time or fewer cycles",
-        )
+    def _deviation(self, y: float) -> float:
+        settings = self._procedure.settings
+        return abs(y - settings.setpoint) if settings is not None else 0.0

@@ -64,7 +64,16 @@ PARAMETERS: tuple[Parameter, ...] = (
         "amplitude",
         0.0,
         "u",
-        "Half the distance of the two command levels; required, since 0 stands for not given.",
+        "Half the distance of the two command levels; 0: found by itself between command_min and "
+        "command_max, from small to large.",
+        lower=0.0,
+    ),
+    Parameter(
+        "target_amplitude",
+        0.0,
+        "y",
+        "Half the swing of the measurement at which an amplitude that is found by itself is large "
+        "enough; 0: when the oscillation stands clear of noise, hysteresis and resolution.",
         lower=0.0,
     ),
     Parameter(
@@ -152,8 +161,39 @@ PARAMETERS: tuple[Parameter, ...] = (
         "y",
         "The experiment is aborted when the measurement rises above this.",
     ),
+    Parameter(
+        "max_deviation",
+        0.0,
+        "y",
+        "The experiment is aborted when the measurement is further than this from the set-point, "
+        "once that is known; 0: no limit.",
+        lower=0.0,
+    ),
     Parameter("command_min", -math.inf, "u", "Lowest command that may be sent."),
     Parameter("command_max", math.inf, "u", "Highest command that may be sent."),
+    Parameter(
+        "command_rate",
+        0.0,
+        "u/s",
+        "Fastest change of the relay's command; the safe command at the end is a step all the "
+        "same; 0: no limit.",
+        lower=0.0,
+    ),
+    Parameter(
+        "extra_delay",
+        0.0,
+        "s",
+        "Dead time that the relay adds to its switches, for the second test of the method li.",
+        lower=0.0,
+    ),
+    Parameter(
+        "max_half_cycle",
+        0.0,
+        "s",
+        "Longest stay of the relay at one level; 0: ten times the longest so far, and more for "
+        "a biased relay.",
+        lower=0.0,
+    ),
     Parameter(
         "max_duration",
         0.0,
@@ -180,6 +220,7 @@ class ExperimentParameters:
     """What the user may set of a relay experiment; :data:`PARAMETERS` describes each field."""
 
     amplitude: float = 0.0
+    target_amplitude: float = 0.0
     bias: float = 0.0
     bias_ratio: float = 0.3
     hysteresis: float = 0.0
@@ -191,8 +232,12 @@ class ExperimentParameters:
     cycle_tolerance: float = 0.02
     measurement_min: float = -math.inf
     measurement_max: float = math.inf
+    max_deviation: float = 0.0
     command_min: float = -math.inf
     command_max: float = math.inf
+    command_rate: float = 0.0
+    extra_delay: float = 0.0
+    max_half_cycle: float = 0.0
     max_duration: float = 0.0
     sample_period: float = 0.0
 
@@ -200,6 +245,11 @@ class ExperimentParameters:
     def relay_bias(self) -> float:
         """The offset mu0 of the middle of the levels from the baseline [u]."""
         return self.bias if self.bias != 0.0 else self.bias_ratio * self.amplitude
+
+    @property
+    def finds_amplitude(self) -> bool:
+        """True if the amplitude is not given, and the experiment finds it by itself."""
+        return self.amplitude == 0.0
 
     def validate(self, baseline: float | None = None) -> None:
         """Refuse values out of range and values that contradict each other.
@@ -226,12 +276,14 @@ class ExperimentParameters:
                 raise ParameterError(problem)
 
     def _validate_together(self) -> None:
-        if self.amplitude == 0.0:
-            raise ParameterError(
-                "amplitude is 0, expected more than 0 u: it is required until it can be found "
-                "by itself; give half the step that the process may see"
-            )
-        if abs(self.relay_bias) >= self.amplitude:
+        if self.finds_amplitude:
+            if not (math.isfinite(self.command_min) and math.isfinite(self.command_max)):
+                raise ParameterError(
+                    f"amplitude is 0, to be found between command_min and command_max, which are "
+                    f"{self.command_min:g} and {self.command_max:g}: give both limits, or give "
+                    f"the amplitude, half the step that the process may see"
+                )
+        elif abs(self.relay_bias) >= self.amplitude:
             raise ParameterError(
                 f"bias is {self.bias:g}, expected less than the amplitude {self.amplitude:g} in "
                 f"magnitude: otherwise both levels lie on one side of the baseline and the "
@@ -265,6 +317,13 @@ class ExperimentParameters:
     def _validate_levels(self, baseline: float) -> None:
         if not math.isfinite(baseline):
             raise ParameterError(f"the baseline is {baseline:g}, expected a finite command")
+        if self.finds_amplitude:
+            if not self.command_min <= baseline <= self.command_max:
+                raise ParameterError(
+                    f"the baseline is {baseline:g}, expected from command_min "
+                    f"{self.command_min:g} to command_max {self.command_max:g}"
+                )
+            return
         levels = {
             "baseline": baseline,
             "low level": baseline + self.relay_bias - self.amplitude,

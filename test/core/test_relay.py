@@ -367,7 +367,7 @@ def test_a_wrong_sign_fails():
     tune = experiment(process_gain_sign=-1)
     run(tune, FopdtPlant(1.0, 1.0, 0.5), 0.05)
     assert tune.outcome is Outcome.FAILED
-    assert "process_gain_sign (taken as negative)" in tune.reason
+    assert "it moved away, against the relay's push: process_gain_sign may be wrong" in tune.reason
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])

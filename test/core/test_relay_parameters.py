@@ -30,7 +30,7 @@ def test_defaults_with_an_amplitude_are_valid():
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"amplitude": 0.0}, "amplitude is 0, expected more than 0 u: it is required"),
+        ({"amplitude": 0.0}, "amplitude is 0, to be found between command_min and command_max"),
         ({"amplitude": -1.0}, "amplitude is -1, expected at least 0 u"),
         ({"amplitude": math.nan}, "amplitude is nan, expected"),
         ({"amplitude": math.inf}, "amplitude is inf, expected a finite number"),

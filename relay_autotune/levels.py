@@ -1,0 +1,125 @@
+"""The two command levels of the relay: given, or found from small to large within the limits."""
+
+from __future__ import annotations
+
+import math
+
+from relay_autotune.record import FloatArray
+from relay_autotune.relay_parameters import ExperimentParameters
+
+# An amplitude that is to be found begins with this part of the range of the command.
+FIRST_SHARE = 0.01
+# An oscillation stands clear of the noise from so many standard deviations on, of the hysteresis
+# from so many times its half width on, and of the sensor's resolution from so many steps on.
+CLEAR_OF_NOISE = 10.0
+CLEAR_OF_HYSTERESIS = 3.0
+CLEAR_OF_STEPS = 5.0
+
+# How much an amplitude that is too small grows at a time.
+_LEAST_GROWTH = 1.5
+_MOST_GROWTH = 4.0
+# A target is aimed at with so much to spare, since an oscillation is not quite linear in it.
+_TO_SPARE = 1.2
+
+
+class Levels:
+    """The levels of a relay about its baseline.
+
+    An amplitude that was given stays as it is. One that is to be found begins at a hundredth of
+    the command's range and grows; a level that would pass a limit stays at the limit, so that
+    next to a limit the upper and the lower step differ, which is then part of the bias.
+
+    :param parameters: what the user set, valid for the baseline.
+    :param baseline: command of the operating point [u].
+    """
+
+    def __init__(self, parameters: ExperimentParameters, baseline: float) -> None:
+        self._parameters = parameters
+        self._baseline = baseline
+        self.searching = parameters.finds_amplitude
+        """True while the amplitude is still to be found."""
+        self._wanted = parameters.amplitude
+        if self.searching:
+            span = parameters.command_max - parameters.command_min
+            self._wanted = FIRST_SHARE * span
+            if abs(parameters.bias) >= self._wanted:
+                self._wanted = 1.5 * abs(parameters.bias)
+        self._shift = 0.0
+        self._set()
+
+    def _set(self) -> None:
+        p = self._parameters
+        bias = p.bias if p.bias != 0.0 else p.bias_ratio * self._wanted
+        middle = self._baseline + bias + self._shift
+        # Whatever shifts them, the levels stay within the limits.
+        self.low = max(middle - self._wanted, p.command_min)
+        """The lower level [u]."""
+        self.high = min(middle + self._wanted, p.command_max)
+        """The upper level [u]."""
+
+    @property
+    def _as_given(self) -> bool:
+        # The digits of the user's own numbers are kept.
+        return not self._parameters.finds_amplitude and self._shift == 0.0
+
+    @property
+    def amplitude(self) -> float:
+        """Half the distance of the levels, mu [u]."""
+        if self._as_given:
+            return self._parameters.amplitude
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def bias(self) -> float:
+        """Middle of the levels minus the baseline, mu0 [u]."""
+        if self._as_given:
+            return self._parameters.relay_bias
+        return 0.5 * (self.high + self.low) - self._baseline
+
+    @property
+    def can_grow(self) -> bool:
+        """True if the amplitude may be made larger."""
+        p = self._parameters
+        return self.searching and (self.low > p.command_min or self.high < p.command_max)
+
+    def grow(self, factor: float = 2.0) -> None:
+        """Make an amplitude that is being found larger, as far as the limits let it."""
+        self._wanted *= factor
+        self._set()
+
+    def shift(self, by: float) -> None:
+        """Move both levels, to bear a load that has come [u]."""
+        self._shift += by
+        self._set()
+
+    def growth_for(self, half_swing: float, least: float) -> float:
+        """Return the factor by which the amplitude is to grow, 1 if it is large enough.
+
+        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param least: the half swing that is large enough [y].
+        """
+        if half_swing >= least or not self.can_grow:
+            return 1.0
+        ratio = _TO_SPARE * least / half_swing if half_swing > 0.0 else math.inf
+        return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)
+
+
+def clear_swing(
+    target: float, noise_std: float, hysteresis: float, measurement: FloatArray
+) -> float:
+    """Return the half swing at which an oscillation stands clear of what disturbs it [y].
+
+    :param target: what the user asked for [y]; 0: nothing.
+    :param noise_std: standard deviation of the noise [y].
+    :param hysteresis: half width of the relay's band [y].
+    :param measurement: samples of the oscillation [y], shape (n,); the smallest difference
+        between two that follow each other is taken for the sensor's resolution.
+    """
+    if target > 0.0:
+        return target
+    steps = abs(measurement[1:] - measurement[:-1])
+    steps = steps[steps > 0.0]
+    resolution = float(steps.min()) if steps.size else 0.0
+    return max(
+        CLEAR_OF_NOISE * noise_std, CLEAR_OF_HYSTERESIS * hysteresis, CLEAR_OF_STEPS * resolution
+    )

@@ -1,0 +1,68 @@
+"""Why a measurement does not come back to the relay: what it did instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from relay_autotune.record import FloatArray
+
+# A growth is taken for that of an instability after so many steps, each of which is larger than
+# the one before by this factor, to so many times the first swing: the transient of a stable loop
+# grows in steps that become smaller.
+_STEPS = 3
+_FASTER = 1.15
+_LARGER = 3.0
+
+# Over its last third, a measurement that moves by less than this part of its whole way is level.
+_LEVEL = 0.03
+
+
+def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> str:
+    """Say what the measurement did while the relay stayed at one level, and what may help.
+
+    :param time: instants of the samples of that stay [s], shape (n,).
+    :param towards: the samples, times 1 if the relay pushed upwards and -1 if downwards [y],
+        shape (n,).
+    :param noise_std: standard deviation of the noise [y].
+    """
+    thirds = [part for part in _thirds(time, towards) if len(part)]
+    if len(thirds) < 3:
+        return "there are too few samples to say why: check the sensor's rate"
+    first, second, third = (float(part.mean()) for part in thirds)
+    whole = float(towards.max() - towards.min())
+    still = 3.0 * noise_std / min(len(part) for part in thirds) ** 0.5
+    if third - float(towards[0]) < -max(_LEVEL * whole, still):
+        faster = " faster and faster" if second - third > first - second > 0.0 else ""
+        return (
+            f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, or "
+            f"the process is unstable and the amplitude too small to hold it"
+        )
+    if abs(third - second) <= max(_LEVEL * whole, still):
+        return (
+            "the response saturates before the relay's band: the amplitude may be too small for "
+            "the hysteresis or the set-point, a load may have come, or the actuator is at its end"
+        )
+    return (
+        "it moves towards the band, but too slowly for what was seen before: give a larger "
+        "amplitude or max_half_cycle, and let the process rest before the start"
+    )
+
+
+def _thirds(time: FloatArray, values: FloatArray) -> list[FloatArray]:
+    begin, span = float(time[0]), float(time[-1] - time[0])
+    edges = [begin + k * span / 3.0 for k in (1, 2)]
+    early, late = time < edges[0], time >= edges[1]
+    return [values[early], values[~early & ~late], values[late]]
+
+
+def is_growing(swings: Sequence[float]) -> bool:
+    """Return True if the swings of the cycles grow as those of an unstable loop do.
+
+    :param swings: peak to peak of each cycle so far [y].
+    """
+    last = swings[-(_STEPS + 1) :]
+    if len(last) <= _STEPS or last[0] <= 0.0 or last[-1] < _LARGER * last[0]:
+        return False
+    steps = [b - a for a, b in pairwise(last)]
+    return steps[0] > 0.0 and all(b >= _FASTER * a for a, b in pairwise(steps))

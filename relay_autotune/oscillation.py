@@ -1,0 +1,251 @@
+"""The part of an experiment in which the relay switches: cycles, and why there are none."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from relay_autotune.cycles import next_cycle
+from relay_autotune.levels import Levels, clear_swing
+from relay_autotune.no_return import is_growing, why_no_return
+from relay_autotune.record import Cycle, Outcome
+from relay_autotune.relay_law import Patience, Relay
+from relay_autotune.relay_parameters import ExperimentParameters
+from relay_autotune.samples import Samples
+from relay_autotune.settling import RestState
+
+# A stay at the low level shorter than this part of the longest stay (less, in proportion to how
+# unequally a biased relay pushes), or of half the time that the process took to respond, cannot be
+# an answer of the process: it is noise at a switch, and no cycle begins after it.
+_SHORT_STAY = 0.2
+
+# Of two instants that rounding tells apart, the later one has come when the earlier one has: part
+# of the sample interval.
+_ROUNDING = 1e-6
+
+_SIGNS = {1: "positive", -1: "negative"}
+
+
+class Oscillation:
+    """Answer samples with the relay until its cycles agree, or until there is no oscillation.
+
+    An amplitude that is to be found grows from cycle to cycle until the oscillation is large
+    enough; cycles count from there on.
+
+    :param parameters: what the user set, valid.
+    :param baseline: command of the operating point [u].
+    :param samples: the samples so far; the last one is that at which the relay begins.
+    :param levels: the levels of the relay.
+    :param rest: the measurement at rest.
+    :param setpoint: measurement about which the relay switches [y].
+    :param hysteresis: half width of its band [y].
+    :param sign: sign of the process gain.
+    :param doubtful: True if no user gave the sign, so that it may turn out to be the other one.
+    :param response_time: time that the process took to respond to the kick [s].
+    :param first_limit: longest stay until the first switch [s].
+    :param until_converged: False: agreement of the cycles does not end it.
+    """
+
+    def __init__(
+        self,
+        parameters: ExperimentParameters,
+        baseline: float,
+        samples: Samples,
+        levels: Levels,
+        rest: RestState,
+        *,
+        setpoint: float,
+        hysteresis: float,
+        sign: int,
+        doubtful: bool,
+        response_time: float,
+        first_limit: float,
+        until_converged: bool,
+    ) -> None:
+        self.sign = sign
+        """Sign of the process gain."""
+        self.cycles: list[Cycle] = []
+        """The whole cycles."""
+        self.cycle_start: list[int] = []
+        """Index of the first sample of each cycle, the unfinished one included."""
+        self.verdict: tuple[Outcome, str] | None = None
+        """How it ended and why; None while it goes on."""
+        self.notes: list[str] = []
+        """What the reason shall mention besides."""
+        self._parameters = parameters
+        self._baseline = baseline
+        self._samples = samples
+        self._levels = levels
+        self._rest = rest
+        self._setpoint = setpoint
+        self._hysteresis = hysteresis
+        self._doubtful = doubtful
+        self._response_time = response_time
+        self._first_limit = first_limit
+        self._until_converged = until_converged
+        self._on_the_way: deque[tuple[float, bool, bool]] = deque()
+        self._limit = first_limit
+        self._begin()
+
+    @property
+    def command(self) -> float:
+        """The level in force [u]."""
+        return self._levels.high if self._is_high else self._levels.low
+
+    def answer(self, t: float, y: float) -> float:
+        """Take the last sample and return the command; :attr:`verdict` says whether it is over.
+
+        :param t: its time [s].
+        :param y: the measurement [y].
+        """
+        relay = self._relay
+        if relay.update(t, y):
+            self._learn(relay.last_stay)
+            begins = relay.is_high and not self._is_noise()
+            due = t + self._parameters.extra_delay
+            self._on_the_way.append((due, relay.is_high, begins))
+        elif t - relay.since > self._limit:
+            self._no_return(t, y)
+        waiting = self._on_the_way
+        while waiting and waiting[0][0] <= t + _ROUNDING * self._samples.interval:
+            _, self._is_high, begins = waiting.popleft()
+            if begins:
+                self._begin_cycle()
+        return self.command
+
+    def _begin(self) -> None:
+        t, y = self._samples.time[-1], self._samples.measurement[-1]
+        self._relay = Relay(self.sign, self._setpoint, self._hysteresis, t, y)
+        self._is_high = self._relay.is_high
+        self._on_the_way.clear()
+        self._patience = Patience(self._levels.amplitude, self._levels.bias)
+        p = self._parameters
+        self._learn(self._response_time)
+        if not p.max_half_cycle and (p.hysteresis > 0.0 or not math.isnan(p.setpoint)):
+            # How far the first switch is from the rest is then the user's choice, and the time
+            # to respond says nothing of it.
+            self._limit = self._first_limit
+
+    def _learn(self, stay: float) -> None:
+        self._patience.learn(stay, self._samples.interval)
+        p = self._parameters
+        self._limit = p.max_half_cycle or self._patience.limit + 2.0 * p.extra_delay
+
+    def _is_noise(self) -> bool:
+        amplitude, bias = self._levels.amplitude, abs(self._levels.bias)
+        balance = max(amplitude - bias, 0.0) / (amplitude + bias)
+        longest = max(balance * self._relay.longest_stay, 0.5 * self._response_time)
+        return self._relay.last_stay < _SHORT_STAY * longest
+
+    # Cycles.
+
+    def _begin_cycle(self) -> None:
+        self.cycle_start.append(len(self._samples) - 1)
+        if len(self.cycle_start) < 2 or self._has_grown():
+            return
+        cycle = self._cycle_that_ended()
+        self.cycles.append(cycle)
+        p = self._parameters
+        if is_growing([c.peak_max - c.peak_min for c in self.cycles]):
+            self._end(
+                Outcome.FAILED,
+                f"the oscillation grows faster and faster, after {count_cycles(self.cycles)}: an "
+                f"unstable process of which the relay cannot get hold; give a larger amplitude",
+            )
+        elif self._until_converged and cycle.converged:
+            self._end(
+                Outcome.COMPLETED,
+                f"{len(self.cycles)} cycles, of which the last {p.min_cycles} agree within "
+                f"{p.cycle_tolerance:g} of half period and amplitude, noise and sample interval "
+                f"allowed for",
+            )
+        elif len(self.cycles) >= p.max_cycles:
+            self._end(
+                Outcome.COMPLETED,
+                f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} do not agree "
+                f"within {p.cycle_tolerance:g} of half period and amplitude"
+                if self._until_converged
+                else f"max_cycles, {p.max_cycles}, reached",
+            )
+
+    def _has_grown(self) -> bool:
+        """Make an amplitude that is being found larger if the last cycle was too small."""
+        if not self._levels.searching:
+            return False
+        first, last = self.cycle_start[-2:]
+        y = self._samples.columns(first, last + 1)[1]
+        least = clear_swing(
+            self._parameters.target_amplitude, self._rest.noise_std, self._hysteresis, y
+        )
+        half_swing = 0.5 * float(y.max() - y.min())
+        factor = self._levels.growth_for(half_swing, least)
+        if factor == 1.0:
+            if half_swing < least:
+                self.notes.append(
+                    f"the amplitude {self._levels.amplitude:g} is all that the command limits "
+                    f"allow, and the measurement swings by {half_swing:.3g} only, less than "
+                    f"{least:.3g}"
+                )
+            self._levels.searching = False
+            return False
+        self._levels.grow(factor)
+        self.cycle_start[:] = [last]
+        return True
+
+    def _cycle_that_ended(self) -> Cycle:
+        first, last = self.cycle_start[-2:]
+        time, measurement, command = self._samples.columns(first, last + 1)
+        p = self._parameters
+        return next_cycle(
+            self.cycles,
+            time,
+            measurement,
+            command,
+            middle=self._baseline + self._levels.bias,
+            reverse_acting=self.sign < 0,
+            noise_std=self._rest.noise_std,
+            min_cycles=p.min_cycles,
+            tolerance=p.cycle_tolerance,
+        )
+
+    # The end.
+
+    def _end(self, outcome: Outcome, reason: str) -> None:
+        disturbed = sum(cycle.disturbed for cycle in self.cycles)
+        if outcome is Outcome.COMPLETED and disturbed:
+            self.notes.append(f"{disturbed} of the cycles have a long gap in their samples")
+        self.verdict = outcome, reason
+
+    def _no_return(self, t: float, y: float) -> None:
+        """Fail, unless the amplitude can grow or a sign that is in doubt can be reversed."""
+        if self._doubtful and not self.cycles:
+            self._doubtful = False
+            self.notes.append(
+                f"the process gain was first taken for {_SIGNS[self.sign]}: the measurement did "
+                f"not come back; give process_gain_sign to spare the process that"
+            )
+            self.sign = -self.sign
+            self.cycle_start.clear()
+            self._begin()
+            return
+        if self._levels.can_grow:
+            self._levels.grow()
+            self.cycle_start.clear()
+            self._begin()
+            return
+        stay = [k for k, s in enumerate(self._samples.time) if s >= self._relay.since]
+        time, measurement, _ = self._samples.columns(stay[0], len(self._samples))
+        towards = self.sign if self._relay.is_high else -self.sign
+        why = why_no_return(time, towards * measurement, self._rest.noise_std)
+        self._end(
+            Outcome.FAILED,
+            f"no oscillation after {count_cycles(self.cycles)}: the measurement is {y:g} and did "
+            f"not come back to {self._setpoint:g} -/+ {self._hysteresis:g} within "
+            f"{t - self._relay.since:.3g} s; {why} (process_gain_sign was taken as "
+            f"{_SIGNS[self.sign]})",
+        )
+
+
+def count_cycles(cycles: list[Cycle]) -> str:
+    """Say how many cycles there are."""
+    return f"{len(cycles)} whole cycle{'' if len(cycles) == 1 else 's'}"

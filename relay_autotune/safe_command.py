@@ -1,0 +1,79 @@
+"""What is commanded once an experiment has ended."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from relay_autotune.record import Cycle, RelaySettings
+
+# Half the ultimate gain: the quarter-decay margin of Ziegler and Nichols for proportional control.
+HOLD_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class SafePolicy:
+    """How the process is left when an experiment ends.
+
+    :param command: what is commanded after an abort or a failure [u]; NaN: the baseline.
+    :param hold: True for a process that would not stay where it is at a constant command (an
+        integrating or unstable one): it is held by proportional control as soon as its ultimate
+        gain is roughly known.
+    """
+
+    command: float = math.nan
+    hold: bool = False
+
+
+@dataclass(frozen=True)
+class ProportionalHold:
+    r"""Proportional control about the set-point, ``u = u0 + k (r - y)``, within limits.
+
+    k is half of the describing function's ultimate gain ``4 mu/(pi a)``, where a is half the
+    swing of the measurement, with the sign of the process; u0 is the mean command of the last
+    cycle, which balanced the process.
+
+    :param centre: u0 [u].
+    :param gain: k [u/y].
+    :param setpoint: r [y].
+    :param low: lowest command [u].
+    :param high: highest command [u].
+    """
+
+    centre: float
+    gain: float
+    setpoint: float
+    low: float
+    high: float
+
+    @classmethod
+    def after(
+        cls, settings: RelaySettings | None, cycles: Sequence[Cycle]
+    ) -> ProportionalHold | None:
+        """Return the hold that an experiment allows, None before its first whole cycle.
+
+        :param settings: the relay's settings; its levels are the limits.
+        :param cycles: the cycles so far.
+        """
+        if settings is None or not cycles:
+            return None
+        last = cycles[-1]
+        half_swing = 0.5 * (last.peak_max - last.peak_min)
+        if half_swing <= 0.0:
+            return None
+        gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * half_swing)
+        return cls(
+            centre=last.mean_command,
+            gain=-gain if settings.reverse_acting else gain,
+            setpoint=settings.setpoint,
+            low=settings.low,
+            high=settings.high,
+        )
+
+    def command(self, measurement: float) -> float:
+        """Return the command [u] that answers a measurement [y]; the centre if that is none."""
+        if not math.isfinite(measurement):
+            return self.centre
+        wanted = self.centre + self.gain * (self.setpoint - measurement)
+        return min(max(wanted, self.low), self.high)

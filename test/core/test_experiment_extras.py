@@ -1,0 +1,274 @@
+"""An amplitude that is found, delays, rates, limits, faults of the sensor, and what follows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from fopdt_plant import FopdtPlant, run, wang_limit_cycle
+
+from relay_autotune.cycles import limit_cycle
+from relay_autotune.errors import ParameterError
+from relay_autotune.models import TransferFunction
+from relay_autotune.no_return import is_growing
+from relay_autotune.record import Outcome
+from relay_autotune.relay import ExperimentParameters, RelayExperiment, SafePolicy
+from relay_autotune.sensor_watch import ClockWatch, FrozenWatch
+from relay_autotune.simulation import Plant
+
+
+def experiment(baseline=0.0, policy=None, until_converged=True, **parameters):
+    return RelayExperiment(
+        ExperimentParameters(**{"amplitude": 1.0, **parameters}),
+        baseline,
+        policy=policy or SafePolicy(),
+        until_converged=until_converged,
+    )
+
+
+def gaussian(std, seed=1):
+    generator = np.random.default_rng(seed)
+    return lambda: std * generator.standard_normal()
+
+
+def searching(**parameters):
+    return experiment(amplitude=0.0, command_min=-10.0, command_max=10.0, **parameters)
+
+
+# The amplitude found by itself.
+
+
+@pytest.mark.parametrize("dead_time", [0.3, 5.0])
+@pytest.mark.parametrize("gain", [2.0, -0.5])
+def test_an_amplitude_that_is_found_stands_clear_of_the_noise(gain, dead_time):
+    std = 0.02
+    tune = searching()
+    run(tune, FopdtPlant(gain, 2.0, dead_time), 0.05, noise=gaussian(std))
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    record, cycle = tune.record(), limit_cycle(tune.record())
+    half_swing = 0.5 * (cycle.peak_max - cycle.peak_min)
+    # The noise itself adds to the swing by which it was judged.
+    assert 7.5 * std < half_swing
+    # Far from what the limits would have allowed.
+    assert half_swing < 0.4 * 10.0 * abs(gain)
+    # It grew, and never passed a limit.
+    sizes = np.abs(record.command[: record.cycle_start[0]])
+    assert np.unique(sizes).size > 3
+    assert np.abs(record.command).max() <= 10.0
+
+
+def test_a_target_in_units_of_the_measurement_is_met():
+    tune = searching(target_amplitude=1.5)
+    run(tune, FopdtPlant(2.0, 2.0, 1.0), 0.05, noise=gaussian(0.01))
+    cycle = limit_cycle(tune.record())
+    assert 1.5 <= 0.5 * (cycle.peak_max - cycle.peak_min) < 3.0
+
+
+def test_a_target_out_of_reach_is_said_and_the_limits_hold():
+    tune = experiment(amplitude=0.0, target_amplitude=50.0, command_min=-1.0, command_max=3.0)
+    run(tune, FopdtPlant(2.0, 2.0, 1.0), 0.05)
+    record = tune.record()
+    assert tune.outcome is Outcome.COMPLETED
+    assert "all that the command limits allow" in tune.reason
+    assert record.command.min() >= -1.0
+    assert record.command.max() <= 3.0
+    # Next to a limit the two steps differ.
+    assert (record.settings.low, record.settings.high) == (-1.0, 3.0)
+    assert record.settings.amplitude == 2.0
+    assert record.settings.bias == 1.0
+
+
+def test_a_coarse_sensor_needs_several_steps():
+    plant, step = FopdtPlant(2.0, 2.0, 1.0), 0.3
+    tune = searching()
+    command = 0.0
+    for k in range(40_000):
+        y = round(plant.advance(0.05 * k, command) / step) * step
+        command = tune.step(0.05 * k, y)
+        if tune.finished:
+            break
+    cycle = limit_cycle(tune.record())
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    assert 0.5 * (cycle.peak_max - cycle.peak_min) >= 4.9 * step
+
+
+# Delay and rate.
+
+
+def test_an_extra_delay_acts_as_a_longer_dead_time():
+    period, extra = 0.005, 0.4
+    tune = experiment(hysteresis=0.1, extra_delay=extra)
+    run(tune, FopdtPlant(1.0, 2.0, 0.6), period)
+    cycle = limit_cycle(tune.record())
+    high, low, *_ = wang_limit_cycle(1.0, 2.0, 0.6 + extra, 1.0, 0.3, 0.1)
+    assert cycle.period_high == pytest.approx(high, abs=2.1 * period)
+    assert cycle.period_low == pytest.approx(low, abs=2.1 * period)
+    assert tune.settings.extra_delay == extra
+
+
+def test_the_command_changes_no_faster_than_its_rate():
+    rate, period = 4.0, 0.05
+    tune = experiment(command_rate=rate)
+    run(tune, FopdtPlant(1.0, 2.0, 1.0), period)
+    record = tune.record()
+    assert tune.outcome is Outcome.COMPLETED
+    steps = np.abs(np.diff(record.command))[:-1]
+    assert steps.max() == pytest.approx(rate * period)
+    assert {record.command.min(), record.command.max()} == {-0.7, 1.3}
+
+
+# Limits and faults.
+
+
+def test_the_largest_deviation_from_the_set_point_ends_it():
+    tune = experiment(max_deviation=0.5)
+    run(tune, FopdtPlant(2.0, 2.0, 1.0), 0.05, offset=7.0)
+    assert tune.outcome is Outcome.ABORTED
+    assert "more than max_deviation, 0.5" in tune.reason
+    record = tune.record()
+    assert abs(record.measurement[-2] - 7.0) <= 0.5
+    assert record.command[-1] == 0.0
+
+
+def test_a_half_cycle_that_is_too_long_ends_it():
+    tune = experiment(max_half_cycle=0.8, process_gain_sign=1)
+    run(tune, FopdtPlant(1.0, 2.0, 2.0), 0.05)
+    assert tune.outcome is Outcome.FAILED
+    assert "no oscillation" in tune.reason
+
+
+def test_a_frozen_sensor_is_recognised_in_a_second():
+    plant, noise = FopdtPlant(1.0, 2.0, 1.0), gaussian(0.01)
+    tune, command, y = experiment(), 0.0, 0.0
+    for k in range(4000):
+        if k < 300:
+            y = plant.advance(0.05 * k, command) + noise()
+        command = tune.step(0.05 * k, y)
+        if tune.finished:
+            break
+    assert k - 300 <= 21
+    assert tune.outcome is Outcome.FAILED
+    assert "the sensor is frozen: its last 21 samples are all" in tune.reason
+    assert command == 0.0
+
+
+@pytest.mark.parametrize("step", [0.05, 0.3])
+@pytest.mark.parametrize("dead_time", [0.2, 10.0])
+def test_a_coarse_sensor_is_not_taken_for_a_frozen_one(step, dead_time):
+    plant, noise = FopdtPlant(1.0, 1.0, dead_time), gaussian(0.02)
+    tune, command = experiment(hysteresis=step), 0.0
+    for k in range(8000):
+        y = round((plant.advance(0.05 * k, command) + noise()) / step) * step
+        command = tune.step(0.05 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+
+
+def test_a_coarse_sensor_that_freezes_is_recognised_after_a_cycle():
+    watch = FrozenWatch()
+    for k in range(400):
+        value = round(3.0 * math.sin(0.05 * k))
+        assert not watch.add(value, at_rest=k < 100, in_cycles=k > 200)
+    frozen = [watch.add(3.0, at_rest=False, in_cycles=True) for _ in range(200)]
+    assert 20 < frozen.index(True) < 120
+
+
+def test_a_step_of_a_clock_is_told_from_a_late_sample():
+    rng = np.random.default_rng(2)
+    watch = ClockWatch()
+    latency = 1e-4 + rng.exponential(1e-3, 2000)
+    latency[500] = 0.7  # one late sample
+    for k in range(1000):
+        assert not watch.add(0.01 * k, 0.01 * k + latency[k] + 1e-5 * k)
+    assert watch.drift == pytest.approx(0.0, abs=0.02)
+    # The source's clock goes forward: nothing arrives before it was sent.
+    said = watch.add(10.0 + 0.3, 10.0 + 0.001)
+    assert "a clock has stepped" in said
+
+
+def test_a_step_of_the_receiving_clock_shows_within_ten_samples():
+    watch = ClockWatch()
+    for k in range(50):
+        assert not watch.add(0.01 * k, 0.01 * k + 0.001)
+    said = [watch.add(0.01 * k, 0.01 * k + 0.2) for k in range(50, 70)]
+    assert [bool(s) for s in said].index(True) == 9
+
+
+def test_a_sensor_out_of_order_is_no_runaway_but_an_instability_is():
+    assert is_growing([1.0, 2.0, 4.0, 8.0])
+    assert not is_growing([1.0, 5.0, 7.0, 8.0])
+    assert not is_growing([1.0, 1.5, 2.0, 2.5])
+    assert not is_growing([2.0, 4.0, 8.0])
+
+
+def test_an_unstable_process_that_the_relay_cannot_hold_fails():
+    # A dead time of 0.75 time constants: no limit cycle exists from ln 2 on.
+    tune = experiment(process_gain_sign=1, hysteresis=0.02, measurement_max=1e6)
+    run(tune, FopdtPlant(-1.0, -1.0, 0.75), 0.01)
+    assert tune.outcome is Outcome.FAILED
+    assert "faster and faster" in tune.reason
+    assert tune.record().command[-1] == 0.0
+
+
+# What is commanded after the end.
+
+
+def test_a_given_safe_command_follows_an_abort_but_not_a_completed_tune():
+    policy = SafePolicy(command=-0.25)
+    tune = experiment(policy=policy)
+    run(tune, FopdtPlant(1.0, 1.0, 1.0), 0.05)
+    assert tune.record().command[-1] == 0.0
+    assert tune.step(1e3, 5.0) == 0.0
+    tune = experiment(policy=policy)
+    tune.step(0.0, 0.0)
+    assert tune.abort("enough") == -0.25
+    assert tune.step(1.0, 0.0) == -0.25
+
+
+def test_an_integrating_process_is_held_after_the_end():
+    model = TransferFunction.from_structure("ipdt", gain=0.5, dead_time=1.0)
+    for stop in (False, True):
+        plant, period = Plant(model), 0.05
+        tune = experiment(policy=SafePolicy(hold=True), hysteresis=0.1)
+        load, command = 0.1, 0.0
+        for k in range(40_000):
+            y = plant.advance(period * k, command + load * (k > 800))
+            command = tune.step(period * k, y)
+            if stop and tune.cycle_count == 2:
+                command = tune.abort("enough")
+            if tune.finished:
+                break
+        assert tune.outcome is (Outcome.ABORTED if stop else Outcome.COMPLETED), tune.reason
+        setpoint = tune.settings.setpoint
+        # It would go on drifting at a constant command; held, it stays near the set-point.
+        last = []
+        for n in range(k + 1, k + 2001):
+            y = plant.advance(period * n, command + load)
+            command = tune.step(period * n, y)
+            assert tune.settings.low <= command <= tune.settings.high
+            last.append(y)
+        assert max(abs(v - setpoint) for v in last[-200:]) < 0.3
+        assert np.ptp(last[-200:]) < 0.01
+
+
+# Ended from outside.
+
+
+def test_a_tune_can_be_concluded_before_its_cycles_agree():
+    tune = experiment(until_converged=False, max_cycles=50)
+    plant, command = FopdtPlant(1.0, 1.0, 1.0), 0.0
+    with pytest.raises(ParameterError, match="before its first whole cycle"):
+        tune.conclude("K_u is known")
+    for k in range(1000):
+        command = tune.step(0.05 * k, plant.advance(0.05 * k, command))
+        if tune.cycle_count == 8:
+            break
+    # Long settled, and still at it.
+    assert not tune.finished
+    assert tune.conclude("K_u is known well enough") == 0.0
+    assert tune.outcome is Outcome.COMPLETED
+    assert tune.record().reason == "K_u is known well enough"
+    assert tune.conclude("again") == 0.0
+    assert tune.reason == "K_u is known well enough"
