@@ -11,7 +11,7 @@ SOURCES = setup.py relay_autotune test tools $(wildcard bags benchmarks)
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 
-.PHONY: setup demo test test-core test-oldest lint docs clean
+.PHONY: setup demo test test-core test-oldest test-system test-rest lint docs clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
@@ -19,13 +19,20 @@ setup:
 demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
+# two at a time, since few of the tests of nodes keep a processor busy
 test: setup
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-core test-oldest
-	@$(ENTER) && python3 -m pytest --ignore=test/core
+	@$(MAKE) --no-print-directory --jobs=2 --keep-going --output-sync=target \
+		test-core test-oldest test-system test-rest
 
-# the numeric core, while the other processor does the same with the oldest libraries
 test-core: lint
 	@$(ENTER) && python3 -m pytest -q test/core
+
+# running nodes, over real DDS
+test-system: lint
+	@$(ENTER) && python3 -m pytest -q test/system
+
+test-rest: lint
+	@$(ENTER) && python3 -m pytest -q --ignore=test/core --ignore=test/system
 
 # the numeric core with the oldest numeric libraries, without ROS
 test-oldest:
