@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -26,6 +27,17 @@ def digits(value: float, count: int = 4) -> str:
     if not math.isfinite(value):
         return "-"
     return f"{value:#.{count}g}".rstrip(".") if value else "0"
+
+
+def date_text(start: float) -> str:
+    """Return a date and time in UTC.
+
+    :param start: s since the epoch.
+    """
+    try:
+        return f"{datetime.fromtimestamp(start, tz=UTC):%Y-%m-%d %H:%M:%S} UTC"
+    except (OverflowError, ValueError, OSError):
+        return f"{start:g} s after 1970"
 
 
 def process_text(model: TransferFunction) -> str:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from relay_autotune.cycles import limit_cycle
-from relay_autotune.notation import digits, process_text
+from relay_autotune.notation import date_text, digits, process_text
 from relay_autotune.record import Outcome, Record
 
 if TYPE_CHECKING:
@@ -72,15 +71,8 @@ def _span(record: Record) -> str:
     if record.lost_samples:
         text += f", {record.lost_samples} lost"
     if record.start:
-        text += f", from {_date(record.start)}"
+        text += f", from {date_text(record.start)}"
     return text
-
-
-def _date(start: float) -> str:
-    try:
-        return f"{datetime.fromtimestamp(start, tz=UTC):%Y-%m-%d %H:%M:%S} UTC"
-    except (OverflowError, ValueError, OSError):
-        return f"{start:g} s after 1970"
 
 
 def _limit_cycle(analysis: Analysis) -> list[str]:
