@@ -1,17 +1,14 @@
-"""Decoding messages: std_msgs/Float64 here, our own by the definition that their bag holds."""
+"""Decoding our own messages by the definition that their bag holds."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-
-from relay_autotune.bag.mcap_file import Channel
+from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.errors import BagError
-from relay_autotune.record import FloatArray
 
 FLOAT64 = "std_msgs/msg/Float64"
 EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
@@ -68,28 +65,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "disturbed": False,
     },
 }
-
-
-def decode_float64(payload: Sequence[bytes]) -> FloatArray:
-    """Return the values of serialized std_msgs/Float64 messages.
-
-    :param payload: the messages, n of them, 12 bytes each.
-    :raises BagError: if one of them has another length or another encapsulation than CDR.
-    """
-    if not payload:
-        return np.empty(0)
-    if set(map(len, payload)) != {12}:
-        odd = next(len(p) for p in payload if len(p) != 12)
-        raise BagError(f"a std_msgs/msg/Float64 message has {odd} bytes; expected 12")
-    raw = np.frombuffer(b"".join(payload), dtype=np.uint8).reshape(-1, 12)
-    little = raw[:, 1] == 1
-    if bool(np.any(raw[:, 0] != 0)) or bool(np.any(raw[:, 1] > 1)):
-        raise BagError("a std_msgs/msg/Float64 message is not in plain CDR")
-    body = np.ascontiguousarray(raw[:, 4:])
-    values = body.view("<f8")[:, 0].astype(np.float64)
-    if not bool(np.all(little)):
-        values = np.where(little, values, body.view(">f8")[:, 0])
-    return values
 
 
 def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:

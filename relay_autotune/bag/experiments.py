@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.bag.decode import CYCLE, EXPERIMENT, FLOAT64, decode_float64
+from relay_autotune.bag.decode import CYCLE, EXPERIMENT, FLOAT64
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import EXPERIMENT_METADATA
 from relay_autotune.errors import BagError, RecordError
@@ -60,7 +60,7 @@ def interrupted_experiment(topics: Topics) -> Record | None:
 
 def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
     names = (about["measurement"], about["command"])
-    found = topics.messages(names, FLOAT64)
+    found = topics.columns(names, FLOAT64)
     if set(found) != set(names):
         raise BagError(f"{topics.path} ends before the first sample of its experiment")
     samples, answers = (found[name] for name in names)
@@ -78,8 +78,8 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
     try:
         return Record(
             time=(taken - origin) / 1e9,
-            measurement=decode_float64(samples.payload)[answered],
-            command=decode_float64(answers.payload)[answer],
+            measurement=samples.values[answered],
+            command=answers.values[answer],
             receive_time=(samples.log_time[answered] - origin) / 1e9,
             command_time=(answers.publish_time[answer] - origin) / 1e9,
             settings=settings_from_message(cycles[-1].settings) if cycles else None,

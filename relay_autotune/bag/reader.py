@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from relay_autotune.bag.csv_file import read_csv
-from relay_autotune.bag.decode import FLOAT64
 from relay_autotune.bag.experiments import interrupted_experiment, recorded_experiments
+from relay_autotune.bag.fields import split_name
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
 from relay_autotune.bag.signals import Signal, join, window
@@ -126,7 +126,7 @@ def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[st
 def _joined(topics: Topics, pair: Pair, notes: list[str]) -> tuple[list[Record], list[str]]:
     names = (pair.measurement.name, pair.command.name)
     measured, commanded = topics.signals(names).values()
-    notes = [*notes, *(timed.note for timed in (measured, commanded) if timed.note)]
+    notes = [*notes, *measured.notes, *commanded.notes]
     signals = [measured.signal, commanded.signal]
     difference = abs(measured.lag_ns - commanded.lag_ns)
     if difference > _CLOCK_DIFFERENCE_NS:
@@ -165,19 +165,14 @@ def _named_pair(topics: Topics, wanted: Selection) -> tuple[Pair, list[str]]:
 
 def _checked(topics: Topics, role: str, wanted: str) -> str:
     types = topics.types()
-    name, _, part = wanted.partition(":")
-    if name not in types and f"/{name}" in types:
-        name = f"/{name}"
-    if name not in types:
+    topic, part = split_name(wanted)
+    if topic not in types and f"/{topic}" in types:
+        topic = f"/{topic}"
+    if topic not in types:
         raise SelectionError(
-            f"{topics.path} has no topic {name!r} for the {role}; it has {topics.listing()}"
+            f"{topics.path} has no topic {topic!r} for the {role}; it has {topics.listing()}"
         )
-    if types[name] != FLOAT64 or part not in ("", "data"):
-        raise SelectionError(
-            f"the {role} {wanted!r} of {topics.path} cannot be read: {name} is of type "
-            f"{types[name]}; expected a topic of {FLOAT64}, whose only field is data"
-        )
-    return name
+    return topics.field_of(topic, part)
 
 
 def _plausible(topics: Topics, given: str | None = None) -> list[Pair]:
@@ -207,6 +202,6 @@ def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[Pair, list[str]]:
     looks = {name: characterise(t.signal).text for name, t in topics.signals().items()}
     raise SelectionError(
         f"{topics.path} holds no recorded experiment and no pair of topics that looks like "
-        f"measurement and command; it has {topics.listing(looks)}; name two of type {FLOAT64} "
-        f"with --measurement TOPIC --command TOPIC"
+        f"measurement and command; it has {topics.listing(looks)}; name two "
+        f"with --measurement TOPIC[:FIELD] --command TOPIC[:FIELD]"
     )

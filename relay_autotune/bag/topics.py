@@ -2,32 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from relay_autotune.bag.decode import FLOAT64, decode_float64, decode_messages
-from relay_autotune.bag.mcap_file import Channel, McapFile, Messages
-from relay_autotune.bag.signals import Signal
+from relay_autotune.bag.cdr import Path
+from relay_autotune.bag.decode import decode_messages
+from relay_autotune.bag.fields import named_field, only_field, split_name, stamp_of
+from relay_autotune.bag.locate import Messages
+from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.schema import Struct, message_type
+from relay_autotune.bag.timing import SignalReader, TimedSignal
+from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.record import FloatArray, IntArray
+
+# Told of how far a file has been read: bytes done, bytes in all.
+Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True)
-class TimedSignal:
-    """The values of a topic, and what is to be known of its clock.
+@dataclass
+class Columns:
+    """Times and values of one topic in the order of the file.
 
-    :param signal: the values by the time at which they were published, or, where that is not
-        known, recorded.
-    :param lag_ns: smallest time from publishing to recording [ns]: the delay of the transport
-        and the difference of the two clocks.
-    :param note: a sentence if the publish times cannot be used; empty otherwise.
+    :param order: position among all messages that were read, shape (n,).
+    :param log_time: when each was recorded [ns], shape (n,).
+    :param publish_time: when each was sent [ns]; 0: unknown; shape (n,).
+    :param values: shape (n,).
     """
 
-    signal: Signal
-    lag_ns: int
-    note: str = ""
+    order: IntArray
+    log_time: IntArray
+    publish_time: IntArray
+    values: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.values.size)
 
 
 @dataclass
@@ -36,11 +50,16 @@ class Topics:
 
     :param path: the bag, as it was given.
     :param files: its files in the order in which they were written.
+    :param clock: which time of a message counts, one of ``CLOCKS``.
+    :param progress: told of how far the files have been read.
     """
 
-    path: Path
+    path: FilePath
     files: Sequence[McapFile]
+    clock: str = "publish"
+    progress: Progress | None = None
     _signals: dict[str, TimedSignal] = field(default_factory=dict)
+    _types: dict[tuple[str, str, str, bytes], Struct] = field(default_factory=dict)
 
     @property
     def notes(self) -> list[str]:
@@ -71,79 +90,159 @@ class Topics:
         """Return the metadata records of a name."""
         return [about for file in self.files for key, about in file.metadata if key == name]
 
-    def messages(self, names: Iterable[str], type_name: str) -> dict[str, Messages]:
-        """Return the messages of topics in the order of the files, with one count for all.
+    def field_of(self, topic: str, wanted: str) -> str:
+        """Return ``TOPIC[:FIELD]`` of a number, without the field where it is the only one.
+
+        :raises SelectionError: if the topic holds no such number.
+        """
+        alone = True
+        for _, channel in self._channels(topic):
+            root = self._type(channel)
+            path = named_field(root, wanted, topic)
+            only = only_field(root)
+            alone &= only is not None and named_field(root, only, topic) == path
+        return topic if alone else f"{topic}:{wanted}"
+
+    def single_numbers(self) -> list[str]:
+        """Return the topics whose messages are there for one number."""
+        found: dict[str, bool] = {}
+        for file in self.files:
+            for channel in file.channels.values():
+                try:
+                    alone = only_field(self._type(channel)) is not None
+                except BagError:
+                    alone = False
+                found[channel.topic] = alone and found.get(channel.topic, True)
+        return [topic for topic, alone in found.items() if alone]
+
+    def columns(self, names: Iterable[str], type_name: str) -> dict[str, Columns]:
+        """Return the values of topics in the order of the files, with one count for all.
 
         :param names: the topics; those without a channel of the type are left out.
-        :param type_name: the type that their messages must have.
+        :param type_name: the type that their messages must have, one of a single number.
         """
-        wanted = set(names)
-        parts: dict[str, list[Messages]] = {}
-        count = 0
-        for file in self.files:
-            channels = [
-                c for c in file.channels.values() if c.topic in wanted and c.type == type_name
-            ]
-            found = file.read([channel.id for channel in channels]) if channels else {}
-            for channel in channels:
-                part = found[channel.id]
-                part.order += count
-                parts.setdefault(channel.topic, []).append(part)
-            count += sum(map(len, found.values()))
-        return {topic: _joined(found) for topic, found in parts.items()}
+        wanted = {
+            (number, channel.id): (name, named_field(self._type(channel), "", name))
+            for name in set(names)
+            for number, channel in self._channels(name)
+            if channel.type == type_name
+        }
+        parts: dict[str, list[tuple[NDArray[Any], ...]]] = {}
+        for key, before, messages in self._messages(wanted):
+            name, path = wanted[key]
+            values, good = _values(path, messages)
+            order = (messages.begin + before)[good]
+            times = (messages.log_time[good], messages.publish_time[good])
+            parts.setdefault(name, []).append((order, *times, values[good].astype(np.float64)))
+        return {
+            name: Columns(*(np.concatenate(column) for column in zip(*found, strict=True)))
+            for name, found in parts.items()
+        }
 
     def decoded(self, type_name: str) -> list[Any]:
         """Return all messages of one of our types, in the order in which they were recorded."""
+        wanted = {
+            (number, channel.id): channel
+            for number, file in enumerate(self.files)
+            for channel in file.channels.values()
+            if channel.type == type_name
+        }
         found: list[tuple[int, Any]] = []
-        for file in self.files:
-            channels: list[Channel] = [c for c in file.channels.values() if c.type == type_name]
-            messages = file.read([channel.id for channel in channels]) if channels else {}
-            for channel in channels:
-                part = messages[channel.id]
-                found += zip(
-                    part.log_time.tolist(), decode_messages(channel, part.payload), strict=True
-                )
+        for key, _, messages in self._messages(wanted):
+            payload = [
+                bytes(messages.content[begin:end])
+                for begin, end in zip(messages.begin.tolist(), messages.end.tolist(), strict=True)
+            ]
+            decoded = decode_messages(wanted[key], payload)
+            found += zip(messages.log_time.tolist(), decoded, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
 
     def signals(self, names: Iterable[str] | None = None) -> dict[str, TimedSignal]:
-        """Return the values of topics of std_msgs/Float64.
+        """Return the values of topics.
 
-        :param names: the topics; default: all of that type.
+        :param names: the topics, each with a field where its type has several numbers; default:
+            all topics whose messages are there for one number.
+        :raises SelectionError: if there is no such number.
+        :raises BagError: if no message of a topic fits its definition.
         """
-        chosen = (
-            [name for name, kind in self.types().items() if kind == FLOAT64]
-            if names is None
-            else list(names)
-        )
-        unread = [name for name in chosen if name not in self._signals]
+        chosen = self.single_numbers() if names is None else list(names)
+        unread = [name for name in dict.fromkeys(chosen) if name not in self._signals]
         if unread:
-            for name, messages in self.messages(unread, FLOAT64).items():
-                self._signals[name] = _timed(name, messages)
+            self._signals.update(self._read(unread))
         return {name: self._signals[name] for name in chosen}
 
+    def _read(self, names: Sequence[str]) -> dict[str, TimedSignal]:
+        readers = self._readers(names, self.clock)
+        again = [name for name, reader in readers.items() if not reader.in_order]
+        if again:
+            # Only where the times are not in order are the recorder's needed beside them.
+            readers |= self._readers(again, self.clock, both=True)
+        return {name: readers[name].signal() for name in names}
 
-def _joined(parts: Sequence[Messages]) -> Messages:
-    if len(parts) == 1:
-        return parts[0]
-    order = np.concatenate([part.order for part in parts])
-    payload = [data for part in parts for data in part.payload]
-    by_order = np.argsort(order)
-    return Messages(
-        order[by_order],
-        np.concatenate([part.log_time for part in parts])[by_order],
-        np.concatenate([part.publish_time for part in parts])[by_order],
-        [payload[i] for i in by_order],
-    )
+    def _readers(
+        self, names: Sequence[str], clock: str, *, both: bool = False
+    ) -> dict[str, SignalReader]:
+        wanted: dict[tuple[int, int], list[tuple[SignalReader, Path, Any]]] = {}
+        readers = {name: SignalReader(name, clock, both=both) for name in names}
+        for name, reader in readers.items():
+            topic, wanted_field = split_name(name)
+            for number, channel in self._channels(topic):
+                root = self._type(channel)
+                stamp = stamp_of(root) if clock == "header" else None
+                if clock == "header" and stamp is None:
+                    raise SelectionError(
+                        f"--clock header: {topic} is of type {channel.type}, which has no header; "
+                        f"expected publish or log"
+                    )
+                path = named_field(root, wanted_field, topic)
+                wanted.setdefault((number, channel.id), []).append((reader, path, stamp))
+        for key, _, messages in self._messages(wanted):
+            for reader, path, stamp in wanted[key]:
+                values, good = _values(path, messages)
+                times = messages.log_time if clock == "log" else messages.publish_time
+                if stamp is not None:
+                    times, dated = _stamps(stamp, messages)
+                    good = good & dated
+                reader.take(values, good, times, messages.log_time)
+        return readers
+
+    def _messages(
+        self, wanted: Mapping[tuple[int, int], Any]
+    ) -> Iterator[tuple[tuple[int, int], int, Messages]]:
+        """Yield the messages of channels, each named by the number of its file and its own."""
+        before, done = 0, 0
+        total = sum(file.size for file in self.files)
+        for number, file in enumerate(self.files):
+            channels = [channel for n, channel in wanted if n == number]
+            last = before
+            if channels:
+                for channel, position, messages in file.read(channels):
+                    last = before + position + len(messages.content) + 1
+                    yield (number, channel), before + position, messages
+                    if self.progress is not None:
+                        self.progress(done + min(position, file.size), total)
+            before, done = last, done + file.size
+
+    def _channels(self, topic: str) -> list[tuple[int, Channel]]:
+        return [
+            (number, channel)
+            for number, file in enumerate(self.files)
+            for channel in file.channels.values()
+            if channel.topic == topic
+        ]
+
+    def _type(self, channel: Channel) -> Struct:
+        key = (channel.type, channel.encoding, channel.schema_encoding, channel.definition)
+        if key not in self._types:
+            self._types[key] = message_type(channel)
+        return self._types[key]
 
 
-def _timed(name: str, messages: Messages) -> TimedSignal:
-    by_log = np.argsort(messages.log_time, kind="stable")
-    log_time, publish_time = messages.log_time[by_log], messages.publish_time[by_log]
-    values = decode_float64(messages.payload)[by_log]
-    if bool(np.any(publish_time == 0)):
-        return TimedSignal(Signal(name, log_time, values), 0)
-    if bool(np.any(np.diff(publish_time) < 0)):
-        note = f"the publish times of {name} go backwards; its log times are used instead"
-        return TimedSignal(Signal(name, log_time, values), 0, note)
-    lag = int(np.min(log_time - publish_time)) if len(messages) else 0
-    return TimedSignal(Signal(name, publish_time, values), lag)
+def _values(path: Path, messages: Messages) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    return path.read(messages.content, messages.begin, messages.end)
+
+
+def _stamps(stamp: tuple[Path, Path], messages: Messages) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Return the time stamps of messages [ns], and which messages have one."""
+    (seconds, good), (rest, also) = (_values(path, messages) for path in stamp)
+    return seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64), good & also

@@ -342,7 +342,7 @@ def test_flipped_bytes_never_break_the_reader(data, tmp_path_factory):
         (b"hello, world, this is text", r"not an MCAP file: it begins with b'hello, w'"),
         (b"SQLite format 3\0" + bytes(100), "not an MCAP file: it is an SQLite file"),
         (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
-        (b"\x28\xb5\x2f\xfd0000000", "compressed as a whole with zstd"),
+        (b"\x28\xb5\x2f\xfd0000000", r"is no recording: bag\.mcap cannot be expanded"),
     ],
 )
 def test_a_file_that_is_no_recording(tmp_path, content, sentence):
@@ -511,12 +511,12 @@ def test_a_topic_that_is_not_there_lists_those_that_are(tmp_path):
 
 
 def test_another_type_is_refused_by_name(tmp_path):
-    own = Definition("float64 x\n")
+    own = Definition("string x\n")
     with BagWriter(
         tmp_path / "bag", [Topic("/x", "x_msgs/msg/X", definition=own), *LOOP], start_ns=START
     ) as bag:
         bag.write("/x", START, START, encode_float64(1.0))
-    with pytest.raises(SelectionError, match=r"/x is of type x_msgs/msg/X; expected"):
+    with pytest.raises(SelectionError, match=r"/x is of type x_msgs/msg/X, which holds no numbers"):
         read_experiments(tmp_path / "bag", Selection("/x", "/command"))
 
 
@@ -589,7 +589,7 @@ def test_big_endian_values(tmp_path):
 def test_values_that_are_no_float64(tmp_path, data):
     with BagWriter(tmp_path / "bag", LOOP, start_ns=START) as bag:
         bag.write("/measurement", START, START, data)
-    with pytest.raises(BagError, match="std_msgs/msg/Float64 message"):
+    with pytest.raises(BagError, match="none of the 1 messages of /measurement fits"):
         read_experiments(tmp_path / "bag", Selection("/measurement", "/command"))
 
 

@@ -11,7 +11,6 @@ from made_bags import REPOSITORY, assert_same_record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from relay_autotune.autotune import analyse
-from relay_autotune.bag.decode import decode_messages
 from relay_autotune.bag.experiments import interrupted_experiment
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.reader import Selection, read_experiments
@@ -51,8 +50,7 @@ def live_result(name: str, type_name: str) -> object:
     """Return the last message of a type, by the definition in the bag."""
     (path,) = (BAGS / name).glob("*.mcap")
     with McapFile(path) as file:
-        (channel,) = (c for c in file.channels.values() if c.type == type_name)
-        return decode_messages(channel, file.read([channel.id])[channel.id].payload)[-1]
+        return Topics(path, [file]).decoded(type_name)[-1]
 
 
 @pytest.mark.parametrize("name", SAMPLES)

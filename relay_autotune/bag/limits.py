@@ -1,0 +1,38 @@
+"""What a file may ask for at most, whatever it declares."""
+
+from __future__ import annotations
+
+from relay_autotune.errors import BagError
+
+# Bytes of a chunk, or of one message outside of chunks; --max-chunk changes it.
+LARGEST_CHUNK = 256 << 20
+
+# Bytes that zstd may hold back while it expands a stream: what its strongest level asks for.
+LARGEST_WINDOW = 128 << 20
+
+# A file compressed as a whole may expand to this many times its size, or to a gigabyte.
+MOST_EXPANSION = 1000
+UNSUSPICIOUS = 1 << 30
+# ... and leaves this much of the disk free.
+FREE_DISK = 256 << 20
+
+# Bytes of the definition of a message type: the largest of the common interfaces has 20 kB.
+LARGEST_DEFINITION = 1 << 20
+
+# Types within types, and fields of all of them together.
+DEEPEST_TYPE = 40
+MOST_FIELDS = 20_000
+
+# Fields, and elements of arrays of unequal size, that are passed on the way to a field.
+MOST_STEPS = 5_000
+
+# Bytes of the index at the end of a file.
+LARGEST_SUMMARY = 256 << 20
+
+
+def missing_package(package: str) -> BagError:
+    """Return the error for a compressed recording without the package that expands it."""
+    return BagError(
+        f"the recording is compressed; to read it install the Python package {package}, "
+        f"with: pip install {package}"
+    )

@@ -1,0 +1,145 @@
+"""The bytes of a recording: ranges of a file, expanded first if it is compressed as a whole."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import BinaryIO
+
+from relay_autotune.bag.limits import (
+    FREE_DISK,
+    LARGEST_WINDOW,
+    MOST_EXPANSION,
+    UNSUSPICIOUS,
+    missing_package,
+)
+from relay_autotune.errors import BagError
+
+MAGIC = b"\x89MCAP0\r\n"
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+# What the file might be instead, by its first bytes.
+_OTHERS = (
+    (b"SQLite format 3", "an SQLite file; convert such a bag with: ros2 bag convert"),
+    (b"#ROSBAG", "a ROS 1 bag; convert it with: rosbags-convert"),
+)
+
+
+class Source:
+    """A file that begins as MCAP files do, open for reading ranges of it.
+
+    The file is read, not mapped: a file that another process cuts short then gives fewer bytes,
+    where a mapping would end this process.
+
+    :param path: the file; it may be compressed as a whole with zstd.
+    :raises BagError: if it is missing, unreadable, empty or something else.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except FileNotFoundError:
+            raise BagError(f"{path} does not exist; expected a recording") from None
+        except OSError as error:
+            raise BagError(f"cannot read {path}: {error.strerror or error}") from error
+        try:
+            if self.read(0, len(_ZSTD_MAGIC)) == _ZSTD_MAGIC:
+                self._expand()
+            self.size = os.fstat(self._file.fileno()).st_size
+            self._check_start()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()
+
+    def read(self, start: int, stop: int) -> bytes:
+        """Return the bytes between two places; fewer if the file ends before.
+
+        :raises BagError: if the file system refuses.
+        """
+        try:
+            data = os.pread(self._file.fileno(), max(stop - start, 0), start)
+            while data and len(data) < stop - start:
+                # A single read gives at most 2 GiB, or what a slow medium has at once.
+                more = os.pread(self._file.fileno(), stop - start - len(data), start + len(data))
+                if not more:
+                    break
+                data += more
+        except OSError as error:
+            raise BagError(f"cannot read {self.path}: {error.strerror or error}") from error
+        return data
+
+    def _check_start(self) -> None:
+        start = self.read(0, 16)
+        if not start and self.notes:
+            raise BagError(f"{self.path} is no recording: {self.notes[0]}")
+        if not start:
+            raise BagError(
+                f"{self.path} is empty (0 bytes); expected an MCAP recording: "
+                f"the recorder was ended before it wrote anything"
+            )
+        if start[: len(MAGIC)] != MAGIC[: len(start)]:
+            told = next((what for head, what in _OTHERS if start.startswith(head)), None)
+            found = f"it is {told}" if told else f"it begins with {start[:8]!r}"
+            raise BagError(f"{self.path} is not an MCAP file: {found}")
+        if len(start) < len(MAGIC):
+            raise BagError(
+                f"{self.path} holds only the first {len(start)} bytes of an MCAP file; "
+                f"nothing was recorded in it"
+            )
+
+    def _expand(self) -> None:
+        """Put what a file that is compressed as a whole holds into a temporary file."""
+        try:
+            import zstandard
+        except ImportError:
+            raise missing_package("zstandard") from None
+        compressed = os.fstat(self._file.fileno()).st_size
+        most = max(UNSUSPICIOUS, MOST_EXPANSION * compressed)
+        # Closed, and thereby deleted, by close().
+        expanded = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
+        try:
+            room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK
+            decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+            self._file.seek(0)
+            with decompressor.stream_reader(self._file, closefd=False) as stream:
+                written = 0
+                while piece := self._piece(stream):
+                    written += len(piece)
+                    if written > most:
+                        raise BagError(
+                            f"{self.path} expands to more than {most} bytes, over "
+                            f"{MOST_EXPANSION} times its size; expected a recording"
+                        )
+                    if written > room:
+                        raise BagError(
+                            f"{self.path} expands to more than the {max(room, 0)} bytes that "
+                            f"are free in {tempfile.gettempdir()}; set TMPDIR to a larger disk"
+                        )
+                    expanded.write(piece)
+            expanded.flush()
+        except OSError as error:
+            expanded.close()
+            raise BagError(f"cannot expand {self.path}: {error.strerror or error}") from error
+        except BaseException:
+            expanded.close()
+            raise
+        self._file.close()
+        self._file = expanded
+
+    def _piece(self, stream: BinaryIO) -> bytes:
+        import zstandard
+
+        try:
+            return stream.read(1 << 20)
+        except zstandard.ZstdError as error:
+            # What came before is a recording that ends there.
+            self.notes.append(f"{self.path.name} cannot be expanded to its end ({error})")
+            return b""

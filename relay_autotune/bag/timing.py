@@ -1,0 +1,121 @@
+"""Values with their times, taken in piece by piece and put into the order of a clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.bag.columns import Column
+from relay_autotune.bag.signals import Signal
+from relay_autotune.errors import BagError
+from relay_autotune.record import IntArray
+
+# Which time of a message counts; the first is the default.
+CLOCKS = ("publish", "log", "header")
+
+
+@dataclass(frozen=True)
+class TimedSignal:
+    """The values of a topic, and what is to be known of its clock.
+
+    :param signal: the values by the time of the chosen clock, or, where that is not known, by
+        the time at which they were recorded.
+    :param lag_ns: smallest time from the clock's time to recording [ns]: the delay of the
+        transport and the difference of the two clocks.
+    :param notes: what to know about it, each a sentence.
+    """
+
+    signal: Signal
+    lag_ns: int
+    notes: tuple[str, ...] = ()
+
+
+class SignalReader:
+    """Collects a signal.
+
+    :param name: of the signal.
+    :param clock: one of ``CLOCKS``.
+    :param both: keep the recorder's times too, for times that are not in order; these take half
+        as much memory again.
+    """
+
+    def __init__(self, name: str, clock: str, *, both: bool = False) -> None:
+        self._name = name
+        self._clock = clock
+        self._values: Column[np.float64] = Column(np.float64)
+        self._times: Column[np.int64] = Column(np.int64)
+        self._log_times: Column[np.int64] | None = Column(np.int64) if both else None
+        self._lag = np.iinfo(np.int64).max
+        self._last = np.iinfo(np.int64).min
+        self._rising = True
+        self._all_dated = True
+        self._unfit = 0
+
+    def take(
+        self,
+        values: NDArray[Any],
+        good: NDArray[np.bool_],
+        times: IntArray,
+        log_times: IntArray,
+    ) -> None:
+        """Add messages, shape (n,) each.
+
+        :param values: their values.
+        :param good: those that have one; the others are left out.
+        :param times: their times by the clock [ns]; 0: unknown.
+        :param log_times: when they were recorded [ns].
+        """
+        if not bool(good.all()):
+            self._unfit += int(good.size - np.count_nonzero(good))
+            values, times, log_times = values[good], times[good], log_times[good]
+        if values.size == 0:
+            return
+        self._rising &= int(times[0]) >= self._last and bool((times[1:] >= times[:-1]).all())
+        self._last = int(times[-1])
+        if self._clock != "log":
+            self._all_dated &= bool(times.all())
+            # The times of a clock that is far off must not overflow.
+            self._lag = min(self._lag, int((log_times // 2 - times // 2).min()) * 2)
+        self._values.extend(values)
+        self._times.extend(times)
+        if self._log_times is not None:
+            self._log_times.extend(log_times)
+
+    @property
+    def in_order(self) -> bool:
+        """Whether the times need not be compared with the recorder's."""
+        return self._log_times is not None or (self._rising and self._all_dated)
+
+    def signal(self) -> TimedSignal:
+        """Return what was collected; nothing can be added after that.
+
+        :raises BagError: if messages came, and none of them had a value.
+        """
+        values, times = self._values.values(), self._times.values()
+        notes: list[str] = []
+        if self._unfit:
+            if values.size == 0:
+                raise BagError(
+                    f"none of the {self._unfit} messages of {self._name} fits its definition"
+                )
+            notes.append(
+                f"{self._unfit} of {self._unfit + values.size} messages of {self._name} do not "
+                f"fit their definition, or lack the field; they are left out"
+            )
+        lag = 0 if self._clock == "log" or values.size == 0 else self._lag
+        if self._log_times is not None:
+            log_times = self._log_times.values()
+            order = np.argsort(log_times, kind="stable")
+            log_times, times, values = log_times[order], times[order], values[order]
+            back = bool((times[1:] < times[:-1]).any())
+            if back or not self._all_dated:
+                times, lag = log_times, 0
+            if back and self._all_dated and self._clock != "log":
+                notes.append(
+                    f"the {self._clock} times of {self._name} go backwards; "
+                    f"its log times are used instead"
+                )
+        return TimedSignal(Signal(self._name, times, values), lag, tuple(notes))
