@@ -51,7 +51,7 @@ def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
     :param model: the process.
     """
     crossings = sorted(_crossings(model), key=lambda c: c.gain)
-    on_the_right = _unstable_at_small_gain(model)
+    on_the_right = unstable_at_small_gain(model)
     was_stable = on_the_right == 0
     for crossing in crossings:
         on_the_right += crossing.roots_to_the_right
@@ -71,7 +71,7 @@ def unstable_poles(loop: TransferFunction) -> int:
 
     :param loop: controller times process, with the sign that makes its feedback negative.
     """
-    count = _unstable_at_small_gain(loop)
+    count = unstable_at_small_gain(loop)
     return count + sum(c.roots_to_the_right for c in _crossings(loop, 1.0) if c.gain < 1.0)
 
 
@@ -85,7 +85,7 @@ def phase_crossings(loop: TransferFunction) -> list[UltimatePoint]:
     return [UltimatePoint(c.gain, c.frequency) for c in _crossings(loop, 1.0)]
 
 
-def _unstable_at_small_gain(model: TransferFunction) -> int:
+def unstable_at_small_gain(model: TransferFunction) -> int:
     """Closed-loop poles in the right half plane as the gain leaves zero."""
     unstable = sum(1 for t in model.time_constants if t.real < 0.0)
     m = model.integrators

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
@@ -120,3 +120,10 @@ class DesignTask:
     simple: TransferFunction | None = None
     models: tuple[TransferFunction, ...] = ()
     describing: UltimatePoint | None = None
+
+    def in_loop(self, model: TransferFunction) -> TransferFunction:
+        """Return a process with the dead time that the loop adds to it.
+
+        :param model: the process, or one of those around it.
+        """
+        return replace(model, dead_time=model.dead_time + self.options.added_delay)

@@ -1,0 +1,71 @@
+r"""What measurement noise does to the command of a sampled controller."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.tuning.sampled import filter_matrices
+
+FloatArray = NDArray[np.float64]
+
+# Time constants of the filter over the sampling period, between which is interpolated.
+_RATIOS = np.geomspace(1e-3, 1e4, 141)
+
+
+@lru_cache(maxsize=1)
+def _moments() -> FloatArray:
+    """Return var(yf), cov(yf, h yf') and var(h yf') for each of ``_RATIOS``, shape (3, n)."""
+    rows = []
+    for ratio in _RATIOS:
+        turn, past, present = filter_matrices(float(ratio), 1.0)
+        # What the state and the next sample share is the sample before.
+        shared = turn @ np.outer(present, past)
+        drive = np.outer(past, past) + np.outer(present, present) + shared + shared.T
+        operator = np.eye(4) - np.kron(turn, turn)
+        covariance = np.linalg.solve(operator, drive.ravel())
+        rows.append(covariance[[0, 1, 3]])
+    return np.array(rows).T
+
+
+def open_noise_gain(td: FloatArray, tf: FloatArray, period: float) -> FloatArray:
+    """Return the standard deviation of ``yf + td dyf/dt`` per that of white sampled noise.
+
+    Times kp it is that of the command, but for the integral's share and for what the loop feeds
+    back.
+
+    :param td: derivative times [s], shape (k,).
+    :param tf: time constants of the filter [s], shape (k,).
+    :param period: of the samples [s].
+    """
+    at = np.log(np.maximum(tf / period, _RATIOS[0]))
+    value, mixed, slope = (np.interp(at, np.log(_RATIOS), row) for row in _moments())
+    lead = td / period
+    return np.sqrt(value + 2.0 * lead * mixed + lead**2 * slope)
+
+
+def filter_for(td: FloatArray, largest: FloatArray, period: float) -> FloatArray:
+    """Return the least time constant of the filter with which the noise gain keeps a limit.
+
+    :param td: derivative times [s], shape (k,).
+    :param largest: what :func:`open_noise_gain` may be, shape (k,).
+    :param period: of the samples [s].
+    :return: s, shape (k,); infinite: none of a usable size.
+    """
+    value, mixed, slope = _moments()
+    lead = (td / period)[:, None]
+    gains = np.sqrt(value + 2.0 * lead * mixed + lead**2 * slope)
+    # A filter that is slow enough makes it ever smaller.
+    keeps = gains <= largest[:, None]
+    first = np.where(keeps.any(axis=1), keeps.argmax(axis=1), _RATIOS.size)
+    inside = np.clip(first, 1, _RATIOS.size - 1)
+    rows = np.arange(td.size)
+    above, below = np.log(gains[rows, inside - 1]), np.log(gains[rows, inside])
+    share = np.clip((above - np.log(largest)) / np.maximum(above - below, 1e-300), 0.0, 1.0)
+    steps = np.log(_RATIOS)
+    found = np.exp(steps[inside - 1] + share * (steps[inside] - steps[inside - 1])) * period
+    found = np.where(first == 0, 0.0, found)
+    return np.where(first == _RATIOS.size, math.inf, found)

@@ -1,0 +1,162 @@
+"""Robust design: the PI or PID controller of least IAE within bounds on the sensitivities."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from relay_autotune.errors import TuningError
+from relay_autotune.tuning.frontier import Bounds
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.search import NoiseLimit, Optimum, Search
+from relay_autotune.tuning.task import MS_RANGE, DesignOptions, DesignTask
+
+# PID has to lower the IAE at least this far to be worth its derivative.
+WORTH = 0.75
+# Above the least bound that any controller attains.
+_RELAXED = 1.15
+_KINDS = {False: "PI", True: "PID"}
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """The best controller of one kind, and what had to be given up for it."""
+
+    optimum: Optimum
+    bounds: Bounds
+    derivative: bool
+    warnings: tuple[str, ...] = ()
+
+
+def robust(task: DesignTask) -> tuple[Controller, str]:
+    """Return the controller of least IAE after a load step, with bounds on Ms and Mt.
+
+    The bounds hold on the model and on 95 % of those around it, with half a sampling period and
+    the loop's own delay added to the dead time. The optimisation follows Astrom, Panagopoulos
+    and Hagglund (1998) in its bounds and Garpinger and Hagglund (2015) in its cost. PI is
+    preferred; PID is chosen where its IAE is lower by 25 % or more, or where no PI controller
+    keeps the bounds. Where none does, the bound is put 15 % above the least that any attains.
+
+    :param task: the process and what is asked for.
+    :return: the controller, and the reason, which says what could not be kept.
+    :raises TuningError: if no controller of the kind asked for holds the process, or nothing
+        limits the gain.
+    """
+    options = task.options
+    model = task.in_loop(task.model)
+    around = tuple(task.in_loop(m) for m in task.models if m.process_sign == model.process_sign)
+    bounds = Bounds(options.ms, options.largest_mt(task.model))
+    search = Search(model, around, options.filter_ratio, _noise_limit(options))
+    if options.controller == "auto":
+        return _chosen(search, bounds)
+    derivative = options.controller == "pid"
+    found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
+    return found.optimum.controller, _promise(found, search)
+
+
+def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
+    """Return PI unless PID is worth it."""
+    pi = _within(search, bounds, False)
+    if pi is None:
+        pid = _within(search, bounds, True) or _relaxed(search, bounds, True)
+        reason = f"{_promise(pid, search)}; no PI controller keeps the bounds that were asked for"
+        return pid.optimum.controller, reason
+    try:
+        other = _within(search, bounds, True)
+    except TuningError:
+        # Nothing limits PID on a model without dead time, and PI was found.
+        other = None
+    if other is None:
+        return pi.optimum.controller, _promise(pi, search)
+    share = other.optimum.iae / pi.optimum.iae
+    if share > WORTH:
+        reason = f"PID would still have {100.0 * share:.0f} % of its IAE"
+    elif search.noise is None:
+        reason = f"PID would have {100.0 * share:.0f} % of its IAE, but the noise is not known"
+    else:
+        reason = f"{_promise(other, search)}; its IAE is {100.0 * share:.0f} % of that of PI"
+        return other.optimum.controller, reason
+    return pi.optimum.controller, f"{_promise(pi, search)}; {reason}"
+
+
+def _noise_limit(options: DesignOptions) -> NoiseLimit | None:
+    """Return what is asked of the noise in the command; None: the noise is not known."""
+    known = options.noise_std > 0.0 and options.amplitude > 0.0 and options.sample_period > 0.0
+    if not known:
+        return None
+    largest = options.noise_share * options.amplitude / options.noise_std
+    return NoiseLimit(largest, options.sample_period)
+
+
+def _within(search: Search, bounds: Bounds, derivative: bool) -> _Attempt | None:
+    """Return the best controller that keeps all limits, None where none does."""
+    optimum = search.optimum(bounds, derivative=derivative)
+    return None if optimum is None else _Attempt(optimum, bounds, derivative)
+
+
+def _relaxed(search: Search, asked: Bounds, derivative: bool) -> _Attempt:
+    """Return the best controller within the tightest bounds that leave room for one.
+
+    :raises TuningError: if none holds the process.
+    """
+    kind, warnings = _KINDS[derivative], []
+    if search.noise is not None:
+        quiet = replace(search, noise=None)
+        found = _within(quiet, asked, derivative)
+        warning = (
+            "no controller keeps both the bounds and the limit of the noise in the command: the "
+            "noise is not limited; a smaller noise_std, a larger noise_share or a slower sensor "
+            "filter would"
+        )
+        if found is not None:
+            return replace(found, warnings=(warning,))
+        search, warnings = quiet, [warning]
+    least = search.least_ms(derivative=derivative)
+    if least > MS_RANGE[1]:
+        raise TuningError(_cannot_hold(search, kind, least))
+    bounds = asked
+    if least > asked.ms:
+        bounds = replace(bounds, ms=_RELAXED * least)
+        warnings.append(_relaxation(kind, "Ms", asked.ms, least, bounds.ms))
+    least = search.least_mt(bounds.ms, derivative=derivative)
+    if least > asked.mt:
+        bounds = replace(bounds, mt=_RELAXED * least)
+        warnings.append(_relaxation(kind, "Mt", asked.mt, least, bounds.mt))
+    found = _within(search, bounds, derivative)
+    if found is None:
+        raise TuningError(_cannot_hold(search, kind, math.inf))
+    return replace(found, warnings=tuple(warnings))
+
+
+def _relaxation(kind: str, name: str, asked: float, least: float, used: float) -> str:
+    return (
+        f"no {kind} controller keeps {name} <= {asked:g} on this process, whose smallest "
+        f"attainable {name} is {least:.3g}: designed for {name} <= {used:.3g}"
+    )
+
+
+def _cannot_hold(search: Search, kind: str, least: float) -> str:
+    """Return a sentence that names the limit which was crossed."""
+    model = search.model
+    if model.structure == "unstable_fopdt":
+        ratio = model.dead_time / abs(model.time_constants[0].real)
+        limit = f"an unstable process with D/tau = {ratio:.3g} (PI needs less than 1, PID than 2)"
+    elif search.models:
+        limit = f"the process on 95 % of the {len(search.models)} models around it"
+    else:
+        limit = "the process"
+    attains = f" below Ms = {least:.3g}" if math.isfinite(least) else ""
+    return (
+        f"no {kind} controller holds {limit}{attains}, at most {MS_RANGE[1]:g} is allowed: "
+        "shorten the dead time, or identify it more accurately"
+    )
+
+
+def _promise(attempt: _Attempt, search: Search) -> str:
+    bounds, around = attempt.bounds, search.models
+    where = f"on the model and 95 % of {len(around)} around it" if around else "on the model"
+    promise = (
+        f"{_KINDS[attempt.derivative]} of least IAE after a load step with Ms <= "
+        f"{bounds.ms:.3g} and Mt <= {bounds.mt:.3g} {where}"
+    )
+    return "; ".join((promise, *attempt.warnings))

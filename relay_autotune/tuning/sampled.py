@@ -1,0 +1,104 @@
+r"""The controller as it runs: at a sampling period, within the limits of its actuator.
+
+The filter is advanced exactly for a measurement that runs straight from one sample to the next,
+so that it has the same lag at every sampling period, and without a filter the derivative is the
+difference quotient. The integral is advanced by the backward rule, and drawn back by what the
+limits cut off (Astrom and Hagglund's back-calculation), so that it does not wind up.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from relay_autotune.errors import TuningError
+from relay_autotune.tuning.gains import Controller
+
+FloatArray = NDArray[np.float64]
+
+
+class SampledController(Protocol):
+    """What turns one sample of the measurement into one command."""
+
+    period: float
+
+    def step(self, setpoint: float, measurement: float) -> float:
+        """Return the command for this sample [u]."""
+
+
+def filter_matrices(tf: float, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how ``(yf, dyf/dt)`` moves on over one period.
+
+    ``x = F x + g0 y + g1 y_next`` with ``yf + tf yf' + tf^2/2 yf'' = y``.
+
+    :param tf: time constant of the filter [s]; 0: none.
+    :param period: s.
+    :return: F of shape (2, 2), g0 and g1 of shape (2,).
+    """
+    if tf <= 1e-6 * period:
+        return np.zeros((2, 2)), np.array([0.0, -1.0 / period]), np.array([1.0, 1.0 / period])
+    stiff = 2.0 / tf**2
+    # State, input, and the input's slope times the period.
+    chain = np.zeros((4, 4))
+    chain[0, 1] = 1.0
+    chain[1, :3] = -stiff, -2.0 / tf, stiff
+    chain[2, 3] = 1.0 / period
+    moved = expm(chain * period)
+    ramp = moved[:2, 3]
+    return moved[:2, :2], moved[:2, 2] - ramp, ramp
+
+
+class SampledPid:
+    """A PI or PID controller that is called once for each sample.
+
+    :param controller: the gains.
+    :param period: of the samples [s].
+    :param low: least command [u].
+    :param high: largest command [u].
+    :param offset: command at which the integral starts [u].
+    :param measurement: at which the filter starts [y].
+    :raises TuningError: if the period is not positive or the limits leave no range.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        period: float,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        offset: float = 0.0,
+        measurement: float = 0.0,
+    ) -> None:
+        if not 0.0 < period < math.inf:
+            raise TuningError(f"the sampling period must be > 0 s and finite, found {period:g} s")
+        if not low < high:
+            raise TuningError(f"the command's limits leave no range, found {low:g} to {high:g}")
+        self.period = period
+        self._gains, self._low, self._high = controller, low, high
+        self._motion = filter_matrices(controller.tf, period)
+        self._filter = np.array([measurement, 0.0])
+        self._last = measurement
+        self._integral = offset
+        tracking = math.sqrt(controller.ti * controller.td) or controller.ti
+        self._draw = min(1.0, period / tracking) if tracking > 0.0 else 0.0
+
+    def step(self, setpoint: float, measurement: float) -> float:
+        """Return the command for this sample [u].
+
+        :param setpoint: y.
+        :param measurement: y.
+        """
+        c, (turn, past, present) = self._gains, self._motion
+        self._filter = turn @ self._filter + past * self._last + present * measurement
+        self._last = measurement
+        value, slope = self._filter
+        self._integral += c.i * self.period * (setpoint - value)
+        wanted = c.kc * (c.b * setpoint - value - c.td * slope) + self._integral
+        given = min(max(wanted, self._low), self._high)
+        self._integral += self._draw * (given - wanted)
+        return float(given)

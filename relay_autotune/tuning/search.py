@@ -1,0 +1,352 @@
+"""The search for the PI or PID controller of least IAE within bounds on the sensitivities.
+
+Where the integral gain is as large as the bounds leave, only kp and td remain to be chosen. A
+scan of both finds the region of the optimum; a pattern search closes in on it, and then tries
+whether a smaller integral gain is better still. The optimum often lies where two bounds meet,
+on a ridge, which is why the directions of the pattern change from step to step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.frontier import Bounds, Responses
+from relay_autotune.tuning.gain_range import stable_gains
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.load_cost import load_iaes
+from relay_autotune.tuning.noise import filter_for
+from relay_autotune.ultimate import ultimate_point
+
+FloatArray = NDArray[np.float64]
+
+_SHARE = 0.95
+# Proportional gains are scanned over this part of the stable range, from its upper end.
+_DEPTH = 1e4
+_GAINS = {False: 64, True: 32}
+# Derivative times, in periods of the ultimate point.
+_TIMES = np.geomspace(3e-3, 1.0, 14)
+_FIRST_STEP, _LAST_STEP, _SHRINK, _GROW = 0.12, 1e-3, 0.6, 1.5
+_DIRECTIONS = 10
+_TRIED_AT_ONCE = 40
+# What a bound may exceed 1 by.
+_LEAST_EXCESS, _LARGEST_EXCESS, _EXCESS_TOLERANCE = 0.01, 100.0, 0.01
+_MARGIN = 1.2
+_UNLIMITED = 0.1
+_NO_LIMIT = (
+    "nothing limits the gain of a controller on this model, which has no dead time: give the "
+    "controller's sampling period or the loop's delay"
+)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Controllers to compare, the sign of their process left out.
+
+    :param kp: proportional gains, shape (k,).
+    :param ki: integral gains, shape (k,).
+    :param td: derivative times [s], shape (k,).
+    :param tf: time constants of the filter [s], shape (k,).
+    """
+
+    kp: FloatArray
+    ki: FloatArray
+    td: FloatArray
+    tf: FloatArray
+
+    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
+        return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
+
+    def controller(self, k: int, sign: int) -> Controller:
+        """Return one of them for a process of a sign."""
+        kp, ki = float(self.kp[k]), float(self.ki[k])
+        return Controller(sign * kp, kp / ki, float(self.td[k]), float(self.tf[k]))
+
+
+@dataclass(frozen=True)
+class NoiseLimit:
+    """How much of the measurement noise may reach the command.
+
+    :param gain: largest standard deviation of the command over that of the noise [u/y].
+    :param period: of the samples [s].
+    """
+
+    gain: float
+    period: float
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The controller that a search found.
+
+    :param controller: the gains.
+    :param iae: of a unit step of the load, as the search saw it [y s/u].
+    """
+
+    controller: Controller
+    iae: float
+
+
+@dataclass(frozen=True)
+class Search:
+    """A process, what a controller must keep to, and where to look for it.
+
+    :param model: the process, with all dead time of the loop.
+    :param models: models around it, on all but 5 % of which the bounds hold as well.
+    :param filter_ratio: largest td/tf.
+    :param noise: the limit of the noise in the command; None: none.
+    """
+
+    model: TransferFunction
+    models: tuple[TransferFunction, ...] = ()
+    filter_ratio: float = 10.0
+    noise: NoiseLimit | None = None
+
+    @cached_property
+    def frequency(self) -> float:
+        """Frequency about which the loop is closed [rad/s]."""
+        point = ultimate_point(self.model)
+        if point is not None:
+            return point.frequency
+        constants = [abs(c) for c in (*self.model.time_constants, self.model.dead_time) if c]
+        return 1.0 / min(constants, default=1.0)
+
+    @cached_property
+    def _largest_kp(self) -> float:
+        """A gain beyond all that is of use, where no gain makes the loop unstable."""
+        return 1e4 / abs(complex(self.model(1j * self.frequency)))
+
+    @cached_property
+    def responses(self) -> Responses:
+        """Response of the process, at the frequencies where bounds are tested."""
+        return Responses((self.model,), design_grid(self.model, self.frequency))
+
+    @cached_property
+    def around(self) -> Responses | None:
+        """Responses of the models around the process."""
+        return Responses(self.models, self.responses.grid[::2]) if self.models else None
+
+    def optimum(self, bounds: Bounds, *, derivative: bool) -> Optimum | None:
+        """Return the controller of least IAE, or None where none keeps the bounds.
+
+        :param bounds: on the sensitivities.
+        :param derivative: True: PID, False: PI.
+        :raises TuningError: if nothing limits the gain.
+        """
+        alone = replace(self, models=())
+        alone.__dict__.update(frequency=self.frequency, responses=self.responses)
+        scanned = alone.scan(bounds, self._times(derivative))
+        if scanned is None:
+            return None
+        if np.isinf(scanned.ki).any():
+            raise TuningError(_NO_LIMIT)
+        start, iae = alone.least(scanned)
+        point, iae = alone.descend(bounds, start, iae)
+        if self.models:
+            found = self._nearby(bounds, point)
+            if found is None:
+                return None
+            point, iae = self.descend(bounds, *found)
+        best = self._at(bounds, point[None])
+        if best.kp[0] > _UNLIMITED * self._largest_kp:
+            raise TuningError(_NO_LIMIT)
+        return Optimum(best.controller(0, self.model.process_sign), iae)
+
+    def largest_integral_gain(self, bounds: Bounds) -> Controller | None:
+        """Return the PI controller of largest integral gain (MIGO, Astrom et al. 1998).
+
+        :param bounds: on the sensitivities.
+        """
+        scanned = self.scan(bounds, self._times(False))
+        if scanned is None:
+            return None
+        best, step = float(scanned.kp[np.argmax(scanned.ki)]), math.log(_DEPTH) / _GAINS[False]
+        zero = np.zeros(9)
+        while step > 1e-5:
+            kp = best * np.exp(step * np.linspace(-1.0, 1.0, 9))
+            best = float(kp[np.argmax(self._limits(bounds, kp, zero, zero))])
+            step /= 4.0
+        gains = np.array([best])
+        ki = self._limits(bounds, gains, zero[:1], zero[:1])
+        return Candidates(gains, ki, zero[:1], zero[:1]).controller(0, self.model.process_sign)
+
+    def _times(self, derivative: bool) -> FloatArray:
+        return _TIMES * 2.0 * math.pi / self.frequency if derivative else np.zeros(1)
+
+    def scan(self, bounds: Bounds, times: FloatArray) -> Candidates | None:
+        """Return controllers all over the stable range that keep the bounds; None: none does.
+
+        :param bounds: on the sensitivities.
+        :param times: derivative times [s], shape (n,); one of 0: PI.
+        """
+        derivative = bool(np.any(times))
+        count = _GAINS[derivative]
+        kp, td = [], []
+        for time in times.tolist():
+            span = stable_gains(self.model, self.responses.grid, time, time / self.filter_ratio)
+            if span is None:
+                continue
+            low, high = span
+            if math.isinf(high):
+                high = self._largest_kp
+            kp.append(np.geomspace(max(low, high / _DEPTH), high, count + 1)[:-1])
+            td.append(np.full(count, time))
+        if not kp:
+            return None
+        points = [np.log(np.concatenate(kp))]
+        if derivative:
+            points.append(np.log(np.concatenate(td)))
+        found = self._at(bounds, np.column_stack((*points, np.zeros(points[0].size))))
+        found = found[found.ki > 0.0]
+        return found if found.kp.size else None
+
+    def least_ms(self, *, derivative: bool) -> float:
+        """Return the least Ms that some controller attains, infinite where none is stable."""
+        return self._least_bound(lambda ms: Bounds(ms), derivative)
+
+    def least_mt(self, ms: float, *, derivative: bool) -> float:
+        """Return the least Mt that some controller attains while it keeps a bound on Ms."""
+        return self._least_bound(lambda mt: Bounds(ms, mt), derivative)
+
+    def _least_bound(self, bounds: Callable[[float], Bounds], derivative: bool) -> float:
+        low, high = math.log(_LEAST_EXCESS), math.log(_LARGEST_EXCESS)
+        times = self._times(derivative)
+        found = self.scan(bounds(1.0 + math.exp(high)), times)
+        if found is None:
+            return math.inf
+        while high - low > _EXCESS_TOLERANCE:
+            middle = 0.5 * (low + high)
+            found = self.scan(bounds(1.0 + math.exp(middle)), times)
+            if found is None:
+                low = middle
+                continue
+            high = middle
+            if derivative:
+                # The tighter the bound, the narrower the range of times that attain it.
+                ends = float(found.td.min()) / _MARGIN, float(found.td.max()) * _MARGIN
+                times = np.geomspace(*ends, _TIMES.size)
+        return 1.0 + math.exp(high)
+
+    def least(self, scanned: Candidates) -> tuple[FloatArray, float]:
+        """Return where the IAE is least among some controllers, and how large it is there.
+
+        The IAE is at least ``1/ki``, so that few have to be followed in time.
+        """
+        order = np.argsort(-scanned.ki)
+        first, rest = order[:_TRIED_AT_ONCE], order[_TRIED_AT_ONCE:]
+        iaes = self._iaes(scanned[first])
+        best, iae = int(first[np.argmin(iaes)]), float(iaes.min())
+        rest = rest[scanned.ki[rest] * iae > 1.0]
+        if rest.size:
+            iaes = self._iaes(scanned[rest])
+            if iaes.min() < iae:
+                best, iae = int(rest[np.argmin(iaes)]), float(iaes.min())
+        td = [math.log(scanned.td[best])] if scanned.td[best] > 0.0 else []
+        return np.array([math.log(scanned.kp[best]), *td, 0.0]), iae
+
+    def descend(self, bounds: Bounds, point: FloatArray, iae: float) -> tuple[FloatArray, float]:
+        """Return the optimum near a point, and its IAE.
+
+        :param bounds: on the sensitivities.
+        :param point: logarithms of kp, of td (PID only), and of the share of the largest integral
+            gain that is used.
+        :param iae: there [y s/u].
+        """
+        free = point.size - 1
+        for size in (free, free + 1):
+            rng = np.random.default_rng(0)
+            step = _FIRST_STEP
+            while step > _LAST_STEP:
+                moves = np.zeros((_DIRECTIONS if size > 1 else 0, point.size))
+                moves[:, :size] = rng.standard_normal((len(moves), size))
+                moves /= np.linalg.norm(moves, axis=1)[:, None]
+                axes = np.eye(point.size)[:size]
+                tried = point + step * np.concatenate((axes, -axes, moves))
+                tried[:, -1] = np.minimum(tried[:, -1], 0.0)
+                iaes = self._worth(bounds, tried, iae)
+                best = int(np.argmin(iaes))
+                if iaes[best] < iae * (1.0 - 1e-7):
+                    point, iae, step = tried[best], float(iaes[best]), step * _GROW
+                else:
+                    step *= _SHRINK
+        return point, iae
+
+    def _nearby(self, bounds: Bounds, point: FloatArray) -> tuple[FloatArray, float] | None:
+        """Return where to begin with the models around the process as well."""
+        tried = np.repeat(point[None], 12, axis=0)
+        tried[:, 0] += np.log(np.geomspace(1.2, 0.02, 12))
+        iaes = self._worth(bounds, tried, math.inf)
+        best = int(np.argmin(iaes))
+        return (tried[best], float(iaes[best])) if math.isfinite(iaes[best]) else None
+
+    def _worth(self, bounds: Bounds, points: FloatArray, iae: float) -> FloatArray:
+        """Return the IAE of each point, infinite where it is larger than ``iae`` for certain."""
+        c = self._at(bounds, points)
+        useful = (c.ki > 0.0) & np.isfinite(c.ki)
+        useful[useful] &= c.ki[useful] * iae > 1.0
+        iaes = np.full(points.shape[0], math.inf)
+        if useful.any():
+            iaes[useful] = self._iaes(c[useful])
+        return iaes
+
+    def _at(self, bounds: Bounds, points: FloatArray) -> Candidates:
+        """Return the controllers of points, those without a usable filter with ki = -inf."""
+        kp = np.exp(points[:, 0])
+        td = np.exp(points[:, 1]) if points.shape[1] > 2 else np.zeros(kp.size)
+        tf = self._filters(kp, td)
+        usable = np.isfinite(tf)
+        ki = np.full(kp.size, -math.inf)
+        ki[usable] = self._limits(bounds, kp[usable], td[usable], tf[usable])
+        return Candidates(kp, ki * np.exp(points[:, -1]), td, tf)
+
+    def _limits(
+        self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
+    ) -> FloatArray:
+        """Return the largest integral gains, shape (k,)."""
+        limits = self.responses.largest_ki(bounds, kp, td, tf)[:, 0]
+        if self.around is None or not kp.size:
+            return limits
+        others = np.sort(self.around.largest_ki(bounds, kp, td, tf), axis=1)
+        return np.minimum(limits, others[:, allowed_outside(len(self.models))])
+
+    def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
+        """Return the filter that each controller needs [s], shape (k,)."""
+        least = td / self.filter_ratio
+        if self.noise is None:
+            return least
+        return np.maximum(least, filter_for(td, self.noise.gain / kp, self.noise.period))
+
+    def _iaes(self, c: Candidates) -> FloatArray:
+        return load_iaes(self.model, c.kp, c.ki, c.td, c.tf, self.frequency)
+
+
+def allowed_outside(count: int) -> int:
+    """Return how many of so many models may exceed a bound."""
+    return int((1.0 - _SHARE) * count + 1e-9)
+
+
+def design_grid(model: TransferFunction, frequency: float) -> FloatArray:
+    """Return the frequencies at which bounds are tested [rad/s].
+
+    :param model: the process.
+    :param frequency: about which the loop is closed [rad/s].
+    """
+    parts = [np.geomspace(1e-3 * frequency, 100.0 * frequency, 300)]
+    if model.dead_time > 0.0:
+        # With derivative action a lag of first order lets every turn pass alike, up to the filter.
+        flat = len(model.time_constants) + model.integrators - len(model.zeros) <= 1
+        turns = np.arange(0.1, (24.0 if flat else 8.0) * math.pi, 0.2) / model.dead_time
+        parts.append(turns[turns < 300.0 * frequency])
+    for c in (*model.zeros, *model.time_constants):
+        if c.imag > 0.0 and abs(c.real) < 0.5 * abs(c):
+            width = abs(c.real) / abs(c)
+            around = (1.0 + width * np.linspace(-6.0, 6.0, 49)) / abs(c)
+            parts.append(around[around > 0.0])
+    return np.unique(np.concatenate(parts))

@@ -1,0 +1,160 @@
+"""Robust design against worked cases, closed forms and what no controller can do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from worked_cases import PROCESSES, cases
+
+from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.analysis import analyse_loop, is_stable
+from relay_autotune.tuning.frontier import Bounds
+from relay_autotune.tuning.robust import robust
+from relay_autotune.tuning.search import Search
+from relay_autotune.tuning.task import DesignOptions, DesignTask
+
+DESIGNS = cases("design.")
+MIGO = [c for c in DESIGNS if "MIGO" in c[0]]
+LEAST = [c for c in DESIGNS if "minIAE PI " in c[0]]
+LEAST_PID = [c for c in DESIGNS if "minIAE PID" in c[0]]
+
+
+def _asked(name: str) -> float:
+    return float(name.rsplit("PI", 1)[1].lstrip("D").split()[0])
+
+
+def _ms_of(controller, model) -> float:
+    """Return the largest sensitivity on a grid that has nothing to do with the search's own."""
+    w = np.geomspace(1e-2, 1e2, 50_001) / (model.dead_time + abs(model.time_constants[0]))
+    s = 1j * w
+    c = controller.kc * (1.0 + 1.0 / (controller.ti * s) + controller.td * s)
+    loop = c / (1.0 + controller.tf * s + 0.5 * (controller.tf * s) ** 2) * model(s)
+    return float(np.max(1.0 / np.abs(1.0 + loop)))
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), MIGO, ids=[c[0] for c in MIGO])
+def test_the_largest_integral_gain(name, inputs, exact, tol):
+    model, ms = PROCESSES[inputs["process"]], _asked(name)
+    found = Search(model).largest_integral_gain(Bounds(ms))
+    assert found.i >= inputs["Kc"] / inputs["Ti"] * (1.0 - 2e-4)
+    assert _ms_of(found, model) == pytest.approx(ms, abs=1e-3)
+    if "ex4" not in name or ms > 1.4:
+        assert found.kc == pytest.approx(inputs["Kc"], rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "inputs", "exact", "tol"), LEAST, ids=[c[0] for c in LEAST])
+def test_the_least_iae_of_pi(name, inputs, exact, tol):
+    model, ms = PROCESSES[inputs["process"]], _asked(name)
+    found = Search(model).optimum(Bounds(ms), derivative=False)
+    assert is_stable(found.controller, model)
+    assert found.controller.td == found.controller.tf == 0.0
+    assert _ms_of(found.controller, model) <= ms + 1e-3
+    assert analyse_loop(found.controller, model).iae_load <= exact["IAE_load"] * (1.0 + tol)
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs", "exact", "tol"), LEAST_PID, ids=[c[0] for c in LEAST_PID]
+)
+def test_the_least_iae_of_pid(name, inputs, exact, tol):
+    model, ms = PROCESSES[inputs["process"]], _asked(name)
+    found = Search(model).optimum(Bounds(ms), derivative=True)
+    assert is_stable(found.controller, model)
+    assert found.controller.tf == pytest.approx(found.controller.td / 10.0)
+    assert _ms_of(found.controller, model) <= ms + 1e-3
+    # The pattern search may stop short on the ridge where two bounds meet.
+    assert analyse_loop(found.controller, model).iae_load <= exact["IAE_load"] * 1.008
+
+
+@pytest.mark.parametrize(
+    ("ratio", "pi", "pid"), [(0.22, 1.61, 1.35), (0.3, 1.97, 1.52), (0.5, 3.55, 2.08)]
+)
+def test_the_least_ms_on_an_unstable_process(ratio, pi, pid):
+    search = Search(TransferFunction.unstable_fopdt(1.0, 1.0, ratio))
+    assert search.least_ms(derivative=False) == pytest.approx(pi, rel=0.01)
+    assert search.least_ms(derivative=True) == pytest.approx(pid, rel=0.015)
+
+
+def test_an_infeasible_bound_is_relaxed_with_a_warning():
+    model = TransferFunction.unstable_fopdt(2.0, 3.0, 0.9)
+    options = DesignOptions(controller="pi")
+    controller, reason = robust(DesignTask(model=model, options=options))
+    performance = analyse_loop(controller, model)
+    assert performance.ms <= 1.16 * 1.98
+    assert "smallest attainable Ms is 1.9" in reason
+    assert "no PI controller keeps Mt <= 1.4" in reason
+    controller, reason = robust(DesignTask(model=model))
+    assert controller.td > 0.0
+    assert "no PI controller" in reason
+    assert analyse_loop(controller, model).ms <= 1.16 * 1.53
+
+
+def test_pid_has_to_be_worth_its_derivative():
+    model = TransferFunction.fopdt(1.0, 1.0, 0.5)
+    quiet = DesignOptions(noise_std=1e-4, amplitude=1.0, sample_period=0.02)
+    controller, reason = robust(DesignTask(model=model, options=quiet))
+    assert controller.td > 0.0
+    assert controller.td / controller.tf == pytest.approx(10.0)
+    loud = DesignOptions(noise_std=0.2, amplitude=1.0, sample_period=0.02)
+    controller, reason = robust(DesignTask(model=model, options=loud))
+    assert controller.td == 0.0
+    assert "PID would still have" in reason
+    controller, reason = robust(DesignTask(model=model))
+    assert controller.td == 0.0
+    assert "the noise is not known" in reason
+
+
+def test_the_loop_of_the_controller_to_be_is_longer_by_its_period_and_delay():
+    model = TransferFunction.fopdt(1.0, 1.0, 0.5)
+    options = DesignOptions(controller="pi", sample_period=0.4, loop_delay=0.3)
+    slow, _ = robust(DesignTask(model=model, options=options))
+    whole, _ = robust(
+        DesignTask(
+            model=TransferFunction.fopdt(1.0, 1.0, 1.0), options=DesignOptions(controller="pi")
+        )
+    )
+    assert (slow.kc, slow.ti) == pytest.approx((whole.kc, whole.ti), rel=1e-9)
+
+
+def test_95_percent_of_the_models_around_keep_the_bound():
+    rng = np.random.default_rng(0)
+    models = tuple(
+        TransferFunction.fopdt(g, 1.0, d)
+        for g, d in zip(
+            np.exp(0.15 * rng.standard_normal(40)), rng.uniform(0.3, 0.7, 40), strict=True
+        )
+    )
+    model = TransferFunction.fopdt(1.0, 1.0, 0.5)
+    for kind in ("pi", "pid"):
+        task = DesignTask(model=model, models=models, options=DesignOptions(controller=kind))
+        controller, reason = robust(task)
+        assert "95 % of 40" in reason
+        peaks = sorted(_ms_of(controller, m) for m in models)
+        assert peaks[37] == pytest.approx(1.4, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("model", "limit"),
+    [
+        (lambda: TransferFunction.unstable_fopdt(1.0, 1.0, 2.3), "D/tau = 2.3"),
+        (lambda: TransferFunction.unstable_fopdt(1.0, 1.0, 0.9), "below Ms = 4.4"),
+        (lambda: TransferFunction.fopdt(1.0, 1.0, 0.0), "nothing limits the gain"),
+        (lambda: TransferFunction.fopdt(0.0, 1.0, 1.0), "gain"),
+        (lambda: TransferFunction.fopdt(1.0, -1.0, 1.0), "time constant"),
+        (lambda: TransferFunction.fopdt(math.nan, 1.0, 1.0), "finite"),
+    ],
+)
+def test_what_cannot_be_designed_is_refused_with_the_limit(model, limit):
+    with pytest.raises(RelayAutotuneError, match=limit):
+        robust(DesignTask(model=model()))
+
+
+def test_a_pi_controller_cannot_hold_what_only_pid_can():
+    task = DesignTask(
+        model=TransferFunction.unstable_fopdt(1.0, 1.0, 1.1),
+        options=DesignOptions(controller="pi"),
+    )
+    with pytest.raises(TuningError, match="no PI controller"):
+        robust(task)
