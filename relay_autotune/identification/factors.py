@@ -135,8 +135,11 @@ class Denominator:
 
         :param theta: shape (parameters,).
         """
-        ends = np.cumsum([f.parameters for f in self.factors])
-        return [theta[e - f.parameters : e] for f, e in zip(self.factors, ends, strict=True)]
+        parts, first = [], 0
+        for factor in self.factors:
+            parts.append(theta[first : first + factor.parameters])
+            first += factor.parameters
+        return parts
 
     def constants(self, theta: FloatArray) -> tuple[complex, ...]:
         """Return the time constants of all poles but the integrators [s]."""
@@ -164,29 +167,27 @@ class Denominator:
             then their derivatives by each parameter in turn, then by the dead time.
         """
         own = self.split(theta)
-        factors = [f.polynomial(t) for f, t in zip(self.factors, own, strict=True)]
+        factors = [f.polynomial(t).tolist() for f, t in zip(self.factors, own, strict=True)]
         whole = _product(factors)
-        rows = [_shift(whole, k) for k in powers]
+        rows = [[0.0] * k + whole for k in powers]
         for j, (factor, part) in enumerate(zip(self.factors, own, strict=True)):
             others = _product(factors[:j] + factors[j + 1 :])
             for derivative in factor.derivatives(part):
-                change = -factor.multiplicity * np.convolve(derivative, others)
-                rows += [_shift(change, k) for k in powers]
+                change = _product([(-factor.multiplicity * derivative).tolist(), others])
+                rows += [[0.0] * k + change for k in powers]
         if by_dead_time:
-            rows += [_shift(-whole, k + 1) for k in powers]
-        width = max(r.size for r in rows)
-        padded = np.zeros((len(rows), width))
-        for row, coefficients in zip(padded, rows, strict=True):
-            row[: coefficients.size] = coefficients
-        return padded
+            rows += [[0.0] * (k + 1) + [-c for c in whole] for k in powers]
+        width = max(map(len, rows))
+        return np.array([row + [0.0] * (width - len(row)) for row in rows])
 
 
-def _product(polynomials: Sequence[Polynomial]) -> Polynomial:
-    product = np.ones(1)
+def _product(polynomials: Sequence[list[float]]) -> list[float]:
+    # Of two or three coefficients each, for which plain numbers are quicker than arrays.
+    product = [1.0]
     for polynomial in polynomials:
-        product = np.convolve(product, polynomial)
+        longer = [0.0] * (len(product) + len(polynomial) - 1)
+        for i, a in enumerate(product):
+            for k, b in enumerate(polynomial):
+                longer[i + k] += a * b
+        product = longer
     return product
-
-
-def _shift(polynomial: Polynomial, power: int) -> Polynomial:
-    return np.concatenate((np.zeros(power), polynomial))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.identification.factors import Denominator, Lag, UnstableLag
+from relay_autotune.identification.partial_fractions import follow, partial_fractions
 from relay_autotune.modes import Modes
 from relay_autotune.record import PiecewiseConstant
 from relay_autotune.response import coordinates_at_changes
@@ -119,13 +120,20 @@ def _follow(
     """Return the outputs at the samples, shape (outputs, n); zero before the first change."""
     horizon = max(float(max(time[-1], changes[-1]) - changes[0]), np.finfo(float).tiny)
     constants = denominator.extended_constants(own)
-    modes = Modes(constants, denominator.integrators, numerators, horizon)
-    z = coordinates_at_changes(modes, changes, steps, backward=backward)
-    weights = modes.weights(z)
     segment = np.searchsorted(changes, time, side="right") - 1
-    values = np.zeros((weights[0].shape[-1], time.size))
+    first = int(np.searchsorted(segment, 0))
+    poles = partial_fractions(constants, denominator.integrators, numerators, horizon)
+    values = np.zeros((numerators.shape[0], time.size))
     # In pieces, so that a long record takes little memory beside its result.
-    for start in range(int(np.searchsorted(segment, 0)), time.size, _CHUNK):
+    if poles is not None:
+        states = [p.states(changes, steps, backward=backward) for p in poles]
+        for start in range(first, time.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            values[:, part] = follow(poles, states, time[part], segment[part], changes)
+        return values
+    modes = Modes(constants, denominator.integrators, numerators, horizon)
+    weights = modes.weights(coordinates_at_changes(modes, changes, steps, backward=backward))
+    for start in range(first, time.size, _CHUNK):
         part = slice(start, start + _CHUNK)
         k = segment[part]
         chosen = [w[k] for w in weights]

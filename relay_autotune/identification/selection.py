@@ -20,6 +20,7 @@ from relay_autotune.identification.separable import (
 from relay_autotune.identification.starts import (
     Starts,
     refine_best,
+    refine_roughly,
     start_fopdt,
     time_scales,
 )
@@ -42,6 +43,10 @@ _ENOUGH = 4e-3
 _EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
+# With a mean square so many times the least one, a structure has no support worth telling.
+_BEYOND_HOPE = 4.0
+# What is asked for whatever it leaves.
+_ALWAYS = ("fopdt", "ipdt")
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,9 @@ class Selection:
 
     def __init__(self, problem: Problem, floor: float, sign: int = 0) -> None:
         self._problem, self._floor, self._sign = problem, floor, sign
-        self._fopdt = refine_best(problem, start_fopdt(problem, sign))
+        # The least mean square so far.
+        self._least = math.inf
+        self._fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
         self._leave_out_the_unknown()
         self._starts = Starts(self._problem, self._fopdt)
 
@@ -155,24 +162,43 @@ class Selection:
             return []
         whole = self._problem
         base = self.with_nuisances(min(simple, key=lambda c: c.criterion)).problem
-        found = self._fit_beside(base, names)
+        found = self._fit_beside(base, names, simple)
         if found and (base.drift or base.relaxation):
             # What these two leave unexplained may pass for a drift: the best one is asked again.
             best = found[0]
-            self._problem = whole
+            self._problem, self._least = whole, math.inf
             plain = self._best(best.structure, [best.state.theta])
             again = base if plain is None else self.with_nuisances(plain).problem
             if (again.drift, again.relaxation) != (base.drift, base.relaxation):
-                return self._fit_beside(again, names) or found
+                return self._fit_beside(again, names, simple) or found
         return found
 
-    def _fit_beside(self, nuisances: Problem, names: tuple[str, ...]) -> list[Candidate]:
-        """Fit structures to all samples with the drift and initial state of a problem."""
+    def _fit_beside(
+        self, nuisances: Problem, names: tuple[str, ...], ready: list[Candidate]
+    ) -> list[Candidate]:
+        """Fit structures to all samples with the drift and initial state of a problem.
+
+        :param nuisances: the problem.
+        :param names: of the structures.
+        :param ready: what was fitted before, perhaps to the same problem.
+        """
         problem = replace(nuisances, structure=FOPDT)
-        # A FOPDT has the longest dead time of all, since it counts every small lag to it.
-        first = refine(problem, self._fopdt.theta, tolerance=_TRIAL)
-        self._problem = after_the_unknown(problem, first)
-        found = [c for name in names for c in self._family(name, 0) if c is not None]
+        if problem.relaxation:
+            # A FOPDT has the longest dead time of all, since it counts every small lag to it.
+            first = refine(problem, self._fopdt.theta, tolerance=_TRIAL)
+            problem = after_the_unknown(problem, first)
+        self._problem = problem
+        same = {
+            c.structure.name: c
+            for c in ready
+            if (c.problem.drift, c.problem.relaxation, c.problem.time.size)
+            == (problem.drift, problem.relaxation, problem.time.size)
+        }
+        self._least = math.inf
+        found: list[Candidate] = []
+        for name in names:
+            family = [same[name]] if name in same else self._family(name, 0)
+            found += [c for c in family if c is not None]
         found.sort(key=lambda c: c.criterion)
         return self._weighed(found)
 
@@ -225,25 +251,33 @@ class Selection:
             case "integrator_inverse":
                 return [self._best(known_structures.INTEGRATOR_INVERSE, starts.integrator_lag())]
             case "unstable_fopdt":
-                return [self._unstable()]
+                return [self._best(known_structures.UNSTABLE_FOPDT, self._unstable())]
             case "unstable_sopdt":
-                first = self._unstable()
-                if first is None:
-                    return []
-                chosen = starts.unstable_second(first.state.theta)
+                first = refine_roughly(
+                    replace(self._problem, structure=known_structures.UNSTABLE_FOPDT),
+                    self._unstable(),
+                )
+                chosen = starts.unstable_second(first.theta)
                 return [self._best(known_structures.UNSTABLE_SOPDT, chosen)]
         return []
 
-    def _unstable(self) -> Candidate | None:
-        problem = replace(self._problem, structure=known_structures.UNSTABLE_FOPDT)
-        return self._best(problem.structure, self._starts.unstable(problem))
+    def _unstable(self) -> list[FloatArray]:
+        return self._starts.unstable(
+            replace(self._problem, structure=known_structures.UNSTABLE_FOPDT)
+        )
 
     def _best(self, structure: RationalStructure, thetas: list[FloatArray]) -> Candidate | None:
         problem = replace(self._problem, structure=structure)
-        if _SAMPLES_EACH * (structure.order + 4) > problem.time.size and structure.order > 1:
+        samples = problem.time.size
+        if _SAMPLES_EACH * (structure.order + 4) > samples and structure.order > 1:
             # So few samples tell no more than a first order.
             return None
-        state = refine_best(problem, thetas, tolerance=_TRIAL)
+        rough = refine_roughly(problem, thetas)
+        hopeless = rough.cost / rough.residual.size > _BEYOND_HOPE * self._least
+        if hopeless and structure.name not in _ALWAYS:
+            return None
+        state = refine(problem, rough.theta, tolerance=_TRIAL, damping=rough.damping)
+        self._least = min(self._least, max(state.cost, self._floor) / samples)
         return self.candidate(problem, state)
 
 

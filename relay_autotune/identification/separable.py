@@ -20,7 +20,11 @@ _MOST_ITERATIONS = 80
 _MOST_ROUGH_ITERATIONS = 25
 _LEAST_GAIN = 1e-15
 _SMALLEST_STEP = 1e-14
+_FIRST_DAMPING = 1e-3
+_LITTLE_DAMPING = 0.1
+_LEAST_DAMPING = 1e-12
 _MOST_DAMPING = 1e12
+_GROWTH = 4.0
 _WEAK = 1e-13
 
 
@@ -79,6 +83,7 @@ class State:
     :param basis: orthonormal columns of the linear part, shape (n, k).
     :param derivative: of the model by theta, shape (m, n).
     :param columns: of the linear part, shape (k, n).
+    :param damping: Marquardt's, where a fit ended.
     """
 
     theta: FloatArray
@@ -88,6 +93,7 @@ class State:
     basis: FloatArray
     derivative: FloatArray
     columns: FloatArray
+    damping: float = _FIRST_DAMPING
 
     @property
     def parameters(self) -> int:
@@ -116,17 +122,27 @@ def evaluate(problem: Problem, theta: FloatArray) -> State:
     return State(theta, coefficients, residual, cost, q, derivative, columns)
 
 
-def refine(problem: Problem, theta: FloatArray, *, tolerance: float = _LEAST_GAIN) -> State:
+def refine(
+    problem: Problem,
+    theta: FloatArray,
+    *,
+    tolerance: float = _LEAST_GAIN,
+    most: int = _MOST_ITERATIONS,
+    damping: float = _FIRST_DAMPING,
+) -> State:
     """Return the least sum of squares near a theta.
 
     :param problem: the problem.
     :param theta: where to begin, shape (m,).
     :param tolerance: relative gain of a step that is not worth another one; by default, rounding.
+    :param most: steps that are tried at most.
+    :param damping: Marquardt's, at the start; that of an earlier fit lets it go on.
     """
     state = evaluate(problem, theta)
-    damping = 1e-3
+    growth = _GROWTH
     # A rough answer must not take as many trials as an exact one.
-    for _ in range(_MOST_ITERATIONS if tolerance <= _LEAST_GAIN else _MOST_ROUGH_ITERATIONS):
+    rough = tolerance > _LEAST_GAIN
+    for _ in range(min(most, _MOST_ROUGH_ITERATIONS) if rough else most):
         scale = problem.structure.scale(state.theta)
         jacobian = state.derivative * scale[:, None]
         jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
@@ -138,28 +154,42 @@ def refine(problem: Problem, theta: FloatArray, *, tolerance: float = _LEAST_GAI
             # The dead time stops at zero, and the others go where that leaves them to go.
             rest = gradient[:-1] - normal[:-1, -1] * least
             step = np.append(_solve(normal[:-1, :-1], rest, damping), least)
+        predicted = float(step @ (2.0 * gradient - normal @ step))
+        if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
+            break
         trial = evaluate(problem, problem.structure.move(state.theta, step))
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         if not trial.cost < state.cost:
-            damping *= 10.0
+            damping *= growth
+            growth *= 2.0
             # Where even the undamped step promises less than rounding, no other will be seen.
             promised = float(gradient @ _solve(normal, gradient, 0.0))
             if promised <= tolerance * state.cost or damping > _MOST_DAMPING or smallest:
                 break
             continue
         gained = state.cost - trial.cost
+        # By how well the linear model foretold the gain (Nielsen 1999).
+        factor = 1.0 - (2.0 * gained / predicted - 1.0) ** 3 if predicted > 0.0 else 1.0
+        damping = max(damping * min(max(factor, 0.1), 2.0), _LEAST_DAMPING)
+        growth = _GROWTH
         state = trial
-        damping = max(damping / 10.0, 1e-12)
-        if gained <= tolerance * state.cost or smallest:
+        # A step that damping made small gains little wherever it begins.
+        if smallest or (gained <= tolerance * state.cost and damping <= _LITTLE_DAMPING):
             break
-    return state
+    return replace(state, damping=damping)
 
 
 def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
     """Solve the normal equations, each direction in its own units, with Marquardt's damping."""
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal / np.outer(size, size) + damping * np.eye(size.size)
-    return np.asarray(np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size)
+    scaled = normal / size[:, None] / size
+    scaled[np.diag_indices_from(scaled)] += damping
+    try:
+        step = np.linalg.solve(scaled, gradient / size)
+    except np.linalg.LinAlgError:
+        # Without damping, directions that the data do not tell apart.
+        step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0]
+    return np.asarray(step / size)
 
 
 def information_criterion(cost: float, samples: int, parameters: int, floor: float) -> float:

@@ -17,6 +17,12 @@ FloatArray = NDArray[np.float64]
 _GRID_SAMPLES = 240
 _BEST = 3
 _COARSE = 1e-4
+# Of several starts: steps that each may take, how many go on, and from which sum of squares not.
+_FIRST_STEPS = 5
+_SECOND_STEPS = 8
+_MORE = 3
+_SAME = 1e-4
+_HOPELESS = 4.0
 _EXACT = 1e-15
 
 # Dead times tried at the start, as shares of the longest one.
@@ -48,6 +54,33 @@ def coarse(problem: Problem) -> Problem:
     return problem.part(slice(None, None, max(1, problem.time.size // _GRID_SAMPLES)))
 
 
+def refine_roughly(problem: Problem, thetas: list[FloatArray]) -> State:
+    """Return the best fit to few samples that any of the starts leads to.
+
+    :param problem: the problem.
+    :param thetas: starts, at least one.
+    """
+    few = coarse(problem)
+    if len(thetas) == 1:
+        return refine(few, thetas[0], tolerance=_COARSE)
+    # A few steps show which starts are worth more.
+    begun = [refine(few, theta, tolerance=_COARSE, most=_FIRST_STEPS) for theta in thetas]
+    begun.sort(key=lambda s: s.cost)
+    best = begun[0]
+    reached = [best]
+    for state in begun[1:]:
+        # Two that have come to the same place go on as one.
+        same = abs(state.cost - best.cost) <= _SAME * best.cost
+        if len(reached) < _MORE and state.cost <= _HOPELESS * best.cost and not same:
+            reached.append(state)
+    if len(reached) > 1:
+        reached = [
+            refine(few, s.theta, tolerance=_COARSE, most=_SECOND_STEPS, damping=s.damping)
+            for s in reached
+        ]
+    return min(reached, key=lambda s: s.cost)
+
+
 def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> State:
     """Return the best fit that any of the starts leads to: first on few samples, then on all.
 
@@ -55,10 +88,8 @@ def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float 
     :param thetas: starts, at least one.
     :param tolerance: relative gain of a step that is not worth another one; 0: rounding.
     """
-    few = coarse(problem)
-    reached = [refine(few, theta, tolerance=_COARSE) for theta in thetas]
-    theta = min(reached, key=lambda s: s.cost).theta
-    return refine(problem, theta, tolerance=tolerance or _EXACT)
+    rough = refine_roughly(problem, thetas)
+    return refine(problem, rough.theta, tolerance=tolerance or _EXACT, damping=rough.damping)
 
 
 def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:

@@ -10,6 +10,7 @@ import pytest
 from relay_autotune.identification.factors import Denominator, Lag, Quadratic, UnstableLag
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.lags import FOPDT
+from relay_autotune.identification.partial_fractions import partial_fractions
 from relay_autotune.identification.rational import free_motion, responses
 from relay_autotune.identification.structures import lag_n
 from relay_autotune.identification.waveform import identify_waveform
@@ -66,6 +67,29 @@ def test_responses_are_those_of_the_transfer_function(name):
     constants = denominator.constants(theta[:-1])
     model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
     np.testing.assert_allclose(found[0], response(model, TIME, INPUT), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["eight lags", "underdamped", "third order", "integrator"])
+def test_responses_to_a_long_staircase_are_those_of_the_transfer_function(name):
+    denominator, powers, point = DENOMINATORS[name]
+    rng = np.random.default_rng(6)
+    u = PiecewiseConstant(np.sort(rng.uniform(0.0, 55.0, 700)), rng.normal(size=700), 0.0)
+    theta = np.array(point)
+    # Slow, and so fast that every change finds the last one settled.
+    for faster in (0.0, 3.0):
+        theta[: denominator.parameters] -= faster
+        found, _ = responses(denominator, powers, theta, TIME, u)
+        constants = denominator.constants(theta[:-1])
+        model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
+        np.testing.assert_allclose(found[0], response(model, TIME, u), atol=1e-9)
+
+
+def test_poles_that_are_close_are_left_to_the_modes():
+    numerator = np.array([[1.0, 0.5]])
+    assert partial_fractions((2.0, 2.0, 3.0), 0, numerator, 50.0) is not None
+    assert partial_fractions((2.0, 2.0, 2.0001), 0, numerator, 50.0) is None
+    # One that is hardly faster than the held input is slow.
+    assert partial_fractions((2.0, 1e4), 0, numerator, 50.0) is None
 
 
 def test_the_closed_form_of_a_lag_is_the_general_one():
