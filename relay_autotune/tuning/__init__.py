@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
@@ -10,27 +10,28 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.tuning.analysis import analyse_loop, is_stable
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
 from relay_autotune.tuning.gains import Controller, Gains, Performance
-from relay_autotune.tuning.rules import imc, itae, thyagarajan, tyreus_luyben
+from relay_autotune.tuning.robust import robust
+from relay_autotune.tuning.rules import PUBLISHED, Rule
+from relay_autotune.tuning.task import DesignOptions, DesignTask
+from relay_autotune.ultimate import UltimatePoint
 
-Rule = Callable[[TransferFunction], tuple[Controller, str]]
-
-RULES: dict[str, Rule] = {
-    "thyagarajan": thyagarajan,
-    "tyreus_luyben": tyreus_luyben,
-    "itae": itae,
-    "imc": imc,
-}
+RULES: dict[str, Rule] = {**PUBLISHED, "robust": robust}
 DEFAULT_RULE = "thyagarajan"
 
 __all__ = [
     "DEFAULT_RULE",
     "RULES",
     "Controller",
+    "DesignOptions",
+    "DesignTask",
     "Gains",
     "Performance",
+    "Rule",
     "analyse_loop",
+    "design",
     "ensemble",
     "is_stable",
+    "rule_named",
     "tune",
 ]
 
@@ -50,6 +51,8 @@ def tune(
     rule: str,
     models: Sequence[TransferFunction] = (),
     simple: TransferFunction | None = None,
+    options: DesignOptions | None = None,
+    describing: UltimatePoint | None = None,
 ) -> Gains:
     """Return the gains of a rule, judged on the model and on the models around it.
 
@@ -58,25 +61,36 @@ def tune(
     :param models: models within the uncertainty, from :func:`ensemble`.
     :param simple: the FOPDT that fits best, on which a rule for FOPDT designs where the model is
         of another structure; its gains are judged on the model all the same.
+    :param options: what is asked of the controller.
+    :param describing: what the describing function reads from the limit cycle.
     :raises TuningError: if the rule does not apply, or its loop is unstable on the model or on
         more than 5 % of ``models``.
     """
-    controller, reason = _design(rule_named(rule), identification.model, simple)
-    performance = analyse_loop(controller, identification.model)
-    if not models:
+    task = DesignTask(
+        model=identification.model,
+        options=options or DesignOptions(),
+        simple=simple,
+        models=tuple(models),
+        describing=describing,
+    )
+    return design(task, rule)
+
+
+def design(task: DesignTask, rule: str) -> Gains:
+    """Return the gains of a rule, judged on the model and on the models around it.
+
+    Both are judged with the delay that the loop adds to the process: half a sampling period, and
+    what else the options say.
+
+    :param task: the process and what is asked of the controller.
+    :param rule: one of ``RULES``.
+    :raises TuningError: as :func:`tune`.
+    """
+    controller, reason = rule_named(rule)(task)
+    performance = analyse_loop(controller, task.in_loop(task.model))
+    if not task.models:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
         return Gains.of(rule, controller, performance, ms_95=performance.ms, reason=reason)
-    ms_95 = max(ensemble_ms(controller, models), performance.ms)
+    around = [task.in_loop(model) for model in task.models]
+    ms_95 = max(ensemble_ms(controller, around), performance.ms)
     return Gains.of(rule, controller, performance, ms_95=ms_95, reason=reason)
-
-
-def _design(
-    rule: Rule, model: TransferFunction, simple: TransferFunction | None
-) -> tuple[Controller, str]:
-    try:
-        return rule(model)
-    except TuningError:
-        if simple is None:
-            raise
-    controller, reason = rule(simple)
-    return controller, f"{reason}; designed on the FOPDT that fits best, judged on the model"

@@ -1,0 +1,134 @@
+r"""The three forms of a PID controller, and the exact ways between them.
+
+ISA, in which everything here is computed, parallel and series:
+
+    kc (1 + 1/(ti s) + td s),    p + i/s + d s,    kc (1 + 1/(ti s)) (1 + td s).
+
+They differ in the numbers alone: the filter on the measurement, of time constant tf, is the same
+factor in all three. Luyben (2003, eq 11) writes the filter of the series form as
+``1/(alpha td s + 1)``, alpha typically 0.1; ``alpha = tf/td`` here, with the second-order filter
+of :class:`~relay_autotune.tuning.gains.Controller` in the place of his first-order one, whose
+delay is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from relay_autotune.errors import TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.gains import Controller
+
+FORMS = ("isa", "parallel", "series")
+
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class ParallelForm:
+    """Gains of the parallel form, ``p + i/s + d s``.
+
+    :param p: proportional gain [u/y].
+    :param i: integral gain [u/(y s)]; 0: no integral action.
+    :param d: derivative gain [u s/y]; 0: no derivative action.
+    :param tf: time constant of the filter on the measurement [s].
+    """
+
+    p: float
+    i: float
+    d: float = 0.0
+    tf: float = 0.0
+
+    def isa(self, b: float = 1.0) -> Controller:
+        """Return the same controller in ISA form.
+
+        :param b: weight of the set-point.
+        :raises TuningError: if there is no proportional gain, or the gains differ in sign: the
+            ISA form has positive times only.
+        """
+        if self.p == 0.0 or not all(math.isfinite(g) for g in (self.p, self.i, self.d)):
+            raise TuningError(
+                "the ISA form needs a proportional gain other than zero and finite gains, found "
+                f"p = {self.p:g}, i = {self.i:g}, d = {self.d:g}"
+            )
+        if self.i * self.p < 0.0 or self.d * self.p < 0.0:
+            raise TuningError(
+                "the ISA form needs gains of one sign, since its times are positive; found "
+                f"p = {self.p:g}, i = {self.i:g}, d = {self.d:g}"
+            )
+        ti = self.p / self.i if self.i != 0.0 else 0.0
+        return Controller(self.p, ti, self.d / self.p, self.tf, b)
+
+
+@dataclass(frozen=True)
+class SeriesForm:
+    """Gains of the series form, ``kc (1 + 1/(ti s)) (1 + td s)`` (Luyben 2003, eq 11).
+
+    :param kc: proportional gain of the PI part [u/y].
+    :param ti: integral time [s]; 0: no integral action.
+    :param td: derivative time [s]; 0: no derivative action.
+    :param alpha: time constant of the filter over ``td``; 0: none.
+    """
+
+    kc: float
+    ti: float
+    td: float = 0.0
+    alpha: float = 0.1
+
+    def isa(self, b: float = 1.0) -> Controller:
+        """Return the same controller in ISA form.
+
+        ``kc' = kc (1 + td/ti)``, ``ti' = ti + td``, ``td' = ti td/(ti + td)``.
+
+        :param b: weight of the set-point.
+        """
+        tf = self.alpha * self.td
+        if self.ti == 0.0:
+            return Controller(self.kc, 0.0, self.td, tf, b)
+        total = self.ti + self.td
+        return Controller(self.kc * total / self.ti, total, self.ti * self.td / total, tf, b)
+
+    def transfer_function(self) -> TransferFunction:
+        """Return eq 11 as Luyben wrote it, with its first-order filter.
+
+        ``Gc = kc (ti s + 1)/(ti s) (td s + 1)/(alpha td s + 1)``.
+        """
+        lag = (self.alpha * self.td,)
+        if self.ti == 0.0:
+            return TransferFunction(self.kc, (self.td,), lag)
+        return TransferFunction(self.kc / self.ti, (self.ti, self.td), lag, 1)
+
+
+def parallel_form(controller: Controller) -> ParallelForm:
+    """Return a controller in parallel form: ``p = kc``, ``i = kc/ti``, ``d = kc td``."""
+    return ParallelForm(controller.p, controller.i, controller.d, controller.tf)
+
+
+def series_form(controller: Controller) -> SeriesForm:
+    """Return a controller in series form.
+
+    With ``r = sqrt(1 - 4 td/ti)``: ``ti' = ti (1 + r)/2``, ``td' = ti (1 - r)/2``,
+    ``kc' = kc (1 + r)/2``.
+
+    :raises TuningError: if ti < 4 td, where the zeros of the controller are complex, or if there
+        is a filter without derivative action, for which alpha has no value.
+    """
+    ti, td = controller.ti, controller.td
+    if td == 0.0 and controller.tf > 0.0:
+        raise TuningError(
+            "the series form has a filter only with derivative action: td = 0 and "
+            f"tf = {controller.tf:g} s have none; use the ISA or the parallel form"
+        )
+    if ti == 0.0:
+        alpha = controller.tf / td if td else 0.0
+        return SeriesForm(controller.kc, 0.0, td, alpha)
+    squared = 1.0 - 4.0 * td / ti
+    if squared < -_ROUNDING:
+        raise TuningError(
+            f"ti = {ti:g} s is less than 4 td = {4.0 * td:g} s: the controller has complex zeros "
+            "and no series form; use the ISA or the parallel form"
+        )
+    half = 0.5 * (1.0 + math.sqrt(max(squared, 0.0)))
+    lead = td / half
+    return SeriesForm(controller.kc * half, ti * half, lead, controller.tf / lead if lead else 0.0)

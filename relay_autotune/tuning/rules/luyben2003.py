@@ -1,0 +1,225 @@
+r"""Luyben's rules for integrating processes with inverse response and dead time.
+
+Luyben, "Identification and Tuning of Integrating Processes with Deadtime and Inverse Response",
+Ind. Eng. Chem. Res. 2003. The two integrators of process and controller start the loop's phase at
+-180 degrees; the controller's lead lifts it to a peak before the lags bring it down again. The
+integral time is the one whose peak is at -120 degrees, the gain the one whose closed loop
+resonates by +2 dB.
+
+Errata: eq 9 has ``+ ti/(1 + (w ti)^2)``, as the paper's program has it. The paper calls that
+integral time the smallest possible; the +2 dB are feasible down to a little more than half of it.
+Two gains give +2 dB, and the upper one is meant. The optimum of td is sought on a continuum here,
+and not among the four values of Table 1: for half the integral time it is 0.94, not 1.15 min.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+
+from relay_autotune.errors import TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.forms import SeriesForm
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.rules.applicability import named, process_of, wants_pid
+from relay_autotune.tuning.rules.resonance import resonant_gain
+from relay_autotune.tuning.task import DesignTask
+
+SHARES = (0.5, 0.25)
+
+_GRID = np.geomspace(1e-6, 1e4, 600)
+_LONGEST = 1e8
+_TD_GRID = np.geomspace(0.01, 1.0, 18)
+
+
+@dataclass(frozen=True)
+class Derivative:
+    """A series PID controller of the largest gain.
+
+    :param share: its integral time over that of the PI controller.
+    :param series: its gains in the series form.
+    """
+
+    share: float
+    series: SeriesForm
+
+    @property
+    def controller(self) -> Controller:
+        """The same in ISA form."""
+        return self.series.isa()
+
+
+def luyben2003(task: DesignTask) -> tuple[Controller, str]:
+    """Return the PI or PID gains of Luyben for an integrating process.
+
+    PI: ti of :func:`integral_time`, kc of +2 dB (eqs 8 to 10). PID: series form with ti half and a
+    quarter of that, td of the largest gain (eq 11, Table 1); of the two the one with the larger
+    integral gain.
+
+    :param task: a process with one integrator, and lags, dead time or inverse response; its
+        ``phase_peak`` and ``resonance`` are the two figures.
+    :raises TuningError: for any other, or where no gain has so small a resonance.
+    """
+    model = _process("luyben2003", task)
+    asked = task.options
+    ti = integral_time(model, asked.phase_peak)
+    said = f"{math.degrees(asked.phase_peak):.4g} degrees at the peak and +{asked.resonance:g} dB"
+    if not wants_pid("luyben2003", task):
+        gains = Controller(model.process_sign * gain(model, ti, asked.resonance), ti)
+        return gains, f"Luyben 2003: {said}"
+    found = []
+    for share in SHARES:
+        try:
+            found.append(derivative(model, share, ti, asked.resonance, 1.0 / asked.filter_ratio))
+        except TuningError as error:
+            refused = error
+    if not found:
+        raise refused
+    best = max(found, key=lambda d: abs(d.controller.i))
+    tried = ", ".join(
+        f"{100.0 * d.share:.0f} % gives ti {d.series.ti:.4g} s, td {d.series.td:.4g} s, "
+        f"kc {d.series.kc:.4g}"
+        for d in found
+    )
+    reason = f"Luyben 2003: {said}, series PID; of the PI's integral time {tried}"
+    return best.controller, reason
+
+
+def luyben2003_p(task: DesignTask) -> tuple[Controller, str]:
+    """Return the gain of proportional control for an ordinary level.
+
+    Where a level may stand anywhere in its vessel, Luyben (2003) advises proportional action
+    alone: it has no integral time to disturb the smoothing. The gain here is the largest one, of
+    +2 dB; a smaller one smooths more.
+
+    :param task: as for :func:`luyben2003`.
+    :raises TuningError: for a process without integrator, or without any lag or dead time.
+    """
+    model = _process("luyben2003_p", task)
+    if task.options.controller == "pid":
+        raise TuningError("the rule luyben2003_p gives proportional action only")
+    size = resonant_gain(Controller(1.0, 0.0).loop(_direct(model)), task.options.resonance).upper
+    return Controller(model.process_sign * size, 0.0), (
+        f"Luyben 2003: P only, the largest gain of +{task.options.resonance:g} dB; it leaves an "
+        "offset after a load, as an ordinary level may have"
+    )
+
+
+def integral_time(model: TransferFunction, phase_peak: float) -> float:
+    """Return the integral time whose loop has its phase peak at a given angle (eqs 8 and 9) [s].
+
+    :param model: a process with one integrator.
+    :param phase_peak: between -pi and -pi/2 [rad].
+    :raises TuningError: if the phase has no peak.
+    """
+    scale = _lag(model)
+    low, high = 0.0, math.log(_LONGEST)
+
+    def excess(log_ti: float) -> float:
+        return _peak(model, scale, scale * math.exp(log_ti)) - phase_peak
+
+    while excess(low) > 0.0:
+        low -= 5.0
+        if low < -math.log(_LONGEST):
+            raise TuningError("the phase of the loop is above the angle at any integral time")
+    if excess(high) < 0.0:
+        raise TuningError(
+            f"the loop's phase never comes up to {math.degrees(phase_peak):.4g} degrees, "
+            "whatever the integral time"
+        )
+    return scale * math.exp(brentq(excess, low, high, xtol=1e-14, rtol=1e-14))
+
+
+def gain(model: TransferFunction, ti: float, decibels: float) -> float:
+    """Return the size of kc whose PI loop has a closed-loop resonance, the upper one [u/y].
+
+    :param model: the process.
+    :param ti: integral time [s].
+    :param decibels: of the closed-loop log modulus [dB].
+    :raises TuningError: if no gain has so small a resonance.
+    """
+    return resonant_gain(Controller(1.0, ti).loop(_direct(model)), decibels).upper
+
+
+def derivative(
+    model: TransferFunction, share: float, ti: float, decibels: float, alpha: float = 0.1
+) -> Derivative:
+    """Return the series PID controller of the largest gain (steps 1 to 4 of section 3.4).
+
+    :param model: the process.
+    :param share: of the PI controller's integral time.
+    :param ti: the PI controller's integral time [s].
+    :param decibels: of the closed-loop log modulus [dB].
+    :param alpha: of the filter.
+    :raises TuningError: if no derivative time has a gain of that resonance.
+    """
+    short = share * ti
+
+    def size(td: float) -> float:
+        c = SeriesForm(1.0, short, td, alpha).isa()
+        try:
+            return resonant_gain(c.loop(_direct(model)), decibels).upper
+        except TuningError:
+            return 0.0
+
+    tried = short * _TD_GRID
+    sizes = [size(float(td)) for td in tried]
+    top = int(np.argmax(sizes))
+    if sizes[top] == 0.0:
+        raise TuningError(
+            f"with {100.0 * share:.0f} % of the PI controller's integral time no derivative time "
+            f"has a gain of +{decibels:g} dB"
+        )
+    bounds = (float(tried[max(top - 1, 0)]), float(tried[min(top + 1, tried.size - 1)]))
+    best = minimize_scalar(
+        lambda td: -size(td), bounds=bounds, method="bounded", options={"xatol": 1e-6 * short}
+    )
+    td = float(best.x)
+    return Derivative(share, SeriesForm(model.process_sign * size(td), short, td, alpha))
+
+
+def _process(rule: str, task: DesignTask) -> TransferFunction:
+    model = process_of(task)
+    if model.integrators != 1 or any(t.real < 0.0 for t in model.time_constants):
+        raise TuningError(
+            f"the rule {rule} is for a process with one integrator, found {named(task.model)}: "
+            "use a rule for that structure, or robust"
+        )
+    if _lag(model) == 0.0:
+        raise TuningError(
+            f"the rule {rule} needs a lag, a dead time or an inverse response that limits the "
+            "gain, and the integrator has none: its phase never falls below -90 degrees"
+        )
+    return model
+
+
+def _lag(model: TransferFunction) -> float:
+    constants = (*model.time_constants, *model.zeros)
+    return model.dead_time + sum(abs(c) for c in constants)
+
+
+def _direct(model: TransferFunction) -> TransferFunction:
+    """Return a process as if it were direct-acting."""
+    return replace(model, gain=model.process_sign * model.gain)
+
+
+def _peak(model: TransferFunction, scale: float, ti: float) -> float:
+    """Return the highest phase of the loop, after the two integrators' -180 degrees [rad]."""
+
+    def phase(w: float) -> float:
+        return float(model.phase(w)) - 0.5 * math.pi + math.atan(w * ti)
+
+    grid = _GRID / scale
+    values = model.phase(grid) - 0.5 * math.pi + np.arctan(grid * ti)
+    top = int(np.argmax(values))
+    low, high = grid[max(top - 1, 0)], grid[min(top + 1, grid.size - 1)]
+    best = minimize_scalar(
+        lambda log_w: -phase(math.exp(log_w)),
+        bounds=(math.log(low), math.log(high)),
+        method="bounded",
+        options={"xatol": 1e-10},
+    )
+    return max(float(values[top]), -float(best.fun))

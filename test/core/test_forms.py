@@ -1,0 +1,88 @@
+"""The forms of a PID controller are one controller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_autotune.errors import TuningError
+from relay_autotune.tuning.forms import ParallelForm, SeriesForm, parallel_form, series_form
+from relay_autotune.tuning.gains import Controller
+
+S = 1j * np.geomspace(1e-3, 1e3, 25)
+
+
+def filtered(tf: float) -> np.ndarray:
+    return 1.0 / (1.0 + tf * S + 0.5 * (tf * S) ** 2)
+
+
+sizes = st.floats(1e-3, 1e3)
+
+
+@given(kc=sizes, ti=sizes, td=sizes, alpha=st.floats(0.01, 1.0))
+def test_series_there_and_back(kc, ti, td, alpha):
+    isa = SeriesForm(kc, ti, td, alpha).isa()
+    law = kc * (1.0 + 1.0 / (ti * S)) * (1.0 + td * S)
+    np.testing.assert_allclose(isa.transfer_function()(S), law * filtered(alpha * td), rtol=1e-6)
+    back = series_form(isa)
+    # The two times are told apart by their size alone.
+    assert (back.ti, back.td) == pytest.approx((max(ti, td), min(ti, td)), rel=1e-5)
+
+
+@given(kc=sizes | st.floats(-1e3, -1e-3), ti=sizes, td=sizes, tf=sizes)
+def test_parallel_there_and_back(kc, ti, td, tf):
+    isa = Controller(kc, ti, td, tf)
+    parallel = parallel_form(isa)
+    law = parallel.p + parallel.i / S + parallel.d * S
+    np.testing.assert_allclose(isa.transfer_function()(S), law * filtered(tf), rtol=1e-6)
+    back = parallel.isa()
+    assert vars(back) == pytest.approx(vars(isa), rel=1e-12)
+
+
+def test_eq_11_as_luyben_wrote_it():
+    law = 1.69 * (11.5 * S + 1.0) / (11.5 * S) * (1.15 * S + 1.0) / (0.115 * S + 1.0)
+    found = SeriesForm(1.69, 11.5, 1.15).transfer_function()(S)
+    np.testing.assert_allclose(found, law, rtol=1e-12)
+    law = 2.0 * (0.5 * S + 1.0) / (0.05 * S + 1.0)
+    np.testing.assert_allclose(SeriesForm(2.0, 0.0, 0.5).transfer_function()(S), law, rtol=1e-12)
+
+
+def test_actions_that_are_not_there_stay_away():
+    assert series_form(Controller(2.0, 4.0)) == SeriesForm(2.0, 4.0, 0.0, 0.0)
+    assert series_form(Controller(2.0, 0.0, 0.5, 0.05)) == SeriesForm(2.0, 0.0, 0.5, 0.1)
+    assert SeriesForm(2.0, 0.0, 0.5).isa() == Controller(2.0, 0.0, 0.5, 0.05)
+    assert ParallelForm(2.0, 0.0).isa() == Controller(2.0, 0.0)
+    assert parallel_form(Controller(2.0, 0.0)) == ParallelForm(2.0, 0.0)
+
+
+def test_double_zeros_still_have_a_series_form():
+    found = series_form(Controller(2.0, 4.0, 1.0))
+    assert (found.kc, found.ti, found.td) == pytest.approx((1.0, 2.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("gains", "message"),
+    [
+        (Controller(1.0, 4.0, 1.001), "complex zeros"),
+        (Controller(1.0, 4.0, 0.0, 0.1), "filter only with derivative"),
+    ],
+)
+def test_no_series_form(gains, message):
+    with pytest.raises(TuningError, match=message):
+        series_form(gains)
+
+
+@pytest.mark.parametrize(
+    ("gains", "message"),
+    [
+        (ParallelForm(0.0, 1.0), "proportional gain"),
+        (ParallelForm(1.0, -1.0), "one sign"),
+        (ParallelForm(1.0, 1.0, -1.0), "one sign"),
+        (ParallelForm(float("nan"), 1.0), "finite"),
+    ],
+)
+def test_no_isa_form(gains, message):
+    with pytest.raises(TuningError, match=message):
+        gains.isa()
