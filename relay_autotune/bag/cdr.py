@@ -51,14 +51,14 @@ class Path:
         if begin.size == 0:
             return np.empty(0), np.empty(0, dtype=np.bool_)
         fits = end - begin >= _ENCAPSULATION
-        # Two bytes that are outside of the content belong to a message that does not fit.
-        kinds = every_byte(content, "<u2")[np.where(fits, begin, 0)]
-        little, big = kinds == 0x0100, kinds == 0x0000
-        if bool((little & fits).all()):
+        # A message shorter than that may lie at the very end.
+        kinds = every_byte(content, "<u2")[begin if fits.all() else np.where(fits, begin, 0)]
+        little, big = (kinds == 0x0100) & fits, (kinds == 0x0000) & fits
+        if bool(little.all()):
             return self._of_one_order(content, begin, end, "<")
         values = np.zeros(begin.size)
         good = np.zeros(begin.size, dtype=np.bool_)
-        for order, chosen in (("<", little & fits), (">", big & fits)):
+        for order, chosen in (("<", little), (">", big)):
             at = np.flatnonzero(chosen)
             if at.size:
                 values[at], good[at] = self._of_one_order(content, begin[at], end[at], order)

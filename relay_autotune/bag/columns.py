@@ -9,6 +9,8 @@ from numpy.typing import DTypeLike, NDArray
 
 T = TypeVar("T", bound=np.generic)
 
+_LARGE = 1 << 22
+
 
 class Column(Generic[T]):
     """An array to which values are added at its end.
@@ -16,18 +18,20 @@ class Column(Generic[T]):
     It grows in place: joining pieces would for a moment take the memory twice.
 
     :param kind: type of the values.
+    :param expected: how many are expected; memory is taken only for those that come.
     """
 
-    def __init__(self, kind: DTypeLike) -> None:
-        self._data = np.empty(0, dtype=kind)
+    def __init__(self, kind: DTypeLike, expected: int = 0) -> None:
+        self._data = np.empty(expected, dtype=kind)
         self._size = 0
 
     def extend(self, values: NDArray[T]) -> None:
         """Add values, shape (n,)."""
         size = self._size + values.size
         if size > self._data.size:
-            # Memory beyond the values is reserved, but not taken before it is written to.
-            self._data.resize(max(size, 2 * self._data.size, 1024), refcheck=False)
+            # What is added is filled with zeros, and thereby taken: large arrays grow less.
+            grown = self._data.size * (2 if size < _LARGE else 1.125)
+            self._data.resize(max(size, int(grown), 1024), refcheck=False)
         self._data[self._size : size] = values
         self._size = size
 

@@ -17,11 +17,11 @@ UNSUSPICIOUS = 1 << 30
 FREE_DISK = 256 << 20
 
 # Bytes of the definition of a message type: the largest of the common interfaces has 20 kB.
-LARGEST_DEFINITION = 1 << 20
+LARGEST_DEFINITION = 256 << 10
 
 # Types within types, and fields of all of them together.
 DEEPEST_TYPE = 40
-MOST_FIELDS = 20_000
+MOST_FIELDS = 5_000
 
 # Fields, and elements of arrays of unequal size, that are passed on the way to a field.
 MOST_STEPS = 5_000
@@ -36,3 +36,7 @@ def missing_package(package: str) -> BagError:
         f"the recording is compressed; to read it install the Python package {package}, "
         f"with: pip install {package}"
     )
+
+
+# Messages of a topic for which memory is set aside because the file says that it has them.
+MOST_EXPECTED = 1 << 27

@@ -138,14 +138,13 @@ def indexed_offsets(index: bytes, channel: int, size: int) -> IntArray:
         raise DamageError("a message index of impossible length")
     count = bytes_of_entries // 16
     offsets = np.ndarray((count,), "<u8", index, RECORD.size + 6 + 8, (16,)).astype(np.int64)
-    if count and (int(offsets.min()) < 0 or int(offsets.max()) > size - _HEAD.itemsize):
-        raise DamageError("a message index leads out of its chunk")
-    rising = np.diff(offsets) > 0
-    if not bool(rising.all()):
+    if not bool((offsets[1:] > offsets[:-1]).all()):
         # An index is in the order of the log times.
         offsets = np.unique(offsets)
         if offsets.size < count:
             raise DamageError("a message index leads to one message twice")
+    if count and (offsets[0] < 0 or offsets[-1] > size - _HEAD.itemsize):
+        raise DamageError("a message index leads out of its chunk")
     return offsets
 
 

@@ -70,9 +70,9 @@ class McapFile:
         """Size of the file, expanded if it is compressed as a whole [bytes]."""
         return self._source.size
 
-    def message_count(self, channel: int) -> int | None:
-        """Return how many messages of a channel the file says it has; None: it does not say."""
-        return self._counts.get(channel)
+    def message_count(self, channel: int) -> int:
+        """Return how many messages of a channel the file says it has; 0: it does not say."""
+        return self._counts.get(channel, 0)
 
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:
         """Yield the messages of some channels, a run of them at a time.

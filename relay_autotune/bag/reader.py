@@ -11,12 +11,17 @@ from pathlib import Path
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.experiments import interrupted_experiment, recorded_experiments
 from relay_autotune.bag.fields import split_name
+from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
 from relay_autotune.bag.signals import Signal, join, window
-from relay_autotune.bag.topics import Topics
+from relay_autotune.bag.timing import CLOCKS
+from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record import Record
+
+# A file compressed as a whole, as rosbag2 and the zstd command name it.
+_WHOLE = ([".mcap", ".zstd"], [".mcap", ".zst"])
 
 # Beyond this, two topics' lags to the recorder differ by their clocks, not by the transport.
 _CLOCK_DIFFERENCE_NS = 100_000_000
@@ -45,6 +50,9 @@ class Selection:
     :param time: column of the time in a CSV file; None: the first.
     :param start: beginning of the part to use [s from the first sample]; None: all.
     :param end: end of the part to use [s from the first sample]; None: all.
+    :param clock: which time of a message counts, one of ``CLOCKS``.
+    :param largest_chunk: size of a chunk, or a message outside of chunks, beyond which it is left
+        out [bytes].
     """
 
     measurement: str | None = None
@@ -52,21 +60,32 @@ class Selection:
     time: str | None = None
     start: float | None = None
     end: float | None = None
+    clock: str = CLOCKS[0]
+    largest_chunk: int = LARGEST_CHUNK
 
 
-def read_experiments(path: Path | str, selection: Selection | None = None) -> Recording:
+def read_experiments(
+    path: Path | str | Sequence[Path | str],
+    selection: Selection | None = None,
+    progress: Progress | None = None,
+) -> Recording:
     """Return every experiment of a recording.
 
     Topics that are named are used. Else the experiments that relay_node recorded are returned;
     else an experiment of relay_node whose recording was cut short; else the one pair of topics
     that looks like measurement and command.
 
-    :param path: a rosbag2 directory, an MCAP file, or a CSV file (by its ending).
+    :param path: a rosbag2 directory, an MCAP file, or a CSV file (by its ending); or several of
+        the first two that are one timeline.
     :param selection: what is wanted of it; default: everything.
+    :param progress: told of how far a bag has been read.
     :raises SelectionError: if the selection does not fit, or more than one pair does.
     :raises BagError: if the recording cannot be read, or holds nothing to identify from.
     """
-    path, wanted = Path(path), selection or Selection()
+    paths = [Path(path)] if isinstance(path, Path | str) else [Path(part) for part in path]
+    path, wanted = paths[0], selection or Selection()
+    if len(paths) > 1 and any(part.suffix.lower() == ".csv" for part in paths):
+        raise SelectionError("CSV files cannot be joined to one timeline; expected bags")
     if path.suffix.lower() == ".csv":
         columns = (wanted.measurement, wanted.command, wanted.time)
         measured, commanded, dated = read_csv(path, *columns)
@@ -75,8 +94,12 @@ def read_experiments(path: Path | str, selection: Selection | None = None) -> Re
         raise SelectionError(f"--time names a column of a CSV file, but {path} is none")
     else:
         with ExitStack() as opened:
-            files = [opened.enter_context(McapFile(file)) for file in _data_files(path)]
-            records, notes = _of_topics(Topics(path, files), wanted)
+            files = [
+                opened.enter_context(McapFile(file, wanted.largest_chunk))
+                for part in paths
+                for file in _data_files(part)
+            ]
+            records, notes = _of_topics(Topics(path, files, wanted.clock, progress), wanted)
     parts = tuple(window(record, wanted.start, wanted.end) for record in records)
     return Recording(path, parts, tuple(notes))
 
@@ -90,6 +113,10 @@ def _data_files(path: Path) -> list[Path]:
         raise BagError(f"cannot read {path}: {error.strerror or error}") from error
     # The folder itself counts: a killed recorder's metadata.yaml is missing or out of date.
     files = [entry for entry in entries if entry.suffix == ".mcap"]
+    plain = {file.name for file in files}
+    # A recorder that was killed while it compressed leaves both.
+    files += [e for e in entries if e.suffixes[-2:] in _WHOLE and e.stem not in plain]
+    files.sort(key=_natural)
     if not files:
         found = ", ".join(entry.name for entry in entries[:5]) or "nothing"
         advice = (

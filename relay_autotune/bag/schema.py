@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -77,6 +78,12 @@ Type = Number | Text | Struct | Repeated
 _STAMP = (("sec", Number("int32", "i4")), ("nanosec", Number("uint32", "u4")))
 _TIME = Struct("builtin_interfaces/msg/Time", _STAMP)
 _HEADER = (("stamp", _TIME), ("frame_id", Text()))
+# Before each file that a definition in IDL consists of.
+_IDL_HEADING = re.compile(r"^={80}\nIDL: .*\n", re.MULTILINE)
+
+# The files that one includes are all there; the parser knows no directives.
+_IDL_DIRECTIVE = re.compile(r"^\s*#.*$", re.MULTILINE)
+
 # What a definition need not bring along.
 _KNOWN = {
     "builtin_interfaces/msg/Time": _TIME,
@@ -132,7 +139,10 @@ def _parsed(channel: Channel, text: str) -> Mapping[str, Any]:
         if channel.schema_encoding == "ros2msg":
             return get_types_from_msg(text, channel.type)
         if channel.schema_encoding in ("ros2idl", "omgidl"):
-            return get_types_from_idl(text)
+            types: dict[str, Any] = {}
+            for part in _IDL_HEADING.split(_IDL_DIRECTIVE.sub("", text)):
+                types |= get_types_from_idl(part) if part.strip() else {}
+            return types
     except (TypesysError, LookupError, ValueError, TypeError, AttributeError, RecursionError,
             ArithmeticError, MemoryError) as error:  # fmt: skip
         raise _senseless(channel, first_line(error)) from None
@@ -202,7 +212,7 @@ def numeric_paths(kind: Type, prefix: str = "") -> Iterator[str]:
 def first_line(error: Exception) -> str:
     """Return what an error says, in one line."""
     lines = str(error).strip().splitlines()
-    return lines[0][:300] if lines else type(error).__name__
+    return " ".join(lines[:2])[:120] if lines else type(error).__name__
 
 
 def _senseless(channel: Channel, why: str) -> BagError:

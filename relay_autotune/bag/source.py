@@ -124,6 +124,8 @@ class Source:
                             f"are free in {tempfile.gettempdir()}; set TMPDIR to a larger disk"
                         )
                     expanded.write(piece)
+            if not written and not self.notes:
+                self.notes.append(f"{self.path.name} ends before anything can be expanded")
             expanded.flush()
         except OSError as error:
             expanded.close()

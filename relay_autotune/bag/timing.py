@@ -38,16 +38,17 @@ class SignalReader:
 
     :param name: of the signal.
     :param clock: one of ``CLOCKS``.
+    :param expected: number of its messages, as the file says.
     :param both: keep the recorder's times too, for times that are not in order; these take half
         as much memory again.
     """
 
-    def __init__(self, name: str, clock: str, *, both: bool = False) -> None:
+    def __init__(self, name: str, clock: str, *, both: bool = False, expected: int = 0) -> None:
         self._name = name
         self._clock = clock
-        self._values: Column[np.float64] = Column(np.float64)
-        self._times: Column[np.int64] = Column(np.int64)
-        self._log_times: Column[np.int64] | None = Column(np.int64) if both else None
+        self._values: Column[np.float64] = Column(np.float64, expected)
+        self._times: Column[np.int64] = Column(np.int64, expected)
+        self._log_times: Column[np.int64] | None = Column(np.int64, expected) if both else None
         self._lag = np.iinfo(np.int64).max
         self._last = np.iinfo(np.int64).min
         self._rising = True
@@ -65,7 +66,7 @@ class SignalReader:
 
         :param values: their values.
         :param good: those that have one; the others are left out.
-        :param times: their times by the clock [ns]; 0: unknown.
+        :param times: their times by the clock [ns], none negative; 0: unknown.
         :param log_times: when they were recorded [ns].
         """
         if not bool(good.all()):
@@ -77,8 +78,7 @@ class SignalReader:
         self._last = int(times[-1])
         if self._clock != "log":
             self._all_dated &= bool(times.all())
-            # The times of a clock that is far off must not overflow.
-            self._lag = min(self._lag, int((log_times // 2 - times // 2).min()) * 2)
+            self._lag = min(self._lag, int((log_times - times).min()))
         self._values.extend(values)
         self._times.extend(times)
         if self._log_times is not None:

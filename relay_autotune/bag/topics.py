@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from relay_autotune.bag.cdr import Path
 from relay_autotune.bag.decode import decode_messages
 from relay_autotune.bag.fields import named_field, only_field, split_name, stamp_of
+from relay_autotune.bag.limits import MOST_EXPECTED
 from relay_autotune.bag.locate import Messages
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
@@ -183,7 +184,10 @@ class Topics:
         self, names: Sequence[str], clock: str, *, both: bool = False
     ) -> dict[str, SignalReader]:
         wanted: dict[tuple[int, int], list[tuple[SignalReader, Path, Any]]] = {}
-        readers = {name: SignalReader(name, clock, both=both) for name in names}
+        readers = {
+            name: SignalReader(name, clock, both=both, expected=self._expected(name))
+            for name in names
+        }
         for name, reader in readers.items():
             topic, wanted_field = split_name(name)
             for number, channel in self._channels(topic):
@@ -223,6 +227,14 @@ class Topics:
                         self.progress(done + min(position, file.size), total)
             before, done = last, done + file.size
 
+    def _expected(self, name: str) -> int:
+        """Return how many messages of a topic the files say they have, within reason."""
+        counts = [
+            min(self.files[number].message_count(channel.id), self.files[number].size)
+            for number, channel in self._channels(split_name(name)[0])
+        ]
+        return min(sum(counts), MOST_EXPECTED)
+
     def _channels(self, topic: str) -> list[tuple[int, Channel]]:
         return [
             (number, channel)
@@ -245,4 +257,6 @@ def _values(path: Path, messages: Messages) -> tuple[NDArray[Any], NDArray[np.bo
 def _stamps(stamp: tuple[Path, Path], messages: Messages) -> tuple[IntArray, NDArray[np.bool_]]:
     """Return the time stamps of messages [ns], and which messages have one."""
     (seconds, good), (rest, also) = (_values(path, messages) for path in stamp)
-    return seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64), good & also
+    times = seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64)
+    # No clock was set to a time before 1970.
+    return np.maximum(times, 0), good & also

@@ -516,7 +516,7 @@ def test_another_type_is_refused_by_name(tmp_path):
         tmp_path / "bag", [Topic("/x", "x_msgs/msg/X", definition=own), *LOOP], start_ns=START
     ) as bag:
         bag.write("/x", START, START, encode_float64(1.0))
-    with pytest.raises(SelectionError, match=r"/x is of type x_msgs/msg/X, which holds no numbers"):
+    with pytest.raises(SelectionError, match="/x is of type x_msgs/msg/X, which holds no num"):
         read_experiments(tmp_path / "bag", Selection("/x", "/command"))
 
 
