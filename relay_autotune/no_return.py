@@ -16,6 +16,8 @@ _LARGER = 3.0
 
 # Over its last third, a measurement that moves by less than this part of its whole way is level.
 _LEVEL = 0.03
+# What is no further than this part of its way from where it went last has not come back.
+_BACK = 0.1
 
 
 def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> str:
@@ -32,13 +34,17 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
     first, second, third = (float(part.mean()) for part in thirds)
     whole = float(towards.max() - towards.min())
     still = 3.0 * noise_std / min(len(part) for part in thirds) ** 0.5
-    if third - float(towards[0]) < -max(_LEVEL * whole, still):
+    level = max(_LEVEL * whole, still)
+    # It may swing out for a while first; what counts is whether it came back from there.
+    way_back = float(towards[-1] - towards.min())
+    away = way_back <= max(_BACK * whole, level, 6.0 * noise_std)
+    if away and third - float(towards[0]) < -level:
         faster = " faster and faster" if second - third > first - second > 0.0 else ""
         return (
             f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, or "
             f"the process is unstable and the amplitude too small to hold it"
         )
-    if abs(third - second) <= max(_LEVEL * whole, still):
+    if abs(third - second) <= level:
         return (
             "the response saturates before the relay's band: the amplitude may be too small for "
             "the hysteresis or the set-point, a load may have come, or the actuator is at its end"

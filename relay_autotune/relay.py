@@ -160,12 +160,24 @@ class RelayExperiment:
         return self._samples.time[-1] if self._samples else 0.0
 
     @property
+    def cycles_left(self) -> int:
+        """Number of cycles until the end, as far as one can tell; at least 1 while it runs."""
+        return max(self.parameters.min_cycles + 1 - self.cycle_count, 0 if self.finished else 1)
+
+    @property
+    def remaining(self) -> float:
+        """Expected time until the end [s]; NaN before the first whole cycle."""
+        if self.finished:
+            return 0.0
+        cycles = self._procedure.cycles
+        return self.cycles_left * cycles[-1].period if cycles else math.nan
+
+    @property
     def progress(self) -> float:
         """How much of the experiment is done, from 0 to 1, as far as one can tell."""
         if self.state is State.RELAY:
             done = self.cycle_count
-            left = max(self.parameters.min_cycles + 1 - done, 1)
-            return 0.1 + 0.9 * done / (done + left)
+            return 0.1 + 0.9 * done / (done + self.cycles_left)
         return {State.SETTLING: 0.0, State.KICK: 0.05, State.PROBE: 0.05}.get(self.state, 1.0)
 
     def samples(self, first: int, stop: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -244,7 +256,7 @@ class RelayExperiment:
         """
         if self._hold is not None:
             return self._hold.command(measurement)
-        if self._procedure.state is State.COMPLETED:
+        if self._procedure.state is State.COMPLETED and not self._policy.give_back:
             return self.baseline
         return self.safe_command
 
@@ -283,8 +295,10 @@ class RelayExperiment:
         return self._samples.measurement[-1] if self._samples else math.nan
 
     def _ended(self, measurement: float) -> float:
-        if self._policy.hold:
-            self._hold = ProportionalHold.after(self.settings, self._procedure.cycles)
+        if self._policy.hold and not self._policy.give_back:
+            self._hold = ProportionalHold.after(
+                self.settings, self._procedure.cycles, self._policy.gain
+            )
         return self.after_end(measurement)
 
     def _rate_limited(self, wanted: float) -> float:

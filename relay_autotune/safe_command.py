@@ -19,11 +19,16 @@ class SafePolicy:
     :param command: what is commanded after an abort or a failure [u]; NaN: the baseline.
     :param hold: True for a process that would not stay where it is at a constant command (an
         integrating or unstable one): it is held by proportional control as soon as its ultimate
-        gain is roughly known.
+        gain is roughly known, or from the kick on if ``gain`` is given.
+    :param gain: gain of that proportional control [u/y]; 0: half of the ultimate gain.
+    :param give_back: True if another controller takes over at once, however it ended; the
+        experiment's ``safe_command`` is then kept at what that one wants.
     """
 
     command: float = math.nan
     hold: bool = False
+    gain: float = 0.0
+    give_back: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,23 +54,29 @@ class ProportionalHold:
 
     @classmethod
     def after(
-        cls, settings: RelaySettings | None, cycles: Sequence[Cycle]
+        cls, settings: RelaySettings | None, cycles: Sequence[Cycle], gain: float = 0.0
     ) -> ProportionalHold | None:
-        """Return the hold that an experiment allows, None before its first whole cycle.
+        """Return the hold that an experiment allows, None where no gain is known.
 
         :param settings: the relay's settings; its levels are the limits.
         :param cycles: the cycles so far.
+        :param gain: a gain that the user gave [u/y]; 0: none.
         """
-        if settings is None or not cycles:
+        if settings is None:
             return None
-        last = cycles[-1]
-        half_swing = 0.5 * (last.peak_max - last.peak_min)
-        if half_swing <= 0.0:
+        centre = settings.baseline
+        if cycles:
+            last = cycles[-1]
+            centre = last.mean_command
+            half_swing = 0.5 * (last.peak_max - last.peak_min)
+            if gain == 0.0 and half_swing > 0.0:
+                gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * half_swing)
+                gain = -gain if settings.reverse_acting else gain
+        if gain == 0.0:
             return None
-        gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * half_swing)
         return cls(
-            centre=last.mean_command,
-            gain=-gain if settings.reverse_acting else gain,
+            centre=centre,
+            gain=gain,
             setpoint=settings.setpoint,
             low=settings.low,
             high=settings.high,

@@ -11,9 +11,9 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from std_msgs.msg import Float64
 
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.live_types import Reader, command_setter
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
 # The safe command is repeated at this interval until it is acknowledged, so many times at most.
@@ -29,23 +29,28 @@ class Ends:
     :param on_measurement: called with each measurement and the middleware's facts about it.
     :param on_result: called with the topic's unresolved name and each model or gains.
     :param cycles_kept: cycles that wait for who comes late.
+    :param reader: how the measurement is read from its messages.
+    :param command_type: message type of the command.
     """
 
     def __init__(
         self,
         node: Node,
         *,
-        on_measurement: Callable[[Float64, dict[str, Any]], None],
+        on_measurement: Callable[[Any, dict[str, Any]], None],
         on_result: Callable[[str, Any], None],
         cycles_kept: int,
+        reader: Reader,
+        command_type: str,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
         # Each event that an end watches costs every turn of the executor; incompatible ends are
         # named by /diagnostics and by the answer to a start.
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
+        self._message, self._write = command_setter(command_type)
         self.command = node.create_publisher(
-            Float64,
+            type(self._message),
             "command",
             quality.COMMAND,
             event_callbacks=quiet,
@@ -60,8 +65,10 @@ class Ends:
         self.diagnostics = node.create_publisher(
             DiagnosticArray, "/diagnostics", 1, event_callbacks=quiet
         )
+        self.reader = reader
+        self.command_type = command_type
         self.measurement = node.create_subscription(
-            Float64,
+            reader.kind,
             "measurement",
             on_measurement,
             quality.MEASUREMENT,
@@ -74,7 +81,8 @@ class Ends:
             )
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
         )
-        self._message = Float64()
+        self.sent: Callable[[float], None] | None = None
+        """Told each command before it goes out."""
         # Bound once: this is called for each measurement.
         self._publish = self.command.publish
 
@@ -91,7 +99,9 @@ class Ends:
 
     def send(self, command: float) -> None:
         """Publish a command."""
-        self._message.data = command
+        if self.sent is not None:
+            self.sent(command)
+        self._write(self._message, command)
         self._publish(self._message)
 
     def send_until_acknowledged(self, command: float) -> tuple[int, bool]:

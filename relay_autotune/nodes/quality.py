@@ -56,33 +56,35 @@ def for_bag(profile: QoSProfile) -> Qos:
     )
 
 
-def why_no_publisher(node: Node, topic: str) -> str:
+def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
     """Say why nothing arrives on a topic, as far as the graph tells.
 
     :param node: the node that subscribes.
     :param topic: resolved name of the topic.
+    :param kind: the message type that is expected.
     """
     ends = node.get_publishers_info_by_topic(topic)
     if not ends:
         return f"{topic} has no publisher"
     own = _own(node, node.get_subscriptions_info_by_topic(topic))
-    problems = _problems(ends, lambda offered: qos_check_compatible(offered, own))
+    problems = _problems(ends, kind, lambda offered: qos_check_compatible(offered, own))
     if problems:
         return f"{topic} has {_count(len(ends), 'publisher')}, but {'; '.join(problems)}"
     return f"{topic} has {_count(len(ends), 'publisher')}, but nothing arrives"
 
 
-def why_no_subscriber(node: Node, topic: str) -> str:
+def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
     """Say why nobody takes what is published on a topic, as far as the graph tells.
 
     :param node: the node that publishes.
     :param topic: resolved name of the topic.
+    :param kind: the message type that is expected.
     """
     ends = node.get_subscriptions_info_by_topic(topic)
     if not ends:
         return f"{topic} has no subscriber"
     own = _own(node, node.get_publishers_info_by_topic(topic))
-    problems = _problems(ends, lambda wanted: qos_check_compatible(own, wanted))
+    problems = _problems(ends, kind, lambda wanted: qos_check_compatible(own, wanted))
     if problems:
         return f"{topic} has no subscriber that can be served: {'; '.join(problems)}"
     return f"{topic} has {_count(len(ends), 'subscriber')}, but none is connected yet"
@@ -96,12 +98,12 @@ def _own(node: Node, ends: Sequence[Any]) -> Any:
     return None
 
 
-def _problems(ends: Sequence[Any], check: Any) -> list[str]:
+def _problems(ends: Sequence[Any], kind: str, check: Any) -> list[str]:
     problems = []
     for end in ends:
         who = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
-        if end.topic_type != FLOAT64_TYPE:
-            problems.append(f"{who} has type {end.topic_type}, expected {FLOAT64_TYPE}")
+        if end.topic_type != kind:
+            problems.append(f"{who} has type {end.topic_type}, expected {kind}")
             continue
         compatibility, reason = check(end.qos_profile)
         if compatibility == QoSCompatibility.ERROR:

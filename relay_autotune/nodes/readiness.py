@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.levels import Levels
+from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber
+from relay_autotune.relay import SafePolicy
 from relay_autotune.relay_parameters import ExperimentParameters
 
 
@@ -17,14 +20,11 @@ class NotReadyError(RelayAutotuneError):
     """A tune that cannot start."""
 
 
-def require_connections(
-    node: Node, measurement: Subscription, command: Publisher, age: float, timeout: float
-) -> None:
+def require_connections(node: Node, ends: Ends, age: float, timeout: float) -> None:
     """Refuse a start without measurements, or with nobody who takes the commands.
 
     :param node: the node that would tune.
-    :param measurement: its subscription.
-    :param command: its publisher.
+    :param ends: its topics.
     :param age: time since the last measurement came [s]; inf: none has come.
     :param timeout: the greatest age that counts as "arriving" [s].
     :raises NotReadyError: with the reason, as far as the graph tells it.
@@ -33,22 +33,27 @@ def require_connections(
         raise NotReadyError("use_sim_time is true, but no time has come on /clock")
     if age > timeout:
         when = "yet" if math.isinf(age) else f"for {age:.3g} s"
-        why = why_no_publisher(node, measurement.topic_name)
+        why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
         raise NotReadyError(f"no measurement has come {when}: {why}")
-    if command.get_subscription_count() == 0:
-        why = why_no_subscriber(node, command.topic_name)
+    # In takeover one of the subscriptions is the node's own.
+    own = sum(s.topic_name == ends.command.topic_name for s in node.subscriptions)
+    if ends.command.get_subscription_count() <= own:
+        why = why_no_subscriber(node, ends.command.topic_name, ends.command_type)
         raise NotReadyError(f"no command would arrive: {why}")
 
 
-def baseline_from(parameter: float, held: float | None) -> float:
+def baseline_from(parameter: float, mean: float, held: float | None) -> float:
     """Return the command of the operating point.
 
     :param parameter: the parameter ``baseline`` [u]; NaN: not given.
+    :param mean: mean of the present controller's commands [u]; NaN: none is connected.
     :param held: the command that the node holds now [u]; None: it has sent none.
-    :raises NotReadyError: if neither is known.
+    :raises NotReadyError: if none of them is known.
     """
     if not math.isnan(parameter):
         return parameter
+    if not math.isnan(mean):
+        return mean
     if held is None:
         raise NotReadyError(
             "the baseline is not known: set the parameter baseline, or initial_command at the "
@@ -57,12 +62,52 @@ def baseline_from(parameter: float, held: float | None) -> float:
     return held
 
 
-def plan_of(parameters: ExperimentParameters, baseline: float) -> str:
+def policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
+    """Return how the process will be left when the tune ends.
+
+    :param values: the node's parameters.
+    :param connected: True if a present controller's commands come.
+    :raises NotReadyError: if the process would not stay where it is, and nothing could hold it.
+    """
+    safe = values["safe_command"]
+    low, high = values["command_min"], values["command_max"]
+    if not math.isnan(safe) and not low <= safe <= high:
+        raise NotReadyError(
+            f"safe_command is {safe:g}, expected from command_min {low:g} to command_max {high:g}"
+        )
+    kind, gain = values["process_type"], values["hold_gain"]
+    if kind == "self_regulating":
+        return SafePolicy(command=safe)
+    if connected:
+        return SafePolicy(command=safe, give_back=True)
+    if gain == 0.0 and not values["start_without_hold"]:
+        drift = "drift away" if kind == "integrating" else "run away"
+        raise NotReadyError(
+            f"process_type is {kind}: at a constant command it would {drift} when a tune ends "
+            f"before its first cycle; connect controller_command, or give hold_gain, or set "
+            f"start_without_hold to true"
+        )
+    return SafePolicy(command=safe, hold=True, gain=gain)
+
+
+def plan_of(parameters: ExperimentParameters, baseline: float, policy: SafePolicy) -> str:
     """Say what a tune will command.
 
     :param parameters: the experiment's parameters.
     :param baseline: command of the operating point [u].
+    :param policy: how the process will be left.
     """
-    middle = baseline + parameters.relay_bias
-    low, high = middle - parameters.amplitude, middle + parameters.amplitude
-    return f"relay between {low:g} and {high:g} about the baseline {baseline:g}"
+    if parameters.finds_amplitude:
+        levels = Levels(parameters, baseline)
+        plan = (
+            f"relay from between {levels.low:g} and {levels.high:g} about the baseline "
+            f"{baseline:g}, growing within {parameters.command_min:g} and "
+            f"{parameters.command_max:g}"
+        )
+    else:
+        middle = baseline + parameters.relay_bias
+        low, high = middle - parameters.amplitude, middle + parameters.amplitude
+        plan = f"relay between {low:g} and {high:g} about the baseline {baseline:g}"
+    if policy.give_back:
+        return f"{plan}, then back to controller_command"
+    return f"{plan}, then proportional control holds the process" if policy.hold else plan

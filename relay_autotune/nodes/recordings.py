@@ -34,6 +34,7 @@ class _Recording:
         self.missing = list(RESULTS)
         self.waiting = False
         self.timer: Timer | None = None
+        self.closed: Callable[[str], None] | None = None
 
 
 class Recordings:
@@ -53,6 +54,7 @@ class Recordings:
         ]
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._open: dict[str, _Recording] = {}
+        self._paths: dict[str, str] = {}
         self._last: Recorder | None = None
         self._reported = ""
 
@@ -73,6 +75,9 @@ class Recordings:
         recorder.wait_until_open(OPEN_WITHIN)
         self._open[experiment_id] = _Recording(recorder)
         self._last = recorder
+        if len(self._paths) > 1:
+            self._paths.pop(next(iter(self._paths)))
+        self._paths[experiment_id] = str(recorder.path)
         said = self.problem() or f"recorded in {recorder.path}"
         return recorder.sample, said
 
@@ -101,16 +106,27 @@ class Recordings:
             if recording.waiting and not recording.missing:
                 self.close(experiment_id, "with model and gains")
 
-    def close_with_results(self, experiment_id: str, timeout: float) -> None:
+    def path_of(self, experiment_id: str) -> str:
+        """Return the folder of a recording; "" if nothing could be recorded.
+
+        :param experiment_id: the id of the experiment, one of the newest two.
+        """
+        return self._paths.get(experiment_id, "") if not self.problem() else ""
+
+    def close_with_results(
+        self, experiment_id: str, timeout: float, closed: Callable[[str], None]
+    ) -> None:
         """Close a recording once model and gains are in it, or after a time without them.
 
         :param experiment_id: the id of the experiment.
         :param timeout: how long to wait [s].
+        :param closed: called with a sentence on what is missing, "" if nothing is.
         """
         recording = self._open.get(experiment_id)
         if recording is None:
             return
         recording.waiting = True
+        recording.closed = closed
         if not recording.missing:
             self.close(experiment_id, "with model and gains")
             return
@@ -132,6 +148,9 @@ class Recordings:
             return
         if recording.timer is not None:
             self._node.destroy_timer(recording.timer)
+        if recording.closed is not None:
+            missing = " and ".join(recording.missing)
+            recording.closed(f"{missing} did not come" if missing else "")
         log = self._node.get_logger()
         say = log.warning if recording.waiting and recording.missing else log.info
         recording.recorder.close(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import secrets
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,35 +15,36 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
-from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from relay_autotune.errors import ParameterError, RecordError, RelayAutotuneError
-from relay_autotune.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
+from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
+from relay_autotune.nodes.loop_ends import LoopEnds
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.quality import why_no_publisher
 from relay_autotune.nodes.readiness import (
     NotReadyError,
     baseline_from,
     plan_of,
+    policy_from,
     require_connections,
 )
 from relay_autotune.nodes.recordings import Recordings
+from relay_autotune.nodes.reports import Counter, cycle_message, experiment_message, state_values
 from relay_autotune.nodes.session import Session
+from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )
 from relay_autotune.record import Outcome
-from relay_autotune.relay import RelayExperiment
+from relay_autotune.relay import RelayExperiment, SafePolicy
 from relay_autotune.relay_parameters import ExperimentParameters
-from relay_autotune_msgs.msg import RelayCycle
-from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 from relay_autotune_msgs.srv import StartTune
 
 # How long the end of the process waits for the record to be acknowledged.
@@ -54,74 +56,83 @@ CLOSE_WITHIN = 3.0
 
 
 class RelayNode(ServedNode):
-    """Answers each measurement with a command while a tune runs, and holds the baseline after."""
+    """Answers each measurement with a command while a tune runs, and holds the process after."""
 
     def __init__(self) -> None:
         super().__init__("relay_node")
         declare(self, TUNE_PARAMETERS)
         declare(self, FIXED_PARAMETERS, read_only=True)
-        initial = self.get_parameter("initial_command").value
+        fixed = values_of(self, FIXED_PARAMETERS)
+        initial = fixed["initial_command"]
         self._held: float | None = None if math.isnan(initial) else initial
+        self._after: Callable[[float], float] | None = None
         self._session: Session | None = None
         self._watchdog: Timer | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._simulated = bool(self.get_parameter("use_sim_time").value)
-        self._last_arrival = -math.inf
-        self._arrivals = self._arrivals_before = 0
-        self._sequence = 0
-        self._lost = 0
+        self._counter = Counter()
         self._counted = False
         self._ahead = 0
         self._summary = "no tune yet"
+        self._alarm = ""
+        self._reader = reader_of(fixed["measurement_type"], fixed["measurement_field"])
+        self._value = self._reader.value
         self._ends = Ends(
             self,
             on_measurement=self._on_measurement,
             on_result=self._on_result,
             cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
+            reader=self._reader,
+            command_type=fixed["command_type"],
         )
         self._send = self._ends.send
+        self._loop = LoopEnds(
+            self, self._ends, takeover=fixed["path"] == "takeover", stop=self._stop_now
+        )
         if not self._simulated:
             # With /clock, the time of a sample comes by another callback.
             self.favoured = self._ends.measurement
         self._recordings = Recordings(self, self._ends.recorded())
         self.create_service(StartTune, "~/start_tune", self._on_start)
         self.create_service(Trigger, "~/abort", self._on_abort)
+        self._action = TuneAction(self, self._request, partial(self._stop_now, "cancelled"))
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
         self.add_on_set_parameters_callback(self._on_set)
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(
             f"ready: {self._ends.measurement.topic_name} in, {self._ends.command.topic_name} out; "
-            f"start a tune with the service {self._name}/start_tune"
+            f"start with the service {self._name}/start_tune or the action {self._name}/tune"
         )
 
     # The hot path.
 
-    def _on_measurement(self, message: Float64, info: dict[str, Any]) -> None:
+    def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
         session = self._session
+        value = self._value(message)
         if self._ahead:
             self._ahead -= 1
         elif session is not None:
-            command = session.answer(message.data, info)
+            if self._reader.stamp_ns is not None:
+                info["source_timestamp"] = self._reader.stamp_ns(message)
+            command = session.answer(value, info)
             if command is not None:
                 # Nothing comes before this: the actuator waits for it.
                 self._send(command)
                 session.answered()
+                self._loop.commanded = command
                 experiment = session.experiment
                 if experiment.cycle_count != session.published_cycles:
                     self._defer_cycles(session)
                 if experiment.finished:
-                    self._leave(session)
+                    self._leave(session, command)
             elif session.may_be_no_repeat:
                 self._answer_later(session)
-        elif self._held is not None:
-            self._send(self._held)
-        self._last_arrival = time.monotonic()
-        self._arrivals += 1
-        number = info["publication_sequence_number"]
-        if number is not None:
-            if number > self._sequence + 1 and self._sequence:
-                self._lost += number - self._sequence - 1
-            self._sequence = number
+        elif not self._loop.is_driven:
+            if self._after is not None:
+                self._held = self._after(value)
+            if self._held is not None:
+                self._send(self._held)
+        self._counter.add(info["publication_sequence_number"])
 
     def _answer_later(self, session: Session) -> None:
         def answer() -> None:
@@ -138,50 +149,56 @@ class RelayNode(ServedNode):
     def _on_start(
         self, request: StartTune.Request, response: StartTune.Response
     ) -> StartTune.Response:
-        try:
-            parameters, baseline = self._ready(request.amplitude)
-        except RelayAutotuneError as error:
-            response.accepted = False
-            response.reason = str(error)
-            self.get_logger().warning(f"start refused: {error}")
-            return response
-        response.accepted = True
-        plan = plan_of(parameters, baseline)
-        if request.dry_run:
-            response.reason = f"a tune could start: {plan}"
-            return response
-        response.experiment_id, recorded = self._start(parameters, baseline)
-        response.reason = f"{plan}; {recorded}"
-        self.get_logger().info(f"tune {response.experiment_id} started: {response.reason}")
+        started = self._request(request.amplitude, request.dry_run)
+        response.accepted, response.reason = started.accepted, started.reason
+        response.experiment_id = started.experiment_id
         return response
 
-    def _ready(self, amplitude: float) -> tuple[ExperimentParameters, float]:
+    def _request(self, amplitude: float, dry_run: bool) -> Started:
+        try:
+            parameters, baseline, policy = self._ready(amplitude)
+        except RelayAutotuneError as error:
+            self.get_logger().warning(f"start refused: {error}")
+            return Started(False, str(error))
+        plan = plan_of(parameters, baseline, policy)
+        if dry_run:
+            return Started(True, f"a tune could start: {plan}")
+        identity, recorded = self._start(parameters, baseline, policy)
+        reason = f"{plan}; {recorded}"
+        self.get_logger().info(f"tune {identity} started: {reason}")
+        return Started(True, reason, identity)
+
+    def _ready(self, amplitude: float) -> tuple[ExperimentParameters, float, SafePolicy]:
         if self._session is not None:
             raise NotReadyError(
                 f"tune {self._session.id} is running; wait for its end or call {self._name}/abort"
             )
-        values = values_of(self, EXPERIMENT_PARAMETERS)
+        values = values_of(self, TUNE_PARAMETERS)
+        chosen = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
         if amplitude != 0.0:
-            values["amplitude"] = amplitude
-        parameters = ExperimentParameters(**values)
+            chosen["amplitude"] = amplitude
+        parameters = ExperimentParameters(**chosen)
         parameters.validate()
-        baseline = baseline_from(self.get_parameter("baseline").value, self._held)
+        connected = self._loop.is_connected
+        mean = self._loop.handover.mean() if connected else math.nan
+        baseline = baseline_from(values["baseline"], mean, self._held)
         parameters.validate(baseline)
-        require_connections(
-            self,
-            self._ends.measurement,
-            self._ends.command,
-            time.monotonic() - self._last_arrival,
-            self.get_parameter("measurement_timeout").value,
-        )
-        return parameters, baseline
+        policy = policy_from(values, connected=connected)
+        require_connections(self, self._ends, self._counter.age, values["measurement_timeout"])
+        self._loop.require_alone()
+        return parameters, baseline, policy
 
-    def _start(self, parameters: ExperimentParameters, baseline: float) -> tuple[str, str]:
+    def _start(
+        self, parameters: ExperimentParameters, baseline: float, policy: SafePolicy
+    ) -> tuple[str, str]:
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
         identity = f"{stamp}_{secrets.token_hex(4)}"
         clock = self.get_clock()
+        converged = self.get_parameter("stop_when").value == "converged"
         session = Session(
-            RelayExperiment(parameters, baseline, identity),
+            RelayExperiment(
+                parameters, baseline, identity, policy=policy, until_converged=converged
+            ),
             identity,
             sample_period=parameters.sample_period,
             clock=(lambda: int(clock.now().nanoseconds)) if self._simulated else None,
@@ -190,13 +207,14 @@ class RelayNode(ServedNode):
             identity, self.get_parameter("record_directory").value
         )
         session.record_with(sample)
-        self._lost = 0
         # Numbers of several publishers cannot be told apart.
         self._counted = self._ends.measurement.get_publisher_count() == 1
-        self._last_arrival = time.monotonic()
+        self._counter.begin()
+        self._alarm = ""
         self._session = session
         timeout = self.get_parameter("measurement_timeout").value
         self._watchdog = self.create_timer(timeout, self._watch, clock=self._steady)
+        self._loop.take(session.experiment, gives_back=policy.give_back)
         return identity, recorded
 
     # While a tune runs.
@@ -207,39 +225,22 @@ class RelayNode(ServedNode):
         session.published_cycles = session.experiment.cycle_count
 
     def _publish_cycle(self, session: Session, index: int) -> None:
-        experiment = session.experiment
-        first, stop = experiment.cycle_start[index], experiment.cycle_start[index + 1] + 1
-        begin = 0 if index == 0 else first
-        columns = experiment.samples(begin, stop)
-        message = RelayCycle()
-        cycle = experiment.cycles[index]
-        fill_cycle(
-            message,
-            cycle,
-            settings=experiment.settings,
-            experiment_id=session.id,
-            start_ns=session.start_ns,
-            time=columns[0],
-            measurement=columns[1],
-            command=columns[2],
-            lead_in=first - begin,
-        )
+        message = cycle_message(session, index)
         self._ends.cycles.publish(message)
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
+        self._action.tell(session.experiment)
 
     def _watch(self) -> None:
         session, watchdog = self._session, self._watchdog
         if session is None or watchdog is None:
             return
-        timeout = self.get_parameter("measurement_timeout").value
-        silent = time.monotonic() - self._last_arrival
+        timeout, silent = self.get_parameter("measurement_timeout").value, self._counter.age
         if silent < timeout:
             watchdog.timer_period_ns = max(int((timeout - silent) * 1e9), 1_000_000)
             watchdog.reset()
             return
-        self._stop(
-            session, f"no measurement on {self._ends.measurement.topic_name} for {silent:.3g} s"
-        )
+        topic = self._ends.measurement.topic_name
+        self._stop(session, f"no measurement on {topic} for {silent:.3g} s")
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         session = self._session
@@ -272,13 +273,41 @@ class RelayNode(ServedNode):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
+    def _on_result(self, name: str, message: Any) -> None:
+        session = self._session
+        now = int(self.get_clock().now().nanoseconds)
+        self._action.note(name, message)
+        self._recordings.message(message.experiment_id, name, now, message)
+        if session is None or name != "transfer_function" or message.experiment_id != session.id:
+            return
+        self._action.tell(session.experiment)
+        if self.get_parameter("stop_when").value == "confident":
+            self._end_if_confident(session, message)
+
+    def _end_if_confident(self, session: Session, model: Any) -> None:
+        wanted = self.get_parameter("confidence").value
+        gain = abs(model.ultimate_gain)
+        found = 1.96 * model.ultimate_gain_std / gain if gain > 0.0 else math.nan
+        if not found <= wanted or not session.experiment.cycle_count:
+            return
+        command = session.experiment.conclude(
+            f"after {session.experiment.cycle_count} cycles the 95 % interval of K_u is within "
+            f"{found:.3g} of it, as narrow as asked, {wanted:g}"
+        )
+        self._send_safe(command)
+        self._leave(session, command)
+
     # Ending.
+
+    def _stop_now(self, reason: str) -> None:
+        if self._session is not None:
+            self._stop(self._session, reason)
 
     def _stop(self, session: Session, reason: str) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
-        acknowledged = self._send_safe(session.experiment.safe_command)
-        session.experiment.abort(reason)
-        self._leave(session)
+        command = session.experiment.abort(reason)
+        acknowledged = self._send_safe(command)
+        self._leave(session, command)
         return acknowledged
 
     def _send_safe(self, command: float) -> bool:
@@ -288,44 +317,41 @@ class RelayNode(ServedNode):
             self._ahead = count
         return acknowledged
 
-    def _leave(self, session: Session) -> None:
+    def _leave(self, session: Session, command: float) -> None:
         # The safe command is out. All that takes time waits until the callback has returned.
-        self._held = session.experiment.safe_command
+        self._held = command
+        self._after = session.experiment.after_end
         self._session = None
-        session.lost_samples = self._lost if self._counted else 0
+        session.lost_samples = self._counter.lost if self._counted else 0
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
             self._watchdog = None
+        self._loop.give_back(session.experiment, command)
         self.defer(partial(self._complete, session))
 
     def _complete(self, session: Session) -> None:
         experiment = session.experiment
-        message = ExperimentMessage()
-        try:
-            fill_experiment(message, session.record())
-        except RecordError:
-            # Ended before the first sample: there is an outcome, but nothing was recorded.
-            fill_settings(message.settings, experiment.settings)
-            message.experiment_id = session.id
-            message.outcome = int(experiment.outcome)
-            message.reason = experiment.reason
-            message.noise_std = math.nan
-        if session.sample_count:
-            set_stamp(message.header.stamp, session.start_ns)
+        message = experiment_message(session)
         self._ends.experiments.publish(message)
         outcome = experiment.outcome.name.lower()
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
+        completed = experiment.outcome == Outcome.COMPLETED
+        self._alarm = "" if completed else self._summary
         self.get_logger().info(f"tune {session.id} {outcome}: {experiment.reason}")
+        self._publish_diagnostics()
         self._recordings.message(session.id, "relay_experiment", session.now_ns(), message)
-        if experiment.outcome == Outcome.COMPLETED:
+        self._action.tell(experiment)
+
+        def closed(missing: str) -> None:
+            bag = self._recordings.path_of(session.id)
+            self._action.end(session.id, experiment_message(session, arrays=False), bag, missing)
+
+        if completed:
             timeout = self.get_parameter("model_timeout").value
-            self._recordings.close_with_results(session.id, timeout)
+            self._recordings.close_with_results(session.id, timeout, closed)
         else:
             self._recordings.close(session.id, f"after a tune that was {outcome}")
-
-    def _on_result(self, name: str, message: Any) -> None:
-        now = int(self.get_clock().now().nanoseconds)
-        self._recordings.message(message.experiment_id, name, now, message)
+            closed("")
 
     def end(self, reason: str) -> None:
         """Send the safe command, then finish the record and close the bag."""
@@ -333,7 +359,7 @@ class RelayNode(ServedNode):
         try:
             if session is not None:
                 self._stop(session, reason)
-            elif self._held is not None:
+            elif self._held is not None and not self._loop.is_driven:
                 self._send_safe(self._held)
             self.work_off()
             self._ends.experiments.wait_for_all_acked(ACKNOWLEDGE)
@@ -342,31 +368,27 @@ class RelayNode(ServedNode):
 
     # Telling.
 
+    def hold(self, command: float) -> None:
+        """Answer each measurement with a command from now on."""
+        self._held, self._after = command, None
+        self._send(command)
+
     def _publish_diagnostics(self) -> None:
         session = self._session
-        age = time.monotonic() - self._last_arrival
-        problems = []
-        if age > self.get_parameter("measurement_timeout").value:
-            why = why_no_publisher(self, self._ends.measurement.topic_name)
+        problems = [self._alarm] if self._alarm else []
+        if self._counter.age > self.get_parameter("measurement_timeout").value:
+            why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
             problems.append(f"no measurement comes: {why}")
-        if self._recordings.problem():
-            problems.append(self._recordings.problem())
+        problems += filter(None, (self._recordings.problem(), self._loop.problem()))
+        idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
         values: dict[str, object] = {
-            "state": "idle" if self._held is None else "holding",
+            "state": idle,
             "experiment": "" if session is None else session.id,
-            "rate [Hz]": float(self._arrivals - self._arrivals_before),
-            "age of the last sample [s]": age,
+            "rate [Hz]": float(self._counter.since_last_asked()),
+            "age of the last sample [s]": self._counter.age,
         }
-        self._arrivals_before = self._arrivals
         if session is not None:
-            experiment = session.experiment
-            values |= {
-                "state": experiment.state.name.lower(),
-                "cycles": experiment.cycle_count,
-                "noise standard deviation": experiment.noise_std,
-                "samples": session.sample_count,
-                "lost samples": self._lost if self._counted else 0,
-            }
+            values |= state_values(session, self._counter.lost if self._counted else 0)
         summary = self._summary if session is None else f"tune {session.id} is running"
         now = int(self.get_clock().now().nanoseconds)
         name = self.get_fully_qualified_name().lstrip("/")

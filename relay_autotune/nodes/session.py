@@ -16,6 +16,7 @@ from relay_autotune.messages import start_seconds
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.record import Record
 from relay_autotune.relay import RelayExperiment
+from relay_autotune.sensor_watch import ClockWatch
 
 
 class Session:
@@ -53,6 +54,7 @@ class Session:
         self.may_be_no_repeat = False
         self._received_ns = array.array("q")
         self._sent_ns = array.array("q")
+        self.clocks = ClockWatch()
         self._record_sample: Callable[[tuple[int, int, float, int, float]], None] | None = None
         if sample_period > 0.0:
             self.answer = self._answer_by_number
@@ -114,6 +116,11 @@ class Session:
             self.start_ns = source
         self._count += 1
         command: float = self._step((source - self.start_ns) * 1e-9, measurement)
+        # From the first sample on, since the stamps themselves leave no digits for microseconds.
+        start = self.start_ns
+        stepped = self.clocks.add((source - start) * 1e-9, (received - start) * 1e-9)
+        if stepped:
+            command = self.experiment.abort(stepped)
         self._last = (received, source, measurement, command)
         return command
 

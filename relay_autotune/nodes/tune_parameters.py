@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from relay_autotune.nodes.live_types import COMMAND_TYPES, FLOAT64
 from relay_autotune.nodes.parameters import Entry, NodeParameter
 from relay_autotune.relay_parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 
@@ -14,7 +15,84 @@ NODE_PARAMETERS = (
         "baseline",
         math.nan,
         "u",
-        "Command of the operating point; NaN: the command held now, else initial_command.",
+        "Command of the operating point; NaN: the mean of controller_command where that comes, "
+        "else the command held now, else initial_command.",
+    ),
+    NodeParameter(
+        "safe_command",
+        math.nan,
+        "u",
+        "Command after a tune that was aborted or failed; NaN: the baseline.",
+    ),
+    NodeParameter(
+        "process_type",
+        "self_regulating",
+        "",
+        "What the process does at a constant command: it settles, its offset grows, or it runs "
+        "away; the last two are given back to controller_command, or held by proportional "
+        "control, when a tune ends.",
+        choices=("self_regulating", "integrating", "unstable"),
+    ),
+    NodeParameter(
+        "hold_gain",
+        0.0,
+        "u/y",
+        "Gain of that proportional control, with the sign of the process; 0: half of K_u, as "
+        "soon as a whole cycle was seen.",
+    ),
+    NodeParameter(
+        "start_without_hold",
+        False,
+        "",
+        "True: a tune of a process that is not self-regulating may start with neither "
+        "controller_command nor hold_gain.",
+    ),
+    NodeParameter(
+        "stop_when",
+        "converged",
+        "",
+        "converged: a tune ends when min_cycles cycles agree; confident: when the 95 % interval "
+        "of K_u from identifier_node is narrow enough.",
+        choices=("converged", "confident"),
+    ),
+    NodeParameter(
+        "confidence",
+        0.02,
+        "",
+        "Half width of that interval as a fraction of K_u, for stop_when confident.",
+        1e-4,
+        1.0,
+    ),
+    NodeParameter(
+        "controller_timeout",
+        1.0,
+        "s",
+        "controller_command counts as connected when its last message is no older; when it falls "
+        "silent for longer, the safe command goes out.",
+        1e-3,
+    ),
+    NodeParameter(
+        "return_time",
+        0.0,
+        "s",
+        "Time over which the command goes back to the controller's after a tune; 0: the last "
+        "period of the oscillation, else 5 s.",
+        0.0,
+    ),
+    NodeParameter(
+        "feedback_tolerance",
+        0.0,
+        "u",
+        "How far command_feedback may be from the command, where that topic is published; 0: "
+        "half of the amplitude.",
+        0.0,
+    ),
+    NodeParameter(
+        "feedback_timeout",
+        1.0,
+        "s",
+        "For how long it may be further away before the actuator counts as stuck.",
+        1e-3,
     ),
     NodeParameter(
         "measurement_timeout",
@@ -43,6 +121,31 @@ FIXED_PARAMETERS = (
         math.nan,
         "u",
         "Answer to each measurement before the first tune; NaN: silent until then.",
+    ),
+    NodeParameter(
+        "path",
+        "passthrough",
+        "",
+        "passthrough: controller_command is passed on to command when no tune runs; takeover: "
+        "the controller publishes command by itself and is silent during a tune.",
+        choices=("passthrough", "takeover"),
+    ),
+    NodeParameter(
+        "measurement_type",
+        FLOAT64,
+        "",
+        "Message type of the measurement; its header's stamp, if it has one, is the time.",
+    ),
+    NodeParameter(
+        "measurement_field", "data", "", "Path of the measurement in it, such as position[2]."
+    ),
+    NodeParameter(
+        "command_type",
+        FLOAT64,
+        "",
+        "Message type of the command; an array has the command as its only element, as a "
+        "forward_command_controller of ros2_control wants it.",
+        choices=COMMAND_TYPES,
     ),
 )
 TUNE_PARAMETERS: tuple[Entry, ...] = (*EXPERIMENT_PARAMETERS, *NODE_PARAMETERS)

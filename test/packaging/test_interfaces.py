@@ -71,7 +71,25 @@ PROMISED = {
         ---
         uint8 state
         uint32 cycle
-        float64 progress elapsed remaining period amplitude ultimate_gain ultimate_gain_std""",
+        float64 progress elapsed remaining period amplitude ultimate_gain ultimate_gain_std
+        TransferFunction transfer_function""",
+    "action/Verify.action": """
+        float64 setpoint_step load_step
+        ---
+        bool passed
+        string reason
+        Verification[] steps
+        ---
+        uint8 step
+        float64 elapsed remaining""",
+    "msg/Verification.msg": """
+        std_msgs/Header header
+        uint8 kind
+        float64 step overshoot overshoot_predicted settling_time settling_time_predicted
+        float64 iae iae_predicted fit gain_ratio ms ms_predicted
+        bool passed
+        string reason
+        float64[] time measurement command predicted""",
 }
 FILES = sorted(
     str(file.relative_to(ROOT))
@@ -134,7 +152,8 @@ def test_floats_have_a_unit(file: str):
     mere = {"b", "fit", "gain_margin", "ms", "ms_95", "mt", "progress", "whiteness_p"}
     in_the_parameters_unit = {"std", "covariance", "ci95_low", "ci95_high"}
     polynomials = {"numerator", "denominator"}
-    exempt = mere | in_the_parameters_unit | polynomials
+    compared = {"overshoot", "overshoot_predicted", "gain_ratio", "ms_predicted"}
+    exempt = mere | compared | in_the_parameters_unit | polynomials
     unitless = [
         name
         for section in sections(file)

@@ -1,0 +1,140 @@
+"""What is watched while a tune runs, besides the samples themselves."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+# The guard looks so often [s], and at the graph every so many looks.
+LOOK_EVERY = 0.05
+_GRAPH_EVERY = 4
+
+# An actuator that is too slow for the time limit is seen by so many of its last stays in which it
+# never came to the level it was told.
+_STAYS = 6
+_MISSED = 3
+
+
+class FollowWatch:
+    """Recognise an actuator that does not follow, from a feedback of its position.
+
+    The fault is a position that is further than the tolerance from the command for longer than
+    the timeout; or, where the relay switches faster than that, three of the last six stays at a
+    level in which the position never came near it.
+
+    :param tolerance: distance that counts as there [u].
+    :param timeout: longest time that the actuator may take [s].
+    """
+
+    def __init__(self, tolerance: float, timeout: float) -> None:
+        self._tolerance = tolerance
+        self._timeout = timeout
+        self._command = math.nan
+        self._since = -math.inf
+        self._came = True
+        self._stays: deque[bool] = deque(maxlen=_STAYS)
+
+    def add(self, now: float, command: float, position: float) -> bool:
+        """Take a position; return True if the actuator does not follow.
+
+        :param now: the time [s].
+        :param command: what it was told [u].
+        :param position: where it says it is [u].
+        """
+        if command != self._command:
+            self._stays.append(self._came)
+            self._command, self._since, self._came = command, now, False
+        if abs(position - command) <= self._tolerance:
+            self._came, self._since = True, now
+            return False
+        return now - self._since > self._timeout or self._stays.count(False) >= _MISSED
+
+
+class Guard:
+    """Look at the graph, the controller and the actuator every 50 ms while a tune runs.
+
+    :param node: the node that tunes.
+    :param stop: called with the reason when the tune is to end.
+    """
+
+    def __init__(self, node: Node, stop: Callable[[str], None]) -> None:
+        self._node = node
+        self._stop = stop
+        self._looks = 0
+        self._checks: list[Callable[[], str]] = []
+        self._timer = node.create_timer(
+            LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
+        )
+
+    def begin(self, checks: list[Callable[[], str]]) -> None:
+        """Begin to look.
+
+        :param checks: each returns a reason to end the tune, or "".
+        """
+        self._checks, self._looks = checks, 0
+        self._timer.reset()
+
+    def end(self) -> None:
+        """Stop looking."""
+        self._checks = []
+        self._timer.cancel()
+
+    def every_look_at_the_graph(self, check: Callable[[], str]) -> Callable[[], str]:
+        """Make a check rarer, since it asks the middleware."""
+        return lambda: check() if self._looks % _GRAPH_EVERY == 0 else ""
+
+    def _look(self) -> None:
+        self._looks += 1
+        for check in self._checks:
+            reason = check()
+            if reason:
+                self._stop(reason)
+                return
+
+
+def second_publisher(node: Node, topic: str) -> str:
+    """Return a sentence if somebody else publishes a topic of the node, else "".
+
+    :param node: the node.
+    :param topic: resolved name of a topic that it publishes.
+    """
+    if node.count_publishers(topic) <= 1:
+        return ""
+    me = (node.get_namespace(), node.get_name())
+    others = {
+        f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+        for end in node.get_publishers_info_by_topic(topic)
+        if (end.node_namespace, end.node_name) != me
+    }
+    who = ", ".join(sorted(others)) or "another publisher of this node's name"
+    return f"{topic} is also published by {who}: two of them would fight for the actuator"
+
+
+class Silence:
+    """A limit on how long something may stay silent, on the steady clock.
+
+    :param what: subject of the sentence.
+    :param timeout: the limit [s].
+    :param age: returns the time since it was last heard [s].
+    """
+
+    def __init__(self, what: str, timeout: float, age: Callable[[], float]) -> None:
+        self._what = what
+        self._timeout = timeout
+        self._age = age
+
+    def __call__(self) -> str:
+        """Return a sentence if the limit is passed, else ""."""
+        silent = self._age()
+        return f"{self._what} for {silent:.3g} s" if silent > self._timeout else ""
+
+
+def now() -> float:
+    """Return the steady clock's time [s]."""
+    return time.monotonic()

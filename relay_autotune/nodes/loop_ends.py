@@ -1,0 +1,217 @@
+"""The loop around relay_node: the present controller, the actuator, and who else commands."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from std_msgs.msg import Float64
+
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.ends import Ends
+from relay_autotune.nodes.guard import FollowWatch, Guard, Silence, second_publisher
+from relay_autotune.nodes.handover import Handover
+from relay_autotune.nodes.readiness import NotReadyError
+from relay_autotune.relay import RelayExperiment
+
+# In takeover, the node's own last commands, which come back to it by the topic.
+_OWN_KEPT = 256
+# How often the controller is looked after while it is passed through [s].
+_LOOK_EVERY = 0.05
+
+
+class LoopEnds:
+    """Watch what else acts on the loop, and hand the command over and back.
+
+    :param node: relay_node.
+    :param ends: its topics.
+    :param takeover: True if the controller publishes the command by itself.
+    :param stop: ends a running tune with a reason.
+    """
+
+    def __init__(
+        self, node: Any, ends: Ends, *, takeover: bool, stop: Callable[[str], None]
+    ) -> None:
+        self._node = node
+        self._ends = ends
+        self._takeover = takeover
+        self._stop = stop
+        self.handover = Handover(ends.send)
+        self.commanded = math.nan
+        """The last command of the tune [u]."""
+        self._experiment: RelayExperiment | None = None
+        self._gives_back = False
+        self._driven = False
+        self._silent = ""
+        self._feedback = math.nan
+        self._feedback_at = -math.inf
+        self._follow: FollowWatch | None = None
+        self._own: deque[float] = deque(maxlen=_OWN_KEPT)
+        self._guard = Guard(node, stop)
+        self._topic = ends.command.topic_name
+        unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
+        if takeover:
+            ends.sent = self._own.append
+            node.create_subscription(
+                Float64, "command", self._on_command, quality.COMMAND, event_callbacks=unheard
+            )
+        else:
+            self._controller = node.create_subscription(
+                Float64,
+                "controller_command",
+                self._on_controller,
+                quality.MEASUREMENT,
+                event_callbacks=unheard,
+            )
+            node.create_timer(
+                _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            )
+        node.create_subscription(
+            Float64,
+            "command_feedback",
+            self._on_feedback,
+            quality.MEASUREMENT,
+            event_callbacks=unheard,
+        )
+
+    def _value(self, name: str) -> Any:
+        return self._node.get_parameter(name).value
+
+    @property
+    def is_driven(self) -> bool:
+        """True while somebody else's commands reach the actuator."""
+        return self._driven and self._experiment is None
+
+    @property
+    def is_connected(self) -> bool:
+        """True if a present controller's commands come."""
+        return self.handover.is_connected(self._value("controller_timeout"))
+
+    def problem(self) -> str:
+        """Return what an operator must act on, "" if nothing."""
+        return self._silent
+
+    def require_alone(self) -> None:
+        """Refuse a start while somebody else commands the actuator.
+
+        :raises NotReadyError: with who does.
+        """
+        if self._takeover:
+            if self._driven and self.handover.is_connected(self._value("controller_timeout")):
+                raise NotReadyError(
+                    f"{self._topic} is being commanded by another node; have the controller hold "
+                    "or track before the start"
+                )
+            return
+        problem = second_publisher(self._node, self._topic)
+        if problem:
+            raise NotReadyError(
+                f"{problem}; remap the controller's output to controller_command, or give path "
+                "takeover"
+            )
+
+    def take(self, experiment: RelayExperiment, *, gives_back: bool) -> None:
+        """Take the command for a tune.
+
+        :param experiment: the tune.
+        :param gives_back: True if the controller gets it back at once, however the tune ends.
+        """
+        connected = self.is_connected and not self._takeover
+        self._experiment, self._gives_back = experiment, gives_back
+        self.commanded = math.nan
+        self.handover.take_over()
+        checks: list[Callable[[], str]] = []
+        if not self._takeover:
+            checks.append(
+                self._guard.every_look_at_the_graph(
+                    lambda: second_publisher(self._node, self._topic)
+                )
+            )
+        if connected:
+            timeout = self._value("controller_timeout")
+            topic = self._controller.topic_name
+            checks.append(Silence(f"no command on {topic}", timeout, lambda: self.handover.age))
+        timeout = self._value("feedback_timeout")
+        self._follow = None
+        if time.monotonic() - self._feedback_at < timeout:
+            self._follow = FollowWatch(self._tolerance(experiment), timeout)
+            checks.append(
+                Silence(
+                    "no command_feedback",
+                    2.0 * timeout,
+                    lambda: time.monotonic() - self._feedback_at,
+                )
+            )
+        self._guard.begin(checks)
+
+    def _tolerance(self, experiment: RelayExperiment) -> float:
+        given = float(self._value("feedback_tolerance"))
+        return given or 0.5 * experiment.parameters.amplitude or math.inf
+
+    def give_back(self, experiment: RelayExperiment, command: float) -> None:
+        """Give the command back after a tune, without a bump unless it hurries.
+
+        :param experiment: the tune that ended.
+        :param command: what the actuator has now [u].
+        """
+        self._guard.end()
+        self._experiment, self._follow = None, None
+        period = experiment.cycles[-1].period if experiment.cycle_count else 0.0
+        left = math.nan if self._gives_back else command
+        self.handover.give_back(left, self._value("return_time") or period)
+        self._driven = self._driven and not self._takeover
+
+    # What comes in.
+
+    def _on_controller(self, message: Float64) -> None:
+        passed = self.handover.hear(message.data)
+        if passed is not None:
+            self._driven, self._silent = True, ""
+        elif self._gives_back and self._experiment is not None and self.is_connected:
+            self._experiment.safe_command = self.handover.last
+
+    def _on_command(self, message: Float64) -> None:
+        """Take a message on the command topic, where others may publish, too."""
+        if message.data in self._own:
+            return
+        if self._experiment is not None:
+            self._stop(
+                f"another node commanded {message.data:g} on {self._topic} during the tune: the "
+                "controller must hold or track"
+            )
+        # Whoever commands has the loop again.
+        self._driven = True
+        self.handover.note(message.data)
+
+    def _on_feedback(self, message: Float64) -> None:
+        self._feedback, self._feedback_at = message.data, time.monotonic()
+        if self._follow is None or math.isnan(self.commanded):
+            return
+        if self._follow.add(self._feedback_at, self.commanded, self._feedback):
+            self._stop(
+                f"the actuator does not follow: it is told {self.commanded:g} and says that it is "
+                f"at {self._feedback:g}"
+            )
+
+    def _look(self) -> None:
+        if not self.is_driven:
+            return
+        timeout = self._value("controller_timeout")
+        if self.handover.is_connected(timeout):
+            return
+        given = self._value("safe_command")
+        safe = self.handover.mean() if math.isnan(given) else given
+        self._driven = False
+        # The safe command comes first.
+        self._node.hold(safe)
+        self._silent = (
+            f"{self._controller.topic_name} has been silent for more than {timeout:g} s; the "
+            f"command is held at {safe:g} until it comes again"
+        )
+        self._node.get_logger().error(self._silent)

@@ -1,0 +1,115 @@
+"""What relay_node tells of a tune: its cycles, its record, its state."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+from relay_autotune.errors import RecordError
+from relay_autotune.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
+from relay_autotune.nodes.session import Session
+from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
+
+
+def cycle_message(session: Session, index: int) -> Any:
+    """Build the message of a finished cycle.
+
+    :param session: the tune.
+    :param index: number of the cycle.
+    """
+    experiment = session.experiment
+    first, stop = experiment.cycle_start[index], experiment.cycle_start[index + 1] + 1
+    begin = 0 if index == 0 else first
+    columns = experiment.samples(begin, stop)
+    message = RelayCycle()
+    fill_cycle(
+        message,
+        experiment.cycles[index],
+        settings=experiment.settings,
+        experiment_id=session.id,
+        start_ns=session.start_ns,
+        time=columns[0],
+        measurement=columns[1],
+        command=columns[2],
+        lead_in=first - begin,
+    )
+    return message
+
+
+def experiment_message(session: Session, *, arrays: bool = True) -> Any:
+    """Build the message of the whole record.
+
+    :param session: the tune.
+    :param arrays: False: a summary, without the samples.
+    """
+    experiment = session.experiment
+    message = RelayExperiment()
+    try:
+        fill_experiment(message, session.record(), arrays=arrays)
+    except RecordError:
+        # Ended before the first sample: there is an outcome, but nothing was recorded.
+        fill_settings(message.settings, experiment.settings)
+        message.experiment_id = session.id
+        message.outcome = int(experiment.outcome)
+        message.reason = experiment.reason
+        message.noise_std = math.nan
+    if session.sample_count:
+        set_stamp(message.header.stamp, session.start_ns)
+    return message
+
+
+class Counter:
+    """Count what arrives: how often, how long ago, and what the middleware lost on the way."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        """Samples lost since `begin`, by the publisher's numbers."""
+        self._last_arrival = -math.inf
+        self._arrivals = self._arrivals_before = 0
+        self._sequence = 0
+
+    @property
+    def age(self) -> float:
+        """Time since the last arrival [s]; inf: none."""
+        return time.monotonic() - self._last_arrival
+
+    def begin(self) -> None:
+        """Count losses, and the age, from here on."""
+        self.lost = 0
+        self._last_arrival = time.monotonic()
+
+    def add(self, number: int | None) -> None:
+        """Take an arrival.
+
+        :param number: its publication sequence number; None: not known.
+        """
+        self._last_arrival = time.monotonic()
+        self._arrivals += 1
+        if number is not None:
+            if number > self._sequence + 1 and self._sequence:
+                self.lost += number - self._sequence - 1
+            self._sequence = number
+
+    def since_last_asked(self) -> int:
+        """Return the number of arrivals since this was last asked."""
+        count = self._arrivals - self._arrivals_before
+        self._arrivals_before = self._arrivals
+        return count
+
+
+def state_values(session: Session, lost: int) -> dict[str, object]:
+    """Return the facts of a running tune for /diagnostics.
+
+    :param session: the tune.
+    :param lost: samples that are known to be lost.
+    """
+    experiment = session.experiment
+    return {
+        "state": experiment.state.name.lower(),
+        "cycles": experiment.cycle_count,
+        "noise standard deviation": experiment.noise_std,
+        "samples": session.sample_count,
+        "lost samples": lost,
+        "clock drift [s]": session.clocks.drift,
+    }

@@ -1,0 +1,176 @@
+"""The action ~/tune: the same experiment, with feedback, cancel, and a result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.node import Node
+
+from relay_autotune.relay import RelayExperiment, State
+from relay_autotune_msgs.action import Tune
+
+_STATES = {
+    State.SETTLING: Tune.Feedback.STATE_SETTLING,
+    State.KICK: Tune.Feedback.STATE_KICK,
+    State.PROBE: Tune.Feedback.STATE_KICK,
+    State.RELAY: Tune.Feedback.STATE_RELAY,
+    State.COMPLETED: Tune.Feedback.STATE_COMPLETED,
+    State.ABORTED: Tune.Feedback.STATE_ABORTED,
+    State.FAILED: Tune.Feedback.STATE_FAILED,
+}
+
+
+@dataclass(frozen=True)
+class Started:
+    """The answer to a request for a tune.
+
+    :param accepted: True if it runs, or could in a dry run.
+    :param reason: what will be done, or why not.
+    :param experiment_id: its id; empty where nothing was started.
+    """
+
+    accepted: bool
+    reason: str
+    experiment_id: str = ""
+
+
+class TuneAction:
+    """Serve the action; nothing waits in it, since the experiment advances with the samples.
+
+    A goal is always accepted, for a rejection could not say why: one that cannot start ends at
+    once as aborted, with the reason in its result.
+
+    :param node: the node.
+    :param start: starts a tune with an amplitude [u], or checks whether it could.
+    :param cancel: called when a running tune is to be cancelled.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        start: Callable[[float, bool], Started],
+        cancel: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._start = start
+        self._cancel = cancel
+        self._goal: Any = None
+        self._id = ""
+        self._result = Tune.Result()
+        self._succeeded = False
+        self._newest: Any = None
+        self._server = ActionServer(
+            node,
+            Tune,
+            "~/tune",
+            self._set_state,
+            handle_accepted_callback=self._accept,
+            cancel_callback=self._on_cancel,
+        )
+
+    def _accept(self, goal: Any) -> None:
+        request = goal.request
+        started = self._start(request.amplitude, request.dry_run)
+        if started.experiment_id:
+            self._goal, self._id = goal, started.experiment_id
+            self._result = Tune.Result()
+            self._newest = None
+            return
+        # A goal that comes while another runs must not disturb its result.
+        kept = self._result, self._succeeded
+        self._result = Tune.Result(reason=started.reason)
+        self._succeeded = started.accepted
+        self._conclude(goal)
+        if self._goal is not None:
+            self._result, self._succeeded = kept
+
+    def _on_cancel(self, goal: Any) -> CancelResponse:
+        if self._goal is not None and goal.goal_id == self._goal.goal_id:
+            self._node.executor.create_task(self._cancel)
+        return CancelResponse.ACCEPT
+
+    def tell(self, experiment: RelayExperiment) -> None:
+        """Publish feedback, if a goal is served.
+
+        :param experiment: the running experiment.
+        """
+        if self._goal is None:
+            return
+        feedback = Tune.Feedback(
+            state=_STATES[experiment.state],
+            cycle=experiment.cycle_count,
+            progress=experiment.progress,
+            elapsed=experiment.elapsed,
+            remaining=experiment.remaining,
+            period=math.nan,
+            amplitude=math.nan,
+            ultimate_gain=math.nan,
+            ultimate_gain_std=math.nan,
+        )
+        if experiment.cycle_count:
+            last = experiment.cycles[-1]
+            feedback.period = last.period
+            feedback.amplitude = 0.5 * (last.peak_max - last.peak_min)
+        if self._newest is not None:
+            feedback.transfer_function = self._newest
+            feedback.ultimate_gain = self._newest.ultimate_gain
+            feedback.ultimate_gain_std = self._newest.ultimate_gain_std
+        self._goal.publish_feedback(feedback)
+
+    def note(self, name: str, message: Any) -> None:
+        """Take a model or gains for the result.
+
+        :param name: unresolved name of its topic.
+        :param message: the message.
+        """
+        if self._goal is None or message.experiment_id != self._id:
+            return
+        if name == "transfer_function":
+            self._newest = message
+            if message.final:
+                self._result.transfer_function = message
+        elif message.final:
+            self._result.gains = message
+
+    def end(self, experiment_id: str, summary: Any, bag: str, missing: str) -> None:
+        """Answer the goal of an experiment; do nothing if it has none.
+
+        :param experiment_id: the id of the experiment.
+        :param summary: its message, without arrays.
+        :param bag: folder of the recording; empty: none.
+        :param missing: what has not come, a sentence; empty: nothing lacks.
+        """
+        goal = self._goal
+        if goal is None or experiment_id != self._id:
+            return
+        result = self._result
+        result.experiment = summary
+        result.bag = bag
+        result.outcome = summary.outcome
+        result.reason = "; ".join(filter(None, (summary.reason, missing)))
+        self._succeeded = summary.outcome == Tune.Result.COMPLETED
+        self._goal = None
+        self._conclude(goal)
+
+    def _conclude(self, goal: Any) -> None:
+        result, succeeded = self._result, self._succeeded
+
+        def finish(handle: Any) -> Any:
+            if handle.is_cancel_requested:
+                handle.canceled()
+            elif succeeded:
+                handle.succeed()
+            else:
+                handle.abort()
+            return result
+
+        goal.execute(finish)
+
+    def _set_state(self, goal: Any) -> Any:
+        # Each goal brings its own callback; this one is asked for by the constructor alone.
+        goal.abort()
+        return Tune.Result()
