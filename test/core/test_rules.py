@@ -17,7 +17,7 @@ from relay_autotune.record import RelaySettings
 from relay_autotune.simulation import exact_limit_cycle
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, analyse_loop, design
 from relay_autotune.tuning.rules import PUBLISHED
-from relay_autotune.tuning.rules.amigo import amigo, step_response
+from relay_autotune.tuning.rules.amigo import amigo
 from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae
 from relay_autotune.tuning.rules.limit_cycle import (
     describing_point_of,
@@ -25,6 +25,7 @@ from relay_autotune.tuning.rules.limit_cycle import (
     half_cycle,
 )
 from relay_autotune.tuning.rules.simc import half_rule, simc
+from relay_autotune.tuning.rules.step_response import step_response, two_point_fopdt
 from relay_autotune.tuning.rules.thyagarajan2003 import lcmax, phase_margin, thyagarajan
 from relay_autotune.tuning.rules.ultimate_point import (
     tyreus_luyben,
@@ -219,9 +220,15 @@ def test_the_shape_of_other_structures_leads_to_the_equivalent_model():
     assert "category 3" in reason
     assert "equivalent lag_n" in reason
     assert found.kc < 0.0
-    simple = _T.fopdt(1.0, 1.8, 10.9)
-    chosen = thyagarajan(task(PROCESSES["ex1 e-10s/(s+1)^3"], simple=simple))[0]
-    assert chosen == imc(task(simple))[0]
+    # Category 1b: eq 20 for tau, and the exact relations in the place of eqs 21 and 22.
+    example = PROCESSES["ex1 e-10s/(s+1)^3"]
+    (_, inputs, exact, _), *_ = cases("thy.T2.ex1.FOPDT")
+    tau = exact["1b"][1]
+    gain = inputs["a"] / math.tanh(inputs["P"] / (4.0 * tau))
+    dead_time = tau * math.log(gain / (gain - inputs["a"]))
+    wanted = imc(task(_T.fopdt(gain, tau, dead_time)))[0]
+    found = thyagarajan(task(example))[0]
+    assert (found.kc, found.ti) == pytest.approx((wanted.kc, wanted.ti), rel=1e-6)
 
 
 def test_lambda_is_free():
@@ -303,6 +310,19 @@ def test_the_step_response_that_amigo_reads():
     assert 1.0 - (1.0 + at / 3.0) * math.exp(-at / 3.0) == pytest.approx(1.0 - math.exp(-1.0))
     late = step_response(_T.integrator_inverse(0.547, 0.418, 1.06, 0.1))
     assert late.delay == pytest.approx(0.1 + 0.418 + 1.06)
+
+
+def test_the_fopdt_of_two_points_of_the_step_response():
+    model = _T.lag_n(-2.0, 3.0, 3, 1.0)
+    found = two_point_fopdt(model)
+    tau, delay = found.time_constants[0].real, found.dead_time
+    for at in (delay + tau / 3.0, delay + tau):
+        x = (at - 1.0) / 3.0
+        risen = 1.0 - (1.0 + x + 0.5 * x * x) * math.exp(-x)
+        assert risen == pytest.approx(1.0 - math.exp((delay - at) / tau), rel=1e-9)
+    assert found.gain == -2.0
+    with pytest.raises(TuningError, match="stable process"):
+        two_point_fopdt(_T.ipdt(1.0, 1.0))
 
 
 @pytest.mark.parametrize("ratio", [0.05, 0.22, 0.3, 0.5])

@@ -18,43 +18,16 @@ and of an integrating process ``K exp(-L s)/s``
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-
-import numpy as np
-from scipy.optimize import brentq
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
-from relay_autotune.response import response
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.rules.applicability import (
     controller,
-    is_first_order,
-    named,
     process_of,
     wants_pid,
 )
+from relay_autotune.tuning.rules.step_response import step_response
 from relay_autotune.tuning.task import DesignTask
-
-_POINTS = 4000
-_REACHED = 0.63212055882855767
-_SETTLED = 1e-3
-_MONOTONE = 0.02
-
-
-@dataclass(frozen=True)
-class StepResponse:
-    """What a step response tells AMIGO.
-
-    :param gain: K; of an integrating process the rate per unit step [y/u, y/(u s)].
-    :param lag: T, to 63 % of the way after the delay [s]; inf: it integrates.
-    :param delay: L, where the steepest tangent meets the initial value [s].
-    """
-
-    gain: float
-    lag: float
-    delay: float
 
 
 def amigo(task: DesignTask) -> tuple[Controller, str]:
@@ -94,47 +67,3 @@ def amigo(task: DesignTask) -> tuple[Controller, str]:
         ti = 0.35 * delay + 13.0 * delay * t * t / (t * t + 12.0 * delay * t + 7.0 * delay**2)
         gains = controller(task, kc, ti)
     return gains, f"AMIGO with T = {t:.4g} s and {said}"
-
-
-def step_response(model: TransferFunction) -> StepResponse:
-    """Return K, T and L of a process, from its own exact step response.
-
-    :param model: a process with one integrator at most.
-    :raises TuningError: if it is unstable, integrates twice, or does not rise steadily.
-    """
-    unstable = any(t.real < 0.0 for t in model.time_constants)
-    if unstable or model.integrators not in (0, 1):
-        raise TuningError(
-            "the rule amigo is for a stable process or one that integrates once, found "
-            f"{named(model)}: use robust"
-        )
-    if model.integrators:
-        # The tangent in the long run begins to rise after all delays and lags.
-        shift = sum(t.real for t in model.time_constants) - sum(z.real for z in model.zeros)
-        return StepResponse(model.gain, math.inf, model.dead_time + shift)
-    if is_first_order(model):
-        return StepResponse(model.gain, model.time_constants[0].real, model.dead_time)
-    return _measured(model)
-
-
-def _measured(model: TransferFunction) -> StepResponse:
-    step = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
-    end = model.dead_time + 12.0 * sum(abs(t) for t in model.time_constants)
-    time = np.linspace(0.0, end, _POINTS)
-    y = response(model, time, step) / model.gain
-    if abs(y[-1] - 1.0) > _SETTLED or y.min() < -_MONOTONE or y.max() > 1.0 + _MONOTONE:
-        raise TuningError(
-            "the rule amigo is for step responses that rise steadily; that of this "
-            f"{model.structure} goes from {100.0 * y.min():.3g} to {100.0 * y.max():.3g} % of "
-            "its final value, and 2 % beyond either end is the limit: use robust"
-        )
-
-    def missing(t: float) -> float:
-        return float(response(model, np.array([t]), step)[0]) / model.gain - _REACHED
-
-    first = int(np.flatnonzero(y >= _REACHED)[0])
-    reached = float(brentq(missing, time[first - 1], time[first], rtol=1e-12))
-    slopes = np.gradient(y, time)
-    top = int(np.argmax(slopes))
-    delay = float(time[top] - y[top] / slopes[top])
-    return StepResponse(model.gain, reached - delay, max(delay, 0.0))

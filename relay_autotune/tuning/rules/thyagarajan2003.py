@@ -145,7 +145,7 @@ def thyagarajan(task: DesignTask) -> _Designed:
     try:
         shape = shape_of_half_cycle(cycle)
         category = shape.category
-        equivalent, rule = _equivalent(category, shape, model, task)
+        equivalent, rule = _equivalent(category, shape, model)
     except TuningError:
         raise
     except RelayAutotuneError as error:
@@ -172,13 +172,11 @@ def _table_4(task: DesignTask) -> _Designed:
 
 
 def _equivalent(
-    category: str, shape: Shape, model: TransferFunction, task: DesignTask
+    category: str, shape: Shape, model: TransferFunction
 ) -> tuple[TransferFunction | None, Callable[[DesignTask], _Designed]]:
     """Return a model of the category, None where the task has one, and the category's rule."""
     period, amplitude = shape.period, shape.amplitude
     if category in ("1a", "1b"):
-        if task.simple is not None and is_first_order(task.simple):
-            return None, _table_4
         if category == "1a":
             values = fopdt(period, amplitude, shape.time_to_peak, 1.0)
         else:
