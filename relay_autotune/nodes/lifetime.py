@@ -110,7 +110,7 @@ def _serve(node: ServedNode, stopped: list[int]) -> int:
     executor.add_node(node)
     if node.favoured is not None:
         executor.favour(node.favoured)
-    _wake_on_signal(executor)
+    stop_waking = _wake_on_signal(executor)
     # What was imported stays: the collector need not look at it again and again.
     gc.collect()
     gc.freeze()
@@ -132,11 +132,16 @@ def _serve(node: ServedNode, stopped: list[int]) -> int:
         node.get_logger().fatal(f"could not end in order: {_where(error)}")
     if status:
         node.get_logger().fatal(reason)
+    # `ros2 launch` sends a second SIGINT beside the terminal's, which may come as late as while
+    # the interpreter ends: there a handler of Python's is undone, and the signal would kill.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    stop_waking()
     executor.shutdown(timeout_sec=0.0)
     return status
 
 
-def _wake_on_signal(executor: Executor) -> None:
+def _wake_on_signal(executor: Executor) -> Callable[[], None]:
     # A Python signal handler does not interrupt the executor's wait in C. The interpreter writes
     # the number of a signal into this pipe at once; a thread reads it and gives the executor
     # something to do.
@@ -148,7 +153,15 @@ def _wake_on_signal(executor: Executor) -> None:
         while os.read(reader, 64):
             executor.create_task(lambda: None)
 
-    threading.Thread(target=read, name="signals", daemon=True).start()
+    thread = threading.Thread(target=read, name="signals", daemon=True)
+    thread.start()
+
+    def stop() -> None:
+        signal.set_wakeup_fd(-1)
+        os.close(writer)  # the thread wakes the executor for what has come, and ends
+        thread.join()
+
+    return stop
 
 
 def _where(error: BaseException) -> str:

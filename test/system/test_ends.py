@@ -77,6 +77,17 @@ def test_a_second_signal_changes_nothing(rig: Rig) -> None:
     assert tune.ended().outcome == RelayExperiment.ABORTED
 
 
+def test_signals_to_the_very_end_change_nothing(rig: Rig) -> None:
+    """`ros2 launch` sends a SIGINT of its own beside the terminal's."""
+    node = rig.identifier()
+    rig.until(lambda: "ready" in node.log, "start of the node")
+    while node.running:
+        node.signal(signal.SIGINT)
+        rig.run_for(0.002)
+    assert node.wait() == 0
+    assert "Traceback" not in node.log
+
+
 def test_a_killed_node_leaves_all_but_the_last_half_second(rig: Rig) -> None:
     tune = RunningTune(rig)
     rig.run_for(1.5)
