@@ -21,7 +21,8 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.models import TransferFunction
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.notation import digits, process_text
-from relay_autotune.report import draw
+from relay_autotune.report import write_page, write_picture
+from relay_autotune.report.case import case_of
 from relay_autotune.ultimate import ultimate_point
 
 TRUTH = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -46,7 +47,7 @@ class _Started:
 
 
 def main() -> int:
-    """Run the demo; leave bag, result and picture in ``demo_output/``."""
+    """Run the demo; leave bag, result, picture and report in ``demo_output/``."""
     output = Path("demo_output")
     try:
         if output.exists():
@@ -202,12 +203,11 @@ def _finish(output: Path, live: Any) -> int:
     result = document(str(output / "bag"), [found])
     result["truth"] = model_fields(TRUTH)
     (output / "result.json").write_text(to_json(result) + "\n")
-    draw(
-        found,
-        output / "figure.png",
-        title=f"Relay test: {process_text(found.model.model)}  (true: {process_text(TRUTH)})",
-    )
-    print(f"Left in {output}/: bag/, result.json, figure.png")
+    case = case_of(found, str(output / "bag"), truth=TRUTH)
+    title = f"Relay test: {process_text(found.model.model)}  (true: {process_text(TRUTH)})"
+    write_picture(case, output / "figure.png", title=title)
+    write_page([case], output / "report.html", title="Relay test of a simulated process")
+    print(f"Left in {output}/: bag/, result.json, figure.png, report.html")
     print(f"  try: . ./env.sh && replay {output}/bag")
     return 0 if same else 1
 

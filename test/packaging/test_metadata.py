@@ -66,8 +66,10 @@ def test_manifest_is_valid(manifest: Path):
 def test_manifest_names_what_is_imported():
     """Every distribution that the package imports is a dependency that rosdep can install."""
     keys = {
+        "jinja2": "python3-jinja2",
         "lz4": "mcap-ros2-support",
         "zstandard": "mcap-ros2-support",
+        "markupsafe": "python3-jinja2",
         "matplotlib": "python3-matplotlib",
         "mcap": "mcap-ros2-support",
         "numpy": "python3-numpy",

@@ -23,7 +23,12 @@ def test_the_demo_tunes_and_leaves_bag_result_and_picture(tmp_path: Path) -> Non
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the same gains to the last digit" in done.stdout
     output = tmp_path / "demo_output"
-    assert {p.name for p in output.iterdir()} == {"bag", "result.json", "figure.png"}
+    assert {p.name for p in output.iterdir()} == {
+        "bag",
+        "result.json",
+        "figure.png",
+        "report.html",
+    }
     result = json.loads((output / "result.json").read_text())
     truth, experiment = result["truth"], result["experiments"][0]
     model = experiment["models"][experiment["selected"]]
@@ -37,6 +42,7 @@ def test_the_demo_tunes_and_leaves_bag_result_and_picture(tmp_path: Path) -> Non
     assert 1.0 < gains["ms"] <= gains["ms_95"] < 2.0
     assert len(read_experiments(output / "bag").experiments) == 1
     assert (output / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert (output / "report.html").read_text().startswith("<!DOCTYPE html>")
 
 
 def test_a_demo_without_executables_says_so(tmp_path: Path) -> None:

@@ -1,0 +1,168 @@
+"""Write a report of recordings or results: `report BAG|RECORD.csv|RESULT.json ... -o FILE`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, known_facts, say
+from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
+from relay_autotune.report import PICTURES, write_figures, write_page, write_picture
+
+if TYPE_CHECKING:
+    from relay_autotune.report.case import Case
+
+PROGRAM = "report"
+
+_EPILOG = """\
+Each source is a recording as `replay` reads it (a rosbag2 directory, an .mcap file or a .csv
+file), or a .json file as `replay --json` prints it.  The page is one file that opens without a
+network; from a .json file the figures that need samples are left out.
+
+Exit status: 0 done; 1 a source could not be read, or nothing was identified in it (the report is
+written all the same); 2 the command line, or the choice of topics, does not fit.
+
+Examples:
+  report ~/.ros/relay_autotune/20261120T234315Z_2c010118 -o tune.html
+  report demo_output/result.json -o demo.html
+  report robot_bag --measurement /tank/level --command /tank/valve -o tank.html --figures figures
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    :param arguments: those of the command line; default: the process's own.
+    :return: the exit status.
+    """
+    options = _parser().parse_args(arguments)
+    return guarded(PROGRAM, lambda: _run(options))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Write a report: the gains, the model, figures, and how sure they are.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("sources", nargs="+", metavar="SOURCE", help="recordings or results")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", default="report.html",
+        help="the report: .html, or one picture: .png, .svg or .pdf (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--figures", metavar="DIR", help="write each figure to a file there, too")
+    parser.add_argument(
+        "--format", choices=("png", "svg"), default="png", help="of these figures (%(default)s)"
+    )
+    parser.add_argument("--title", metavar="TEXT", default="", help="title of the report")
+    parser.add_argument(
+        "--measurement", metavar="TOPIC", help="topic, or column of a CSV, of the measurement"
+    )
+    parser.add_argument(
+        "--command", metavar="TOPIC", help="topic, or column of a CSV, of the command"
+    )
+    parser.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
+    parser.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
+    parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
+    parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
+    parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
+    parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
+    parser.add_argument("--rule", help="how to tune")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    check_output(options.output)
+    cases: list[Case] = []
+    status = DONE
+    for source in options.sources:
+        try:
+            cases += _cases(source, options)
+        except SelectionError:
+            raise
+        except RelayAutotuneError as error:
+            say(PROGRAM, str(error) if source in str(error) else f"{source}: {error}")
+            status = NOTHING_FOUND
+    if not cases:
+        return NOTHING_FOUND
+    for case in cases:
+        if case.model is None:
+            say(PROGRAM, f"{case.source}: nothing identified: {case.reason}")
+            status = NOTHING_FOUND
+    write_report(cases, options.output, title=options.title)
+    print(options.output)
+    if options.figures:
+        try:
+            for path in write_figures(cases, options.figures, options.format):
+                print(path)
+        except OSError as error:
+            raise BagError(f"the figures cannot be written: {error}") from error
+    return status
+
+
+def check_output(output: str) -> None:
+    """Refuse a report that could not be written, before any work is done.
+
+    :param output: name of its file.
+    :raises SelectionError: if the ending is none of those known, or the folder is not there.
+    """
+    path = Path(output)
+    if path.suffix.lower() not in (".html", *PICTURES):
+        raise SelectionError(
+            f"{output!r} does not say what the report is to be; expected an ending "
+            f".html, {', '.join(PICTURES)}"
+        )
+    if not path.parent.is_dir():
+        raise SelectionError(f"there is no folder {path.parent} for the report; make it first")
+
+
+def write_report(cases: Sequence[Case], output: str, *, title: str = "") -> None:
+    """Write a report as its file's ending says.
+
+    :param cases: at least one.
+    :param output: .html for the page, .png, .svg or .pdf for a picture of the first case.
+    :param title: default: the first case's source.
+    :raises BagError: if the file cannot be written.
+    """
+    try:
+        if Path(output).suffix.lower() == ".html":
+            write_page(cases, output, title=title)
+        else:
+            write_picture(cases[0], output, title=title)
+    except OSError as error:
+        raise BagError(f"the report cannot be written: {error}") from error
+
+
+def _cases(source: str, options: argparse.Namespace) -> list[Case]:
+    """Read one source and make of it what a report tells."""
+    from relay_autotune.report.from_document import read_documents
+
+    if source.lower().endswith(".json"):
+        return list(read_documents(source))
+    from relay_autotune.autotune import analyse, check_names
+    from relay_autotune.report.case import case_of
+    from relay_autotune.tuning import DEFAULT_RULE
+
+    rule = options.rule or DEFAULT_RULE
+    try:
+        check_names(options.method, rule)
+        known = known_facts(options)
+    except RelayAutotuneError as error:
+        raise SelectionError(str(error)) from error
+    selection = Selection(options.measurement, options.command, options.time, None, None)
+    recording = read_experiments(source, selection)
+    for note in recording.notes:
+        say(PROGRAM, f"{source}: {note}")
+    return [
+        case_of(analyse(record, method=options.method, rule=rule, known=known), source)
+        for record in recording.experiments
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""The report of an experiment: figures, and a page that says what they mean.
+
+Loading this module is cheap; matplotlib and the template engine are loaded when something is
+drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from relay_autotune.autotune import Analysis
+    from relay_autotune.models import TransferFunction
+    from relay_autotune.report.case import Case
+
+PICTURES = (".png", ".svg", ".pdf")
+
+__all__ = ["PICTURES", "draw", "write_figures", "write_page", "write_picture"]
+
+
+def draw(
+    analysis: Analysis, path: Path | str, *, title: str, truth: TransferFunction | None = None
+) -> None:
+    """Draw an experiment, the fit over it and the loop that its gains will make, in one picture.
+
+    :param analysis: of the record.
+    :param path: the picture; its ending says the format (.png, .svg, .pdf).
+    :param title: what it is about.
+    :param truth: the process, where it was a simulated one.
+    """
+    from relay_autotune.report.case import case_of
+
+    write_picture(case_of(analysis, title, truth=truth), path)
+
+
+def write_picture(case: Case, path: Path | str, *, title: str = "") -> None:
+    """Draw the most important figures of a case into one picture.
+
+    :param case: from :func:`~relay_autotune.report.case.case_of` or a document.
+    :param path: the picture; its ending says the format (.png, .svg, .pdf).
+    :param title: of the picture; default: the case's source.
+    """
+    from relay_autotune.report.picture import draw_picture
+
+    draw_picture(case, Path(path), title=title or case.source)
+
+
+def write_page(cases: Sequence[Case], path: Path | str, *, title: str = "") -> None:
+    """Write the report as one HTML file.
+
+    :param cases: from :func:`~relay_autotune.report.case.case_of` or a document, at least one.
+    :param path: the file.
+    :param title: of the page; default: the first case's source.
+    """
+    from relay_autotune.report.page import page
+
+    Path(path).write_text(page(cases, title=title), encoding="utf-8")
+
+
+def write_figures(cases: Sequence[Case], folder: Path | str, kind: str = "png") -> list[Path]:
+    """Write each figure of each case to a file of its own.
+
+    :param cases: at least one.
+    :param folder: made if it is not there.
+    :param kind: "png" or "svg".
+    :return: the files, named for their figures; of several cases, numbered.
+    """
+    from relay_autotune.report.figures import PLATES
+    from relay_autotune.report.style import save
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for number, case in enumerate(cases, start=1):
+        prefix = f"{number}_" if len(cases) > 1 else ""
+        for plate in PLATES:
+            if not plate.missing(case):
+                written.append(folder / f"{prefix}{plate.key}.{kind}")
+                save(plate.figure(case), str(written[-1]))
+    return written

@@ -1,0 +1,274 @@
+"""What a report tells of one experiment, whether it comes from samples or from a document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.autotune import Analysis
+from relay_autotune.cycles import LimitCycle, cycles_of, infer_settings, limit_cycle
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification import FitReport, Identification
+from relay_autotune.identification.fourier import FrequencyPoint, frequency_point
+from relay_autotune.identification.result import Rival
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.tuning import Gains, ensemble
+
+FloatArray = NDArray[np.float64]
+
+UNITS = {
+    "gain": "y/u",
+    "natural_frequency": "rad/s",
+    "damping": "",
+    "ultimate_gain": "u/y",
+    "ultimate_frequency": "rad/s",
+}
+_HARMONICS = 9
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A quantity with its 95 % interval.
+
+    :param name: of the quantity, as in the code.
+    :param value: in ``unit``.
+    :param low: lower end of the interval; NaN: not estimated.
+    :param high: upper end.
+    :param unit: "" for a pure number.
+    :param determined: False if the data do not tell it.
+    :param truth: where the process was a simulated one; NaN: not known.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    determined: bool = True
+    truth: float = math.nan
+
+    @property
+    def title(self) -> str:
+        """The name as a person writes it."""
+        return self.name.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class ModelCase:
+    """A model as the report shows it.
+
+    :param method: by which it was identified.
+    :param model: the transfer function.
+    :param estimates: its parameters.
+    :param ultimate: K_u and w_u, empty where the model has none.
+    :param fit: quality of the fit.
+    :param warnings: sentences that the user must read.
+    :param rivals: other structures that the data do not rule out.
+    :param fitted: the model's measurement at the samples [y]; empty: not known.
+    """
+
+    method: str
+    model: TransferFunction
+    estimates: tuple[Estimate, ...]
+    ultimate: tuple[Estimate, ...]
+    fit: FitReport
+    warnings: tuple[str, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+    fitted: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Titles of the parameters that the data do not tell."""
+        return tuple(e.title for e in self.estimates if not e.determined)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One experiment and all that was made of it.
+
+    :param source: the recording or document that it comes from.
+    :param experiment_id: the id of its messages; may be empty.
+    :param start: time of the first sample [s since the epoch]; 0: unknown.
+    :param duration: s.
+    :param outcome: how it ended.
+    :param reason: why it ended so, or why there is no model or no gains.
+    :param models: what each method found.
+    :param selected: index of the one that counts; None: nothing was identified.
+    :param gains: what each rule gives.
+    :param recommended: index of the gains that count; None: there are none.
+    :param limit_cycle: averages over its cycles; None: no whole cycle.
+    :param category: of the shape (Thyagarajan and Yu 2003); empty: not told.
+    :param record: the samples; None: not known.
+    :param settings: of the relay; None: no relay, or not known.
+    :param cycles: the whole cycles; empty where there are no samples.
+    :param models_around: models within the uncertainty of the one that counts.
+    :param points: of the frequency response, by Fourier integrals over the cycles.
+    """
+
+    source: str
+    experiment_id: str
+    start: float
+    duration: float
+    outcome: Outcome
+    reason: str
+    models: tuple[ModelCase, ...] = ()
+    selected: int | None = None
+    gains: tuple[Gains, ...] = ()
+    recommended: int | None = None
+    limit_cycle: LimitCycle | None = None
+    category: str = ""
+    record: Record | None = None
+    settings: RelaySettings | None = None
+    cycles: tuple[Cycle, ...] = ()
+    models_around: tuple[TransferFunction, ...] = ()
+    points: tuple[FrequencyPoint, ...] = ()
+
+    @property
+    def model(self) -> ModelCase | None:
+        """The model that counts."""
+        return None if self.selected is None else self.models[self.selected]
+
+    @property
+    def best_gains(self) -> Gains | None:
+        """The gains that count."""
+        return None if self.recommended is None else self.gains[self.recommended]
+
+
+def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None = None) -> Case:
+    """Return what a report tells of an analysed record.
+
+    :param analysis: of the record.
+    :param source: name of the recording.
+    :param truth: the process, where it was a simulated one.
+    """
+    record, model = analysis.record, analysis.model
+    around: tuple[TransferFunction, ...] = ()
+    if model is not None:
+        # The seed is that of the analysis, so that the band holds the models that it judged.
+        around = ensemble(model, rng=np.random.default_rng(0))
+    return Case(
+        source=source,
+        experiment_id=record.experiment_id,
+        start=record.start,
+        duration=record.duration,
+        outcome=record.outcome,
+        reason=analysis.reason or record.reason,
+        models=tuple(_model_case(m, truth) for m in analysis.models),
+        selected=analysis.selected,
+        gains=analysis.gains,
+        recommended=analysis.recommended,
+        limit_cycle=limit_cycle(analysis.cycles) if analysis.cycles else None,
+        record=record,
+        settings=record.settings or infer_settings(record),
+        cycles=analysis.cycles or _cycles(record),
+        models_around=around,
+        points=_points(record, analysis.cycles),
+    )
+
+
+def _cycles(record: Record) -> tuple[Cycle, ...]:
+    try:
+        return cycles_of(record)
+    except RelayAutotuneError:
+        return ()
+
+
+def _points(record: Record, cycles: Sequence[Cycle]) -> tuple[FrequencyPoint, ...]:
+    """Return the points at the harmonics of the limit cycle that the command excites."""
+    if not cycles:
+        return ()
+    first = limit_cycle(cycles).cycles[0]
+    found = []
+    for harmonic in range(1, _HARMONICS + 1):
+        try:
+            found.append(frequency_point(record, harmonic, first))
+        except RelayAutotuneError:
+            # An unbiased relay holds no even harmonics, and a short record no cycle.
+            continue
+    return tuple(found)
+
+
+def _model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
+    low, high = found.ci95_low, found.ci95_high
+    estimates = tuple(
+        Estimate(
+            name, float(value), float(low[i]), float(high[i]), unit_of(name, found.model),
+            name not in found.undetermined, true_value(name, found.model, truth),
+        )
+        for i, (name, value) in enumerate(zip(found.parameters, found.values, strict=True))
+    )  # fmt: skip
+    return ModelCase(
+        method=found.method,
+        model=found.model,
+        estimates=estimates,
+        ultimate=ultimate_estimates(
+            found.ultimate_gain,
+            found.ultimate_gain_std,
+            found.ultimate_frequency,
+            found.ultimate_frequency_std,
+            truth,
+        ),
+        fit=found.fit,
+        warnings=found.warnings,
+        rivals=found.rivals,
+        fitted=found.fitted,
+    )
+
+
+def unit_of(parameter: str, model: TransferFunction) -> str:
+    """Return the unit of a model's parameter.
+
+    :param parameter: its name.
+    :param model: the transfer function, whose integrators the gain's unit depends on.
+    """
+    if parameter == "gain" and model.integrators > 0:
+        return "y/(u s)" if model.integrators == 1 else f"y/(u s^{model.integrators})"
+    return UNITS.get(parameter, "s")
+
+
+def true_value(parameter: str, model: TransferFunction, truth: TransferFunction | None) -> float:
+    """Return what a parameter is in truth, NaN where that is not known or not comparable.
+
+    :param parameter: its name.
+    :param model: the identified transfer function.
+    :param truth: the process, of the same kind as the model.
+    """
+    if truth is None or len(truth.time_constants) != len(model.time_constants):
+        return math.nan
+    if parameter == "time_constant" and len(truth.time_constants) == 1:
+        return truth.time_constants[0].real
+    return {"gain": truth.gain, "dead_time": truth.dead_time}.get(parameter, math.nan)
+
+
+def ultimate_estimates(
+    gain: float,
+    gain_std: float,
+    frequency: float,
+    frequency_std: float,
+    truth: TransferFunction | None = None,
+) -> tuple[Estimate, ...]:
+    """Return K_u and w_u with their intervals; nothing where the model has none.
+
+    :param gain: K_u [u/y].
+    :param gain_std: its standard deviation.
+    :param frequency: w_u [rad/s].
+    :param frequency_std: its standard deviation.
+    :param truth: the process, where it was a simulated one.
+    """
+    from relay_autotune.ultimate import ultimate_point
+
+    if not math.isfinite(gain):
+        return ()
+    true = ultimate_point(truth) if truth is not None else None
+    rows = (
+        ("ultimate_gain", gain, gain_std, math.nan if true is None else true.gain),
+        ("ultimate_frequency", frequency, frequency_std, true.frequency if true else math.nan),
+    )
+    return tuple(
+        Estimate(n, v, v - 1.96 * std, v + 1.96 * std, UNITS[n], truth=t) for n, v, std, t in rows
+    )

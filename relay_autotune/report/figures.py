@@ -1,0 +1,191 @@
+"""The figures of a report: what each shows, when it can be drawn, how it is to be read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from relay_autotune.report.case import Case
+from relay_autotune.report.experiment import draw_experiment, draw_fit, draw_phase_plane
+from relay_autotune.report.frequency import draw_bode, draw_nyquist
+from relay_autotune.report.loops import draw_closed_loop, draw_uncertainty, uncertainty_height
+from relay_autotune.report.style import NARROW, SQUARE, WIDE, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure, SubFigure
+
+_NO_SAMPLES = "it needs the samples, which a result without its recording does not hold."
+_FEWEST = 20
+_NO_MODEL = "nothing was identified."
+_NO_GAINS = "there are no gains."
+
+
+class Draw(Protocol):
+    """Draws a case into an empty figure."""
+
+    def __call__(self, case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
+        """Draw."""
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A figure of the report.
+
+    :param key: its name in files and in the page's links.
+    :param title: what it shows.
+    :param draw: draws it into an empty figure.
+    :param missing: why a case has no such figure, a sentence; empty: it has.
+    :param reading: how it is to be read, what is good and what is bad.
+    :param wide: True if it fills the page, False if two stand side by side.
+    :param without_relay: how it is to be read where no relay acted; empty: the same way.
+    :param height: of a case's figure on a broad page and on a narrow one [in].
+    """
+
+    key: str
+    title: str
+    draw: Draw
+    missing: Callable[[Case], str]
+    reading: str
+    height: Callable[[Case], tuple[float, float]]
+    wide: bool = True
+    without_relay: str = ""
+
+    def reading_of(self, case: Case) -> str:
+        """Return how a case's figure is to be read.
+
+        :param case: the experiment.
+        """
+        return self.reading if case.settings is not None else self.without_relay or self.reading
+
+    def figure(self, case: Case, *, narrow: bool = False) -> Figure:
+        """Return the figure of a case.
+
+        :param case: one for which nothing is missing.
+        :param narrow: True if it is for a narrow screen.
+        """
+        broad, slim = self.height(case)
+        width = NARROW if narrow else WIDE if self.wide else SQUARE
+        figure = new_figure(width, slim if narrow else broad)
+        self.draw(case, figure, narrow=narrow)
+        return figure
+
+
+def _without_samples(case: Case) -> str:
+    return "" if case.record is not None else _NO_SAMPLES
+
+
+def _without_fit(case: Case) -> str:
+    if case.record is None:
+        return _NO_SAMPLES
+    if case.model is None:
+        return _NO_MODEL
+    if case.model.fitted.size != len(case.record):
+        return f"the method {case.model.method} does not fit the samples themselves."
+    return ""
+
+
+def _without_cycles(case: Case) -> str:
+    if case.record is None:
+        return _NO_SAMPLES
+    if not case.cycles or case.limit_cycle is None:
+        return "the record has no whole cycle."
+    return "" if len(case.record) >= _FEWEST else "the record has too few samples."
+
+
+def _without_gains(case: Case) -> str:
+    if case.model is None:
+        return _NO_MODEL
+    return "" if case.best_gains is not None else _NO_GAINS
+
+
+def _without_model(case: Case) -> str:
+    return "" if case.model is not None else _NO_MODEL
+
+
+def _without_intervals(case: Case) -> str:
+    if case.model is None:
+        return _NO_MODEL
+    known = any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate))
+    return "" if known else f"the method {case.model.method} tells no uncertainty."
+
+
+PLATES = (
+    Plate(
+        "experiment",
+        "The experiment",
+        draw_experiment,
+        _without_samples,
+        "The relay swings the command between two levels; the measurement answers with a limit "
+        "cycle. Good: the numbered cycles look alike, and the swing is several times the "
+        "hysteresis band. Bad: peaks that wander, a swing lost in noise, cycles marked as "
+        "disturbed.",
+        lambda _: (4.9, 5.6),
+        without_relay="Measurement and command as they were recorded. Good: the process was at "
+        "rest before the first step, and each step moves it far beyond its noise.",
+    ),
+    Plate(
+        "fit",
+        "Model over the data",
+        draw_fit,
+        _without_fit,
+        "Above, the model follows the measurement. Below, what it leaves. Good: the residual is "
+        "as wide as the band and has no pattern. Bad: it repeats with the cycle (the structure "
+        "is too simple), or it drifts (a disturbance acted during the test).",
+        lambda _: (4.9, 5.6),
+    ),
+    Plate(
+        "phase_plane",
+        "Limit cycle in the phase plane",
+        draw_phase_plane,
+        _without_cycles,
+        "The rate of the measurement over the measurement itself. Good: the last cycles lie on "
+        "one closed curve, and the model's lies on them. Bad: curves that do not close or do "
+        "not coincide; corners that the model cuts.",
+        lambda _: (5.0, 4.3),
+        wide=False,
+    ),
+    Plate(
+        "nyquist",
+        "Nyquist",
+        draw_nyquist,
+        _without_gains,
+        "The loop of recommended controller and process. Its distance from the point -1 is the "
+        "robustness: the dashed circle touches it, and its radius is 1/Ms. Good: the band stays "
+        "away from the circle's centre. Bad: it comes within half a unit of -1.",
+        lambda _: (5.3, 4.6),
+        wide=False,
+    ),
+    Plate(
+        "bode",
+        "Bode",
+        draw_bode,
+        _without_model,
+        "The process alone. The diamonds come from Fourier integrals over whole cycles and need "
+        "no model. Good: they lie on the curve. Bad: they leave the band, above all near the "
+        "ultimate point.",
+        lambda _: (5.2, 6.2),
+    ),
+    Plate(
+        "closed_loop",
+        "Closed loop, predicted",
+        draw_closed_loop,
+        _without_gains,
+        "A step of the set-point, then one of the load at the process input, on the identified "
+        "model. Good: one small overshoot and a quick return. Bad: ringing, or a load error "
+        "that lingers.",
+        lambda _: (5.4, 6.4),
+    ),
+    Plate(
+        "uncertainty",
+        "How sure the model is",
+        draw_uncertainty,
+        _without_intervals,
+        "95 % intervals as distance from the estimate; within the shaded 20 % a quantity counts "
+        "as determined. K_u and w_u decide on the gains, and are often surer than the "
+        "parameters.",
+        lambda case: (uncertainty_height(case), uncertainty_height(case)),
+    ),
+)

@@ -1,0 +1,195 @@
+"""Figures of the frequency response: Nyquist with the Ms circle, Bode."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.models import TransferFunction
+from relay_autotune.report.case import Case
+from relay_autotune.report.style import (
+    BLUE,
+    INK,
+    MUTED,
+    PAPER,
+    SKY,
+    VERMILLION,
+    finish,
+    legend,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.path import Path
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# 95 % of a normal distribution in the plane lie within so many standard deviations.
+_ELLIPSE = math.sqrt(-2.0 * math.log(0.05))
+_CORNERS = 24
+
+
+def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
+    """Draw the loop of the recommended gains about the point -1.
+
+    :param case: with a model and gains.
+    :param figure: empty, to be drawn into.
+    :param narrow: True if it is for a narrow screen.
+    """
+    from matplotlib.patches import Circle, PathPatch
+
+    gains, found = case.best_gains, case.model
+    assert gains is not None
+    assert found is not None
+    axes = figure.subplots()
+    loop = gains.loop(found.model)
+    w = _loop_frequencies(loop)
+    circle = Circle((-1.0, 0.0), 1.0 / gains.ms, fill=False, ec=VERMILLION, lw=1.5, ls=(0, (5, 2)))
+    circle.set_label(f"Ms = {gains.ms:.2f}")
+    axes.add_patch(circle)
+    unit = Circle((0.0, 0.0), 1.0, fill=False, ec=MUTED, lw=0.9, ls=(0, (1, 2)))
+    unit.set_label("unit circle")
+    axes.add_patch(unit)
+    limits = (-2.3, 1.3), (-2.3, 1.3)
+    if case.models_around:
+        grid = w[:: max(1, w.size // 140)]
+        values = np.array([gains.loop(m)(1j * grid) for m in case.models_around])
+        near = np.all(np.abs(values) < 6.0, axis=0)
+        area = swept_area(values[:, near])
+        axes.add_patch(PathPatch(area, fc=SKY, ec="none", alpha=0.45, label="95 % band"))
+    values = loop(1j * w)
+    axes.plot(values.real, values.imag, color=BLUE, lw=1.8, label="loop")
+    if case.points:
+        measured = np.array([p.frequency for p in case.points])
+        controller = gains.transfer_function()(1j * measured)
+        at = controller * np.array([p.value for p in case.points])
+        axes.plot(at.real, at.imag, "D", ms=5, mfc=PAPER, mec=INK, mew=1.3, label="measured")
+    axes.plot([-1.0], [0.0], "+", ms=11, mew=2.0, color=INK)
+    axes.annotate("-1", (-1.0, 0.0), (-4, 5), textcoords="offset points", ha="right", color=INK)
+    axes.set(xlim=limits[0], ylim=limits[1], aspect="equal")
+    axes.set(xlabel="real part", ylabel="imaginary part")
+    legend(figure, columns=2 if narrow else 3)
+    finish(figure)
+
+
+def _loop_frequencies(loop: TransferFunction) -> FloatArray:
+    """Return frequencies from where the loop is large to where it has died away."""
+    from relay_autotune.tuning.analysis import frequencies
+
+    grid = frequencies(loop)
+    size = np.abs(loop(1j * grid))
+    return np.asarray(grid[(size < 20.0) & (size > 0.01)])
+
+
+def swept_area(values: ComplexArray) -> Path:
+    """Return the area that the 95 % ellipses of a curve's points sweep.
+
+    The points of the models at one frequency are taken as normally distributed in the plane, so
+    that 95 % of them lie within ``(z - m)' C^-1 (z - m) = -2 ln 0.05``; between two frequencies
+    the area is the convex hull of their ellipses.
+
+    :param values: of each model at each frequency, shape (m, f).
+    """
+    from matplotlib.path import Path
+
+    angles = np.linspace(0.0, 2.0 * math.pi, _CORNERS, endpoint=False)
+    turn = np.column_stack((np.cos(angles), np.sin(angles)))
+    rings = []
+    for column in values.T:
+        plane = np.column_stack((column.real, column.imag))
+        spread, axes = np.linalg.eigh(np.cov(plane.T))
+        scale = axes * (_ELLIPSE * np.sqrt(np.maximum(spread, 0.0)))
+        rings.append(plane.mean(axis=0) + turn @ scale.T)
+    parts = [_hull(np.vstack(pair)) for pair in pairwise(rings)]
+    return Path.make_compound_path(*[Path(np.vstack((p, p[:1])), closed=True) for p in parts])
+
+
+def _hull(points: FloatArray) -> FloatArray:
+    """Return the convex hull of points in the plane, counterclockwise (Andrew 1979)."""
+    order = points[np.lexsort((points[:, 1], points[:, 0]))]
+
+    def chain(ordered: FloatArray) -> list[FloatArray]:
+        kept: list[FloatArray] = []
+        for p in ordered:
+            while len(kept) > 1:
+                a, b = kept[-1] - kept[-2], p - kept[-1]
+                if a[0] * b[1] - a[1] * b[0] > 0.0:
+                    break
+                kept.pop()
+            kept.append(p)
+        return kept[:-1]
+
+    return np.array(chain(order) + chain(order[::-1]))
+
+
+def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
+    """Draw magnitude and phase of the process, with the points that the cycles themselves gave.
+
+    :param case: with a model.
+    :param figure: empty, to be drawn into.
+    :param narrow: True if it is for a narrow screen.
+    """
+    from matplotlib.ticker import MultipleLocator, NullFormatter
+
+    assert case.model is not None
+    above, below = figure.subplots(2, 1, sharex=True)
+    model = case.model.model
+    w = _bode_frequencies(case)
+    if case.models_around:
+        _band(above, w, np.array([np.abs(m(1j * w)) for m in case.models_around]))
+        _band(below, w, np.degrees([m.phase(w) for m in case.models_around]))
+    phase = np.degrees(model.phase(w))
+    above.loglog(w, np.abs(model(1j * w)), color=BLUE, lw=1.8, label="model")
+    below.semilogx(w, phase, color=BLUE, lw=1.8)
+    points = [p for p in case.points if w[0] <= p.frequency <= w[-1]]
+    if points:
+        at = np.array([p.frequency for p in points])
+        value = np.array([p.value for p in points]) * model.process_sign
+        lag = np.degrees(np.angle(value))
+        # The branch of the angle that is nearest to the model's phase.
+        lag += 360.0 * np.round((np.interp(at, w, phase) - lag) / 360.0)
+        style = {"ms": 6, "mfc": PAPER, "mec": INK, "mew": 1.4, "ls": ""}
+        above.plot(at, np.abs(value), "D", label="Fourier integrals over the cycles", **style)
+        below.plot(at, lag, "D", **style)
+    if case.model.ultimate:
+        gain, frequency = case.model.ultimate
+        above.plot(
+            [frequency.value], [1.0 / abs(gain.value)], "*", ms=12, color=VERMILLION,
+            label="ultimate point, 1/K_u at w_u",
+        )  # fmt: skip
+        below.plot([frequency.value], [-180.0], "*", ms=12, color=VERMILLION)
+    below.axhline(-180.0, color=MUTED, lw=0.9, ls=(0, (5, 3)))
+    above.set_ylabel("magnitude [y/u]")
+    below.set(ylabel="phase [degrees]", xlabel="frequency [rad/s]")
+    floor = -540.0
+    lowest = max(float(np.min(phase)), floor)
+    below.set_ylim(lowest - 20.0, float(np.max(phase)) + 20.0)
+    below.yaxis.set_major_locator(MultipleLocator(90.0))
+    for axis in (above.xaxis, above.yaxis, below.xaxis):
+        axis.set_minor_formatter(NullFormatter())
+    legend(figure, columns=1 if narrow else 4)
+    finish(figure)
+
+
+def _band(axes: Axes, w: FloatArray, values: FloatArray) -> None:
+    low, high = np.quantile(values, (0.025, 0.975), axis=0)
+    axes.fill_between(w, low, high, color=SKY, alpha=0.45, lw=0, label="95 % band")
+
+
+def _bode_frequencies(case: Case) -> FloatArray:
+    """Return two decades about what the experiment excited, or about the model's corner."""
+    assert case.model is not None
+    if case.model.ultimate:
+        middle = case.model.ultimate[1].value
+    elif case.limit_cycle is not None:
+        middle = 2.0 * math.pi / case.limit_cycle.period
+    else:
+        constants = [abs(c) for c in case.model.model.time_constants] or [1.0]
+        middle = 1.0 / max(constants)
+    return np.geomspace(0.02 * middle, 8.0 * middle, 400)

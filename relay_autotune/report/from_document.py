@@ -1,0 +1,208 @@
+"""Cases from the JSON documents that `replay --json` prints, which hold no samples."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from relay_autotune.cycles import LimitCycle
+from relay_autotune.errors import BagError, RelayAutotuneError
+from relay_autotune.identification import FitReport
+from relay_autotune.identification.fourier import FrequencyPoint
+from relay_autotune.identification.result import Rival, is_logarithmic
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Outcome
+from relay_autotune.report.case import (
+    Case,
+    Estimate,
+    ModelCase,
+    true_value,
+    ultimate_estimates,
+    unit_of,
+)
+from relay_autotune.tuning import Gains
+
+
+def read_documents(path: Path | str) -> tuple[Case, ...]:
+    """Return the experiments of a file of documents, one on each line or a single one.
+
+    :param path: a file that `replay --json` or the demo wrote.
+    :raises BagError: if it cannot be read or is no such document.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BagError(f"{path} cannot be read: {error}") from error
+    documents = _parsed(text, str(path))
+    return tuple(case for document in documents for case in cases_of_document(document, str(path)))
+
+
+def _parsed(text: str, name: str) -> list[Any]:
+    if not text.strip():
+        raise BagError(f"{name} is no JSON: it is empty; expected what `replay --json` prints")
+    try:
+        try:
+            return [json.loads(text)]
+        except ValueError:
+            return [json.loads(line) for line in text.splitlines() if line.strip()]
+    except (ValueError, RecursionError) as error:
+        raise BagError(
+            f"{name} is no JSON: {error}; expected what `replay --json` prints"
+        ) from error
+
+
+def cases_of_document(document: Any, name: str) -> tuple[Case, ...]:
+    """Return the experiments of one document.
+
+    :param document: as `json` reads it.
+    :param name: of its file, for messages.
+    :raises BagError: if it is no such document.
+    """
+    try:
+        if "error" in document:
+            return (_unreadable(str(document["bag"]), str(document["error"])),)
+        truth = _model(document["truth"]) if "truth" in document else None
+        return tuple(_case(e, str(document["bag"]), truth) for e in document["experiments"])
+    except (RelayAutotuneError, KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"no field {error}" if isinstance(error, KeyError) else str(error)
+        raise BagError(
+            f"{name} is no result of an experiment ({what}); expected what `replay --json` prints"
+        ) from error
+
+
+def _unreadable(source: str, error: str) -> Case:
+    return Case(source, "", 0.0, 0.0, Outcome.UNKNOWN, f"The recording was not read: {error}")
+
+
+def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Case:
+    cycle = e["limit_cycle"]
+    models = tuple(_model_case(m, truth) for m in e["models"])
+    gains = tuple(_gains(g) for g in e["gains"])
+    return Case(
+        source=source,
+        experiment_id=str(e["experiment_id"]),
+        start=_number(e["start"]),
+        duration=_number(e["duration"]),
+        outcome=Outcome[str(e["outcome"]).upper()],
+        reason=str(e["reason"]),
+        models=models,
+        selected=_index(e["selected"], models),
+        gains=gains,
+        recommended=_index(e["recommended"], gains),
+        limit_cycle=None if cycle is None else _limit_cycle(cycle),
+        points=tuple(_point(p) for m in e["models"] for p in m.get("points", ())),
+    )
+
+
+def _index(value: Any, things: Sequence[object]) -> int | None:
+    if value is not None and not 0 <= int(value) < len(things):
+        raise ValueError(f"index {value} of {len(things)}")
+    return None if value is None else int(value)
+
+
+def _limit_cycle(c: dict[str, Any]) -> LimitCycle:
+    numbers: dict[str, Any] = {
+        field.name: _number(c[field.name])
+        for field in fields(LimitCycle)
+        if field.name not in ("std", "cycles", "converged")
+    }
+    cycles = tuple(range(int(c["cycles"])))
+    return LimitCycle(**numbers, cycles=cycles, converged=bool(c["converged"]))
+
+
+def _model_case(m: dict[str, Any], truth: TransferFunction | None) -> ModelCase:
+    model = _model(m)
+    return ModelCase(
+        method=str(m["method"]),
+        model=model,
+        estimates=tuple(
+            _estimate(name, ends, m, model, truth) for name, ends in m["ci95"].items()
+        ),
+        ultimate=ultimate_estimates(
+            _number(m["ultimate_gain"]),
+            _number(m["ultimate_gain_std"]),
+            _number(m["ultimate_frequency"]),
+            _number(m["ultimate_frequency_std"]),
+            truth,
+        ),
+        fit=FitReport(
+            **{f.name: _number(m["fit"][f.name]) for f in fields(FitReport) if f.name in m["fit"]}
+        ),
+        warnings=tuple(map(str, m["warnings"])),
+        rivals=tuple(Rival(_model(r), _number(r["support"])) for r in m["rivals"]),
+    )
+
+
+def _estimate(
+    name: str,
+    ends: Sequence[Any],
+    m: dict[str, Any],
+    model: TransferFunction,
+    truth: TransferFunction | None,
+) -> Estimate:
+    low, high = (_number(end) for end in ends)
+    return Estimate(
+        name,
+        _value(name, low, high, model),
+        low,
+        high,
+        unit_of(name, model),
+        name not in m["undetermined"],
+        true_value(name, model, truth),
+    )
+
+
+def _value(name: str, low: float, high: float, model: TransferFunction) -> float:
+    """Return a parameter's value, which the document has in its transfer function alone."""
+    if name == "dead_time":
+        return model.dead_time
+    if name == "gain" and model.structure not in ("unstable_fopdt", "unstable_sopdt"):
+        return model.gain
+    if name == "time_constant" and model.time_constants:
+        return abs(model.time_constants[0].real)
+    if is_logarithmic(name):
+        return math.copysign(math.sqrt(low * high), low) if low * high > 0.0 else math.nan
+    return 0.5 * (low + high)
+
+
+def _model(m: dict[str, Any]) -> TransferFunction:
+    found = TransferFunction.from_polynomials(
+        [_number(c) for c in m["numerator"]],
+        [_number(c) for c in m["denominator"]],
+        _number(m["dead_time"]),
+        str(m.get("structure", "general")),
+    )
+    constants = tuple(_complex(c) for c in m["time_constants"])
+    zeros = tuple(_complex(c) for c in m["zeros"])
+    # Roots of the polynomials would come back rounded.
+    return TransferFunction(
+        _number(m["gain"]), zeros, constants, found.integrators, found.dead_time, found.structure
+    )
+
+
+def _gains(g: dict[str, Any]) -> Gains:
+    known = {field.name for field in fields(Gains)}
+    values: dict[str, Any] = {}
+    for name in known & g.keys():
+        value = g[name]
+        # Where no gain or delay makes the loop unstable, the document has null.
+        if value is None:
+            value = math.inf if name.endswith("_margin") else math.nan
+        values[name] = tuple(value) if isinstance(value, list) else value
+    return Gains(**values)
+
+
+def _point(p: dict[str, Any]) -> FrequencyPoint:
+    return FrequencyPoint(_number(p["frequency"]), complex(p["real"], p["imaginary"]))
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _complex(value: Any) -> complex:
+    return complex(*map(float, value)) if isinstance(value, list) else complex(float(value))

@@ -1,0 +1,146 @@
+"""The report as one HTML page that needs nothing beside itself."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import relay_autotune
+from relay_autotune.notation import digits, process_mathml, process_text
+from relay_autotune.report.case import Case
+from relay_autotune.report.figures import PLATES, Plate
+from relay_autotune.report.findings import (
+    Check,
+    Number,
+    Verdict,
+    checks_of,
+    doubts_of,
+    facts_of,
+    numbers_of,
+    verdict_of,
+    warnings_of,
+)
+from relay_autotune.report.style import COLOURS, inline
+
+_NOTHING = Markup()
+# Of the page itself, in dark mode; those of figures come from COLOURS.
+_NIGHT = (
+    "--page: #101318; --card: #171b21; --line: #2c343d; --text: #e8ebee; --soft: #9fabb7; "
+    "--accent: #6db8ea; --accent-soft: #1b2f3d; --good: #5fd6ae; --good-soft: #15322a; "
+    "--warn: #f0b45a; --warn-soft: #3a2a12; --bad: #ff9b85; --bad-soft: #3d1e18; "
+    "--shadow: none; color-scheme: dark;"
+)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A figure in the page.
+
+    :param anchor: id of its place.
+    :param title: what it shows.
+    :param reading: how it is to be read.
+    :param wide: True if it fills the page.
+    :param alone: True if nothing stands beside it.
+    :param broad: the SVG for broad screens and paper.
+    :param slim: the SVG for narrow screens; empty: the same.
+    """
+
+    anchor: str
+    title: str
+    reading: str
+    wide: bool
+    alone: bool
+    broad: Markup
+    slim: Markup
+
+
+@dataclass(frozen=True)
+class _Section:
+    """What the page tells of one experiment."""
+
+    case: Case
+    name: str
+    verdict: str
+    tone: str
+    facts: tuple[str, ...]
+    warnings: tuple[str, ...]
+    checks: tuple[Check, ...]
+    numbers: tuple[Number, ...]
+    doubts: tuple[str, ...]
+    plates: tuple[_Drawn, ...]
+    left_out: tuple[str, ...]
+
+
+def page(cases: Sequence[Case], *, title: str = "") -> str:
+    """Return the report of some experiments as an HTML page.
+
+    The same cases give the same bytes. Whatever comes from a recording is escaped.
+
+    :param cases: at least one.
+    :param title: of the page; default: the first case's source.
+    """
+    environment = Environment(
+        loader=PackageLoader("relay_autotune.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "digits": digits,
+        "degrees": math.degrees,
+        "known": math.isfinite,
+        "process_text": process_text,
+        "mathml": lambda model: Markup(process_mathml(model)),
+    }
+    sections = [_section(case, k, len(cases) > 1) for k, case in enumerate(cases, start=1)]
+    return environment.get_template("report.html").render(
+        title=title or cases[0].source,
+        sections=sections,
+        version=relay_autotune.__version__,
+        light=Markup(_variables(0)),
+        night=Markup(f"{_variables(1)} {_NIGHT}"),
+    )
+
+
+def _variables(column: int) -> str:
+    return " ".join(f"--{name}: {both[column]};" for name, both in COLOURS.items())
+
+
+def _section(case: Case, number: int, many: bool) -> _Section:
+    verdict: Verdict = verdict_of(case)
+    present = [plate for plate in PLATES if not plate.missing(case)]
+    alone = sum(not plate.wide for plate in present) == 1
+    name = case.source if not case.experiment_id else f"{case.source}, {case.experiment_id}"
+    return _Section(
+        case=case,
+        name=name,
+        verdict=verdict.text,
+        tone=verdict.tone,
+        facts=facts_of(case, with_id=not many),
+        warnings=warnings_of(case),
+        checks=checks_of(case),
+        numbers=numbers_of(case),
+        doubts=doubts_of(case),
+        plates=tuple(_drawn(p, case, f"e{number}", alone=alone) for p in present),
+        left_out=tuple(f"{p.title}: {p.missing(case)}" for p in PLATES if p.missing(case)),
+    )
+
+
+def _drawn(plate: Plate, case: Case, prefix: str, *, alone: bool) -> _Drawn:
+    anchor = f"{prefix}-{plate.key}"
+    reading = plate.reading_of(case)
+
+    def svg(*, narrow: bool) -> Markup:
+        label = html.escape(f"{plate.title}. {reading}")
+        ids = f"{anchor}-{'narrow' if narrow else 'broad'}"
+        return Markup(inline(plate.figure(case, narrow=narrow), ids, label))
+
+    slim = svg(narrow=True) if plate.wide else _NOTHING
+    only = alone and not plate.wide
+    return _Drawn(anchor, plate.title, reading, plate.wide, only, svg(narrow=False), slim)

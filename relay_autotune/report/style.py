@@ -1,0 +1,204 @@
+"""How figures look, and how one becomes a picture or a part of a page.
+
+The colours are those of Okabe and Ito, which people of any colour vision can tell apart; lines
+differ in dashes as well. In a page each colour is a CSS variable, so that dark mode needs no
+second figure.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.figure import Figure, SubFigure
+
+FloatArray = NDArray[np.float64]
+
+# Name of the CSS variable, colour on white, colour on black. No two are equal, since the
+# variables are put in where the colours stand.
+COLOURS = {
+    "ink": ("#20262d", "#e7eaee"),
+    "muted": ("#68727d", "#9aa5b1"),
+    "grid": ("#dfe3e8", "#333b45"),
+    "paper": ("#fefefe", "#171b21"),
+    "blue": ("#0072b2", "#4fa8e0"),
+    "vermillion": ("#d55e00", "#ff8a45"),
+    "green": ("#009e73", "#2fc99b"),
+    "orange": ("#e69f00", "#f2b632"),
+    "purple": ("#cc79a7", "#e59cc3"),
+    "sky": ("#56b4e9", "#93d4f7"),
+}
+INK, MUTED, GRID, PAPER, BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY = (
+    light for light, _ in COLOURS.values()
+)
+# For lines that are told apart: colour and dashes.
+LINES = (
+    (BLUE, (6.0, 2.0)),
+    (GREEN, (1.5, 1.5)),
+    (ORANGE, (6.0, 1.5, 1.5, 1.5)),
+    (PURPLE, (10.0, 3.0)),
+    (SKY, (3.0, 1.5)),
+    (MUTED, (8.0, 1.5, 1.5, 1.5, 1.5, 1.5)),
+    (INK, (1.0, 2.5)),
+)
+
+WIDE, NARROW, SQUARE = 11.2, 4.5, 5.4
+_DPI = 110
+_RC = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "relay_autotune",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.2,
+}
+_FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', sans-serif"
+_BUCKETS = 700
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure.
+
+    :param width: in.
+    :param height: in.
+    """
+    # Imported here, since loading matplotlib takes longer than a whole replay.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def finish(figure: Figure | SubFigure) -> None:
+    """Give every axes of a figure the common look.
+
+    :param figure: with all that is to be drawn.
+    """
+    for axes in figure.axes:
+        axes.set_facecolor("none")
+        axes.spines[["top", "right"]].set_visible(False)
+        for spine in axes.spines.values():
+            spine.set_color(MUTED)
+            spine.set_linewidth(0.8)
+        axes.grid(color=GRID, linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=9, length=3)
+        axes.tick_params(which="minor", length=0)
+        for label in (axes.xaxis.label, axes.yaxis.label):
+            label.set_color(INK)
+            label.set_fontsize(9.5)
+
+
+def legend(figure: Figure | SubFigure, *, columns: int) -> None:
+    """Put one legend above all axes of a figure, where it hides nothing.
+
+    :param figure: whose axes have labelled artists.
+    :param columns: entries a row.
+    """
+    handles: list[Artist] = []
+    labels: list[str] = []
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            if label not in labels:
+                handles.append(handle)
+                labels.append(label)
+    if handles:
+        figure.legend(
+            handles, labels, loc="outside upper left", ncols=columns, fontsize=9, labelcolor=INK,
+            frameon=False, borderaxespad=0.0, handlelength=2.2, columnspacing=1.4,
+        )  # fmt: skip
+
+
+def thinned(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a signal with fewer points that looks the same: the extremes of each stretch.
+
+    :param time: s, shape (n,).
+    :param values: shape (n,); NaN where there is none.
+    """
+    n = time.size
+    if n <= 4 * _BUCKETS:
+        return time, values
+    edges = np.linspace(0, n, _BUCKETS + 1).astype(int)
+    kept = {0, n - 1}
+    for first, last in pairwise(edges):
+        part = values[first:last]
+        if np.all(np.isnan(part)):
+            kept.add(int(first))
+            continue
+        kept |= {int(first + np.nanargmin(part)), int(first + np.nanargmax(part))}
+    index = np.array(sorted(kept))
+    return time[index], values[index]
+
+
+def in_steps(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of a held signal.
+
+    :param times: instants from which the values hold [s], shape (n,); the last one ends it.
+    :param values: shape (n,).
+    """
+    changed = np.append(np.flatnonzero(np.diff(values) != 0.0) + 1, len(values) - 1)
+    t = np.concatenate((times[:1], np.repeat(times[changed], 2)))
+    v = np.concatenate((values[:1], np.column_stack((values[changed - 1], values[changed])).flat))
+    return t, v
+
+
+def save(figure: Figure, path: str, *, kind: str = "") -> None:
+    """Write a figure to a file, the same bytes for the same figure.
+
+    :param figure: the figure.
+    :param path: the file.
+    :param kind: "png", "svg" or "pdf"; default: as the file's ending says.
+    """
+    import matplotlib
+
+    kind = kind or path.rpartition(".")[2].lower()
+    dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    with matplotlib.rc_context(_RC):
+        figure.savefig(path, dpi=_DPI, facecolor="white", metadata=dates.get(kind), format=kind)
+
+
+def inline(figure: Figure, prefix: str, label: str) -> str:
+    """Return a figure as an SVG element that may stand in a page beside others.
+
+    :param figure: the figure.
+    :param prefix: put before its ids, different for each figure of the page.
+    :param label: what it shows, in words, escaped for an attribute.
+    """
+    import matplotlib
+
+    buffer = io.StringIO()
+    with matplotlib.rc_context(_RC):
+        figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    head, _, body = text.partition(">")
+    box = re.search(r'viewBox="([^"]+)"', head)
+    if box is None:
+        raise ValueError("matplotlib wrote an SVG without a viewBox")
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    body = re.sub(r"<style[^>]*>.*?</style>", "", body, flags=re.DOTALL)
+    body = re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL)
+    body = re.sub(r'\bid="', f'id="{prefix}-', body)
+    body = re.sub(r"url\(#", f"url(#{prefix}-", body)
+    body = re.sub(r'(?:xlink:)?href="#', f'href="#{prefix}-', body)
+    body = re.sub(r"-?\d+\.\d{3,}", _shorter, body)
+    body = re.sub(r"font-family: [^;\"]*", "font-family: inherit", body)
+    body = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", body)
+    for name, (light, _) in COLOURS.items():
+        body = re.sub(light, f"var(--{name})", body, flags=re.IGNORECASE)
+    body = re.sub(r"\n\s*", "\n", body)
+    return (
+        f'<svg role="img" aria-label="{label}" viewBox="{box[1]}" '
+        f'style="font-family: {_FONT}">{body}'
+    )
+
+
+def _shorter(number: re.Match[str]) -> str:
+    return f"{float(number[0]):.2f}".rstrip("0").rstrip(".")

@@ -1,0 +1,101 @@
+"""The command `report` as its users meet it."""
+
+from __future__ import annotations
+
+import pytest
+from report_cases import completed, fruitless
+
+from relay_autotune.cli import report
+from relay_autotune.document import document, to_json
+from relay_autotune.report.figures import PLATES
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    status = report.main([str(a) for a in arguments])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+@pytest.fixture
+def result(tmp_path):
+    """Return a file with the results of two recordings, a line for each."""
+    path = tmp_path / "result.json"
+    lines = [to_json(document("good", [completed()])), to_json(document("bad", [fruitless()]))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_csv(path) -> None:
+    record = completed().record
+    rows = [
+        f"{t:.6g},{y:.6g},{u:g}"
+        for t, y, u in zip(record.time, record.measurement, record.command, strict=True)
+    ]
+    path.write_text("time,measurement,command\n" + "\n".join(rows) + "\n")
+
+
+def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path) -> None:
+    write_csv(tmp_path / "log.csv")
+    page, folder = tmp_path / "page.html", tmp_path / "figures"
+    facts = ("--structure", "fopdt", "--title", "Tank 7")
+    arguments = (tmp_path / "log.csv", "-o", page, "--figures", folder, "--format", "svg", *facts)
+    status, out, err = run(capsys, *arguments)
+    assert (status, err) == (0, "")
+    assert out.splitlines()[0] == str(page)
+    assert out.splitlines()[1:] == [str(folder / f"{plate.key}.svg") for plate in PLATES]
+    assert all(file.read_text().startswith("<?xml") for file in folder.iterdir())
+    assert "<title>Tank 7</title>" in page.read_text()
+
+
+def test_results_of_several_recordings_share_a_page(capsys, tmp_path, result) -> None:
+    status, _, err = run(capsys, result, "-o", tmp_path / "page.html")
+    assert status == 1
+    assert err == "report: bad: nothing identified: found no response to the command\n"
+    text = (tmp_path / "page.html").read_text()
+    assert '<a href="#e2">bad, run-1</a>' in text
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("", "is no JSON"),
+        ("{", "is no JSON"),
+        ("[1]", "is no result of an experiment"),
+        ('{"bag": "b", "experiments": [{}]}', "no field 'limit_cycle'"),
+        ('{"bag": "b"}', "no field 'experiments'"),
+    ],
+)
+def test_what_is_no_result_is_refused_in_a_line(capsys, tmp_path, content, complaint) -> None:
+    (tmp_path / "r.json").write_text(content)
+    status, out, err = run(capsys, tmp_path / "r.json", "-o", tmp_path / "page.html")
+    assert (status, out) == (1, "")
+    assert complaint in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_recording_that_was_not_read_has_its_place(capsys, tmp_path) -> None:
+    (tmp_path / "r.json").write_text(to_json(document("b", error="b is empty")))
+    status, _, _ = run(capsys, tmp_path / "r.json", "-o", tmp_path / "page.html")
+    assert status == 1
+    assert "b is empty" in (tmp_path / "page.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint", "status"),
+    [
+        (("x.json", "-o", "page.doc"), ".html, .png, .svg, .pdf", 2),
+        (("x.json", "-o", "no/page.html"), "there is no folder no", 2),
+        (("x.json",), "cannot be read", 1),
+        (("no_such_bag",), "does not exist", 1),
+        (("no_such_bag", "--method", "guess"), "unknown method 'guess'", 2),
+    ],
+)
+def test_what_does_not_fit_is_said_in_a_line(
+    capsys, tmp_path, monkeypatch, arguments, complaint, status
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found, out, err = run(capsys, *arguments)
+    assert (found, out) == (status, "")
+    assert complaint in err
+    assert err.count("\n") == 1

@@ -1,0 +1,30 @@
+"""The page on the report names what the command and the figures have."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from pages import ROOT, rows
+
+from relay_autotune.cli import report
+from relay_autotune.report.figures import PLATES
+
+PAGE = (ROOT / "docs/report.md").read_text()
+
+
+def test_the_page_has_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        report.main(["--help"])
+    flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("\nEach source")[0]))
+    shown = " ".join(row[0] for row in rows("docs/report.md", "flag of `report`"))
+    assert set(re.findall(r"--[a-z-]+", shown)) | {"--help"} == flags
+
+
+def test_every_figure_has_a_section_with_its_picture() -> None:
+    sections = dict(re.findall(r"^## (.*)\n\n!\[[^]]+\]\(images/(.*)\)$", PAGE, re.MULTILINE))
+    assert sections == {plate.title: f"report_{plate.key}.png" for plate in PLATES}
+    for name in sections.values():
+        picture = ROOT / "docs/images" / name
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert picture.stat().st_size < 200_000

@@ -1,0 +1,122 @@
+"""What the figures show is what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.path import Path
+from report_cases import SETTINGS, completed, fruitless
+
+from relay_autotune.record import Record
+from relay_autotune.report import draw
+from relay_autotune.report.case import case_of
+from relay_autotune.report.experiment import rate_of, switches_of
+from relay_autotune.report.figures import PLATES
+from relay_autotune.report.frequency import swept_area
+from relay_autotune.report.loops import distinct_gains
+from relay_autotune.report.style import in_steps, inline, save, thinned
+
+
+def levels(names: str) -> Record:
+    """Return a record whose command goes through levels: b(aseline), h(igh), l(ow)."""
+    value = {"b": SETTINGS.baseline, "h": SETTINGS.high, "l": SETTINGS.low}
+    command = np.array([value[name] for name in names])
+    time = np.arange(float(len(names)))
+    return Record(time=time, measurement=np.zeros(time.size), command=command)
+
+
+def test_a_kick_is_no_switch_and_neither_is_the_end() -> None:
+    found = switches_of(levels("bbhhblllhhlb"), SETTINGS)
+    np.testing.assert_array_equal(found.kicks, [2.0, 5.0])
+    np.testing.assert_array_equal(found.switches, [8.0, 10.0])
+    np.testing.assert_array_equal(found.released, [4.0, 11.0])
+
+
+def test_thinning_keeps_every_extreme_of_a_long_signal() -> None:
+    rng = np.random.default_rng(1)
+    time, values = np.arange(50_000.0), rng.normal(size=50_000)
+    values[31_415] = 9.0
+    few_times, few = thinned(time, values)
+    assert few.size < 1500
+    assert few.max() == 9.0
+    assert few.min() == values.min()
+    assert np.all(np.diff(few_times) > 0.0)
+    assert set(zip(few_times, few, strict=True)) <= set(zip(time, values, strict=True))
+
+
+def test_thinning_leaves_gaps_where_nothing_was_fitted() -> None:
+    values = np.full(50_000, np.nan)
+    values[20_000:] = 1.0
+    _, few = thinned(np.arange(50_000.0), values)
+    assert np.isnan(few[0])
+    assert np.nanmin(few) == 1.0
+
+
+def test_steps_have_a_corner_at_each_change() -> None:
+    times, values = in_steps(np.array([0.0, 1.0, 2.0, 5.0]), np.array([3.0, 3.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(times, [0.0, 2.0, 2.0, 5.0, 5.0])
+    np.testing.assert_array_equal(values, [3.0, 3.0, 1.0, 1.0, 1.0])
+
+
+def test_the_rate_is_that_of_a_known_curve() -> None:
+    time = np.arange(0.0, 40.0, 0.05)
+    record = Record(time=time, measurement=np.sin(time), command=np.zeros(time.size))
+    grid, values, rate = rate_of(record, record.measurement, 2.0 * np.pi)
+    np.testing.assert_allclose(values, np.sin(grid), atol=0.01)
+    np.testing.assert_allclose(rate, np.cos(grid), atol=0.03)
+
+
+def test_the_band_of_the_nyquist_curve_holds_95_percent_of_its_models() -> None:
+    rng = np.random.default_rng(2)
+    centres = np.array([0.0, 1.0 + 1.0j, 3.0])
+    spread = rng.normal(size=(4000, 3)) + 0.3j * rng.normal(size=(4000, 3))
+    area = swept_area(centres + spread)
+    fresh = rng.normal(size=4000) + 0.3j * rng.normal(size=4000)
+    parts = [Path(polygon) for polygon in area.to_polygons()]
+
+    def share(centre: complex) -> float:
+        at = np.column_stack(((centre + fresh).real, (centre + fresh).imag))
+        return float(np.mean(np.any([part.contains_points(at) for part in parts], axis=0)))
+
+    inside = [share(centre) for centre in centres]
+    # Its neighbours' part adds to what each ellipse holds.
+    assert min(inside) > 0.94
+    assert inside[0] < 0.985
+
+
+def test_rules_that_give_the_same_gains_are_drawn_once() -> None:
+    case = case_of(completed(), "tank")
+    best = case.best_gains
+    twin = replace(best, rule="twin")
+    assert distinct_gains(replace(case, gains=(best, twin))) == (best,)
+
+
+def test_the_picture_holds_what_there_is(tmp_path) -> None:
+    draw(fruitless(), tmp_path / "figure.png", title="a test")
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("ending", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")]
+)
+def test_a_file_is_what_its_ending_says_and_the_same_every_time(
+    tmp_path, ending: str, start: bytes
+) -> None:
+    case = case_of(completed(), "tank")
+    (plate,) = (p for p in PLATES if p.key == "uncertainty")
+    written = []
+    for name in ("one", "two"):
+        save(plate.figure(case), str(tmp_path / f"{name}.{ending}"))
+        written.append((tmp_path / f"{name}.{ending}").read_bytes())
+    assert written[0].startswith(start)
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize("key", ["nyquist", "closed_loop"])
+def test_the_same_case_gives_the_same_bytes(key: str) -> None:
+    case = case_of(completed(), "tank")
+    (plate,) = (p for p in PLATES if p.key == key)
+    first = inline(plate.figure(case, narrow=True), "a", "label")
+    assert inline(plate.figure(case, narrow=True), "a", "label") == first

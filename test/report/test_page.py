@@ -1,0 +1,186 @@
+"""The page opens without a network, holds every figure, and takes nothing from a bag for HTML."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+from report_cases import MODEL, aborted, completed, fruitless
+
+from relay_autotune.document import document, model_fields, to_json
+from relay_autotune.report.case import Case, case_of
+from relay_autotune.report.figures import PLATES
+from relay_autotune.report.from_document import cases_of_document, read_documents
+from relay_autotune.report.page import page
+from relay_autotune.report.style import COLOURS
+
+VOID = {"meta", "br", "link", "img", "input", "hr"}
+HOSTILE = "<script>alert(1)</script>\"' onload=x <img src=q>"
+
+
+class Reader(HTMLParser):
+    """Check that elements close in order, and note what a browser would load or address."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.elements: list[str] = []
+        self.references: list[str] = []
+        self.words: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append(tag)
+        for name, value in attrs:
+            assert not name.startswith("on"), f"{tag} has {name}"
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("href", "src", "xlink:href", "data", "action", "srcset"):
+                self.references.append(value or "")
+            if value:
+                self.references += re.findall(r"url\(([^)]*)\)", value)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open and "script" not in self.open:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def read(text: str) -> Reader:
+    found = Reader()
+    found.feed(text)
+    found.close()
+    assert found.open == []
+    return found
+
+
+def from_json(analysis) -> Case:
+    written = to_json(document("bag", [analysis]))
+    (case,) = cases_of_document(json.loads(written), "result.json")
+    return case
+
+
+@pytest.fixture(scope="module")
+def whole() -> str:
+    """Return the page of an experiment that went well, beside one that gave nothing."""
+    return page([case_of(completed(), "tank"), case_of(fruitless(), HOSTILE)])
+
+
+def test_it_is_one_well_formed_file_that_loads_nothing(whole: str) -> None:
+    found = read(whole)
+    assert found.elements.count("html") == 1
+    assert all(reference.startswith("#") for reference in found.references)
+    assert not re.search(r"https?:|//[a-z]|@import|file:", whole)
+
+
+def test_ids_are_unique_and_every_reference_has_one(whole: str) -> None:
+    found = read(whole)
+    assert len(set(found.ids)) == len(found.ids)
+    assert {reference[1:] for reference in found.references} <= set(found.ids)
+
+
+def test_every_figure_is_there_for_broad_and_narrow_screens(whole: str) -> None:
+    ids = set(read(whole).ids)
+    assert {f"e1-{plate.key}" for plate in PLATES} <= ids
+    for plate in PLATES:
+        assert any(i.startswith(f"e1-{plate.key}-broad-") for i in ids)
+        assert any(i.startswith(f"e1-{plate.key}-narrow-") for i in ids) == plate.wide
+
+
+def test_colours_are_variables_with_a_value_for_light_and_dark(whole: str) -> None:
+    drawings = "".join(re.findall(r"<svg.*?</svg>", whole, re.DOTALL))
+    assert not re.search(r"#[0-9a-fA-F]{6}\b", drawings)
+    for name, (light, dark) in COLOURS.items():
+        assert f"--{name}: {light};" in whole
+        assert f"--{name}: {dark};" in whole
+    assert set(re.findall(r"var\(--([a-z]+)\)", drawings)) <= set(COLOURS)
+
+
+def test_the_summary_has_the_gains_the_model_and_how_sure_they_are(whole: str) -> None:
+    text, gains = read(whole).text, completed().best_gains
+    assert f"kc {gains.kc:#.4g}" in text
+    assert f"ti {gains.ti:#.4g}" in text
+    assert f"Ms {gains.ms:.2f}" in text
+    for analysis_model in completed().models:
+        assert analysis_model.method in text
+    for each in completed().gains:
+        assert each.rule in text
+
+
+def test_names_and_reasons_from_a_bag_are_text_and_never_html() -> None:
+    hostile = replace(aborted(HOSTILE), record=replace(
+        aborted(HOSTILE).record, experiment_id=HOSTILE
+    ))  # fmt: skip
+    model = replace(hostile.models[0], warnings=(HOSTILE,), method=HOSTILE)
+    case = case_of(replace(hostile, models=(model, *hostile.models[1:])), HOSTILE)
+    text = page([replace(case, record=None, cycles=(), models_around=())], title=HOSTILE)
+    found = read(text)
+    assert found.elements.count("script") == 1
+    assert "img" not in found.elements
+    assert found.text.count("alert(1)") >= 5
+    assert "&lt;script&gt;" in text
+
+
+def test_without_gains_the_reason_stands_in_their_place() -> None:
+    case = replace(case_of(aborted(), "tank"), record=None, cycles=(), models_around=())
+    found = read(page([case]))
+    assert "No gains" in found.text
+    assert "the operator pressed the button" in found.text
+    assert "model, but no gains" in found.text
+    assert "Gains to type in" not in found.text
+    assert "e1-closed_loop" not in found.ids
+    assert "Closed loop, predicted: there are no gains" in found.text
+
+
+def test_where_nothing_was_identified_the_experiment_is_drawn_all_the_same(whole: str) -> None:
+    found = read(whole)
+    assert "e2-experiment" in found.ids
+    assert "e2-fit" not in found.ids
+    assert "found no response to the command" in found.text
+    assert "Model over the data: nothing was identified" in found.text
+
+
+def test_a_document_gives_the_same_report_without_what_needs_samples() -> None:
+    case = from_json(completed())
+    direct = case_of(completed(), "bag")
+    assert case.gains == direct.gains
+    assert case.best_gains == direct.best_gains
+    assert case.model.model == direct.model.model
+    for ours, theirs in zip(case.model.estimates, direct.model.estimates, strict=True):
+        assert (ours.name, ours.unit, ours.low) == (theirs.name, theirs.unit, theirs.low)
+        assert ours.value == pytest.approx(theirs.value, rel=1e-9)
+    assert case.model.ultimate == direct.model.ultimate
+    assert case.limit_cycle.period == direct.limit_cycle.period
+    text = page([case])
+    found = read(text)
+    assert {i for i in found.ids if i.count("-") == 1} == {
+        f"e1-{key}" for key in ("nyquist", "bode", "closed_loop", "uncertainty")
+    }
+    assert "The experiment: it needs the samples" in found.text
+
+
+def test_a_simulated_process_is_compared_with_the_truth(tmp_path) -> None:
+    written = document("bag", [completed()]) | {"truth": model_fields(MODEL)}
+    (tmp_path / "result.json").write_text(to_json(written))
+    (case,) = read_documents(tmp_path / "result.json")
+    truths = {e.name: e.truth for e in (*case.model.estimates, *case.model.ultimate)}
+    assert truths["gain"] == 1.65
+    assert truths["time_constant"] == 20.0
+    assert truths["dead_time"] == 10.0
+    assert truths["ultimate_frequency"] == pytest.approx(0.1837, abs=1e-4)

@@ -1,0 +1,54 @@
+"""Experiments for the tests of the report."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.autotune import Analysis, analyse
+from relay_autotune.identification import Known
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.sampled_relay import simulate_sampled_relay
+
+MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
+SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
+
+
+def relay_record(*, outcome: Outcome = Outcome.COMPLETED, reason: str = "") -> Record:
+    """Record a biased relay on 1.65 e^(-10 s)/(1 + 20 s), with noise."""
+    noise = np.random.default_rng(5).normal(0.0, 0.02, 700)
+    found = simulate_sampled_relay(MODEL, SETTINGS, period=0.4, noise=noise)
+    return Record(
+        time=found.time,
+        measurement=found.measurement,
+        command=found.command,
+        settings=SETTINGS,
+        noise_std=0.02,
+        cycle_start=found.cycle_start,
+        outcome=outcome,
+        reason=reason,
+        experiment_id="run-1",
+        start=1_790_000_000.0,
+    )
+
+
+@functools.cache
+def completed() -> Analysis:
+    """Return an experiment that gave a model and gains."""
+    return analyse(relay_record(), known=Known(structure="fopdt"))
+
+
+def aborted(reason: str = "the operator pressed the button") -> Analysis:
+    """Return an experiment that gave a model and no gains."""
+    found = completed()
+    record = replace(found.record, outcome=Outcome.ABORTED, reason=reason)
+    why = f"the experiment was aborted: no gains. {reason}"
+    return replace(found, record=record, gains=(), recommended=None, reason=why)
+
+
+def fruitless(reason: str = "found no response to the command") -> Analysis:
+    """Return an experiment that gave nothing."""
+    return Analysis(completed().record, completed().cycles, reason=reason)
