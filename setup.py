@@ -12,14 +12,17 @@ setup(
     maintainer="relay_autotune maintainers",
     maintainer_email="maintainers@relay-autotune.example",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed"]},
+    package_data={PACKAGE: ["py.typed", "report/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
     python_requires=">=3.11",
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
-    extras_require={"test": ["pytest", "hypothesis"]},
+    extras_require={
+        "report": ["jinja2", "matplotlib"],
+        "test": ["control", "hypothesis", "pytest"],
+    },
     zip_safe=True,
     entry_points={
         "console_scripts": [
@@ -29,6 +32,7 @@ setup(
             "replay = relay_autotune.cli.replay:main",
             "identify = relay_autotune.cli.identify:main",
             "csv_to_bag = relay_autotune.cli.csv_to_bag:main",
+            "report = relay_autotune.cli.report:main",
         ],
     },
 )
