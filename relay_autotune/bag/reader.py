@@ -14,10 +14,11 @@ from relay_autotune.bag.fields import split_name
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
-from relay_autotune.bag.signals import Signal, join, window
+from relay_autotune.bag.signals import Signal, cut, join, window
 from relay_autotune.bag.timing import CLOCKS
 from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.excitation import find_experiments
 from relay_autotune.record import Record
 
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
@@ -89,7 +90,7 @@ def read_experiments(
     if path.suffix.lower() == ".csv":
         columns = (wanted.measurement, wanted.command, wanted.time)
         measured, commanded, dated = read_csv(path, *columns)
-        records, notes = [join(measured, commanded, dated=dated)], list[str]()
+        records, notes = _experiments(join(measured, commanded, dated=dated), wanted)
     elif wanted.time is not None:
         raise SelectionError(f"--time names a column of a CSV file, but {path} is none")
     else:
@@ -138,7 +139,7 @@ def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[st
     if not topics.types():
         raise BagError("; ".join((f"{topics.path} holds no topic", *topics.notes)))
     if wanted.measurement is not None or wanted.command is not None:
-        records, notes = _joined(topics, *_named_pair(topics, wanted))
+        records, notes = _joined(topics, wanted, *_named_pair(topics, wanted))
     else:
         records, notes = recorded_experiments(topics)
         if not records:
@@ -146,11 +147,13 @@ def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[st
             if interrupted is not None:
                 records = [interrupted]
             else:
-                records, notes = _joined(topics, *_found_pair(topics))
+                records, notes = _joined(topics, wanted, *_found_pair(topics))
     return records, [*topics.notes, *notes]
 
 
-def _joined(topics: Topics, pair: Pair, notes: list[str]) -> tuple[list[Record], list[str]]:
+def _joined(
+    topics: Topics, wanted: Selection, pair: Pair, notes: list[str]
+) -> tuple[list[Record], list[str]]:
     names = (pair.measurement.name, pair.command.name)
     measured, commanded = topics.signals(names).values()
     notes = [*notes, *measured.notes, *commanded.notes]
@@ -166,7 +169,29 @@ def _joined(topics: Topics, pair: Pair, notes: list[str]) -> tuple[list[Record],
             f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
             f"they are aligned by the recorder's clock"
         )
-    return [join(signals[0], signals[1])], notes
+    records, found = _experiments(join(signals[0], signals[1]), wanted)
+    return records, [*notes, *found]
+
+
+def _experiments(record: Record, wanted: Selection) -> tuple[list[Record], list[str]]:
+    """Take a record of unknown origin apart, unless a part of it was asked for."""
+    if wanted.start is not None or wanted.end is not None:
+        return [record], []
+    stretches = find_experiments(record)
+    if not stretches:
+        note = "no relay phase, step, pulse or closed loop stands out; all of it is used"
+        return [record], [note]
+    records = [cut(record, stretch.first, stretch.last + 1) for stretch in stretches]
+    if len(stretches) == 1 and len(records[0]) == len(record):
+        return records, []
+    begins = record.time[[stretch.first for stretch in stretches]]
+    ends = record.time[[stretch.last for stretch in stretches]]
+    return records, [
+        f"experiment {number} of {len(records)}, {begin:g} s to {end:g} s: {stretch.reason}"
+        for number, (begin, end, stretch) in enumerate(
+            zip(begins, ends, stretches, strict=True), start=1
+        )
+    ]
 
 
 def _named_pair(topics: Topics, wanted: Selection) -> tuple[Pair, list[str]]:

@@ -95,6 +95,18 @@ def window(record: Record, start: float | None, end: float | None) -> Record:
             f"no sample lies between --start {0.0 if start is None else start:g} s and "
             f"--end {time[-1] if end is None else end:g} s; the recording is {time[-1]:g} s long"
         )
+    return cut(record, low, high)
+
+
+def cut(record: Record, low: int, high: int) -> Record:
+    """Return some of the samples of a record; the command's history is kept.
+
+    :param record: the record.
+    :param low: index of the first sample to keep.
+    :param high: index of the first one after it not to keep.
+    """
+    if low == 0 and high == len(record):
+        return record
     origin = float(record.time[low])
     held = record.held_input
     if low > 0 or held is not None:

@@ -409,7 +409,8 @@ def test_the_input_of_a_foreign_pair_equals_its_commands(data, tmp_path_factory)
         list(zip(t / 1e9, y, strict=True)),
         list(zip(c / 1e9, u, strict=True)),
     )
-    (found,) = read_experiments(folder / "bag", Selection("/measurement", "/command")).experiments
+    everything = Selection("/measurement", "/command", start=0.0)
+    (found,) = read_experiments(folder / "bag", everything).experiments
     origin = round(found.start * 1e9 - START)
     seen = found.input()
     middles = (c[:-1] + c[1:]) / 2
@@ -442,7 +443,7 @@ def test_commands_before_the_first_sample_are_known(tmp_path):
 def test_the_chosen_pair_is_named_with_its_reason(tmp_path):
     samples = [(k * 0.1, float(k % 29)) for k in range(100)]
     write_pair(tmp_path / "bag", samples, [(0.0, 1.0), (5.0, 2.0)], ("/tank/level", "/tank/valve"))
-    (note,) = read_experiments(tmp_path / "bag").notes
+    note, *_ = read_experiments(tmp_path / "bag").notes
     assert note == (
         "using --measurement /tank/level --command /tank/valve: /tank/level varies over 29 "
         "values in 100 messages; /tank/valve two levels, 1 switches in 2 messages"

@@ -1,0 +1,153 @@
+"""Experiments found in long records."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from relay_autotune.excitation import find_experiments
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.response import response
+from relay_autotune.sampled_relay import simulate_sampled_relay
+
+MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
+TIME = np.arange(0.0, 3000.0, 0.25)
+
+
+def commanded(times, levels, *, noise=0.02, time=TIME) -> Record:
+    """Record the process under a command that changes at some times."""
+    u = PiecewiseConstant(np.array(times, float), np.array(levels[1:], float), float(levels[0]))
+    y = 50.0 + response(MODEL, time, u) + np.random.default_rng(3).normal(0.0, noise, time.size)
+    return Record(time=time, measurement=y, command=u(time), held_input=u)
+
+
+def spans(record):
+    return [
+        (s.kind, float(record.time[s.first]), float(record.time[s.last]))
+        for s in find_experiments(record)
+    ]
+
+
+def test_a_step_with_rest_as_long_as_itself_around_it():
+    ((kind, begin, end),) = spans(commanded([1000.0], [0, 1]))
+    assert kind == "steps"
+    # The response takes the dead time and three to five time constants.
+    moved = (end - begin) / 3.0
+    assert 65.0 < moved < 120.0
+    assert begin == pytest.approx(1000.0 - moved, abs=1.0)
+
+
+def test_a_pulse_is_one_experiment_and_far_steps_are_two():
+    (pulse,) = spans(commanded([1000.0, 1030.0], [0, 1, 0]))
+    assert pulse[0] == "pulses"
+    assert pulse[1] < 1000.0 < 1100.0 < pulse[2] < 1400.0
+    first, second = spans(commanded([200.0, 2500.0], [0, 1, 0]))
+    assert first[1] < 200.0 < first[2] < 500.0
+    assert 2300.0 < second[1] < 2500.0 < second[2]
+
+
+def test_steps_without_rest_between_them_are_one():
+    (found,) = find_experiments(commanded([500.0, 560.0, 600.0], [0, 1, 2, 1.5]))
+    assert found.reason == "steps of the command from 0 to 1 to 2 to 1.5"
+
+
+SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
+
+
+def relay(samples=900, seed=5) -> Record:
+    noise = np.random.default_rng(seed).normal(0.0, 0.02, samples)
+    return simulate_sampled_relay(MODEL, SETTINGS, period=0.25, noise=noise)
+
+
+def test_relay_phases_apart_are_two_experiments_and_rest_is_none():
+    part = relay()
+    rest, n = 2000, len(part)
+    noise = np.random.default_rng(1).normal(0.0, 0.02, rest)
+    y = np.concatenate((50.0 + noise, part.measurement, 50.0 + noise, part.measurement))
+    u = np.concatenate((np.full(rest, 30.0), part.command) * 2)
+    record = Record(time=np.arange(y.size) * 0.25, measurement=y, command=u)
+    found = find_experiments(record)
+    assert [s.kind for s in found] == ["relay", "relay"]
+    assert "between 27.9 and 33.9 that follow the measurement" in found[0].reason
+    for stretch, begin in zip(found, (rest, 2 * rest + n), strict=True):
+        assert begin - 1.1 * n < stretch.first < begin + 200
+        assert begin + 0.8 * n < stretch.last < begin + 2.3 * n
+    assert found[0].last < found[1].first
+
+
+def test_pulses_by_the_clock_are_no_relay():
+    times = 500.0 + 200.0 * np.arange(8)
+    (found,) = find_experiments(commanded(times, [0, 1] * 4 + [0]))
+    assert found.kind == "pulses"
+    assert "whatever the measurement does" in found.reason
+
+
+def controlled(setpoint, samples=4000, noise=0.02) -> Record:
+    """Record a PI loop of 1.65 e^(-10 s)/(20 s + 1), sampled each 0.5 s."""
+    pole, rng = math.exp(-0.5 / 20.0), np.random.default_rng(1)
+    late, y, integral = [0.0] * 20, 0.0, 0.0
+    columns = []
+    for k in range(samples):
+        seen = y + rng.normal(0.0, noise)
+        error = setpoint(0.5 * k) - seen
+        integral += error * 0.5 * 0.6 / 20.0
+        late.append(0.6 * error + integral)
+        columns.append((0.5 * k, seen, late[-1]))
+        y = pole * y + (1.0 - pole) * 1.65 * late[-21]
+    time, measurement, command = np.array(columns).T
+    return Record(time=time, measurement=measurement, command=command)
+
+
+def test_a_staircase_under_a_controller():
+    record = controlled(lambda t: (t > 500.0) + (t > 700.0) - 2.0 * (t > 900.0))
+    ((kind, begin, end),) = spans(record)
+    assert kind == "closed loop"
+    assert begin < 500.0
+    assert 950.0 < end < 1500.0
+
+
+def test_a_loop_at_rest_is_no_experiment():
+    assert spans(controlled(lambda t: 0.0)) == []
+
+
+def test_a_command_that_moves_nothing_is_no_experiment():
+    record = commanded([500.0, 900.0], [0, 1e-6, 0])
+    assert spans(record) == []
+    still = Record(time=TIME, measurement=np.full(TIME.size, 4.0), command=record.command)
+    assert spans(still) == []
+
+
+def test_where_nothing_was_recorded_an_experiment_ends():
+    record = commanded([200.0, 2000.0], [0, 1, 0])
+    kept = (record.time < 600.0) | (record.time > 1900.0)
+    broken = Record(
+        time=record.time[kept],
+        measurement=record.measurement[kept],
+        command=record.command[kept],
+        held_input=record.held_input,
+    )
+    (first, second) = spans(broken)
+    assert first[2] < 600.0
+    assert second[1] > 1900.0
+
+
+def test_a_saturated_stretch_is_left_out():
+    record = commanded([500.0, 1500.0], [0, 1, 0.1])
+    clipped = Record(
+        time=record.time,
+        measurement=np.minimum(record.measurement, 51.2),
+        command=record.command,
+        held_input=record.held_input,
+    )
+    for _, begin, end in spans(clipped):
+        inside = (record.time >= begin) & (record.time <= end)
+        assert np.count_nonzero(clipped.measurement[inside] == 51.2) < 20
+
+
+def test_all_of_a_short_test_is_one_experiment():
+    record = commanded([20.0, 75.0], [0, 1, 0.5], time=np.arange(0.0, 120.0, 0.1))
+    (found,) = find_experiments(record)
+    assert (found.first, found.last) == (0, len(record) - 1)
