@@ -1,16 +1,17 @@
-"""A sampled PI or PID controller on the exact process."""
+"""A sampled controller on the exact process."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
 from relay_autotune.simulation import Plant
 from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.sampled import SampledController, SampledPid
 
 FloatArray = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ class ClosedLoop:
     """Deviations from the operating point in a closed loop.
 
     :param time: s, shape (n,).
-    :param measurement: y, shape (n,).
+    :param measurement: y, shape (n,), without the noise.
     :param command: u, shape (n,), held from each sample to the next.
     """
 
@@ -30,7 +31,7 @@ class ClosedLoop:
 
 
 def simulate_closed_loop(
-    controller: Controller,
+    controller: Controller | SampledController,
     model: TransferFunction,
     *,
     period: float,
@@ -38,30 +39,37 @@ def simulate_closed_loop(
     setpoint: float = 0.0,
     load: float = 0.0,
     load_time: float = 0.0,
+    low: float = -math.inf,
+    high: float = math.inf,
+    noise: FloatArray | None = None,
 ) -> ClosedLoop:
-    """Run a PI controller at its sampling period; between samples the process moves exactly.
+    """Run a controller at its sampling period; between samples the process moves exactly.
 
-    The integral is advanced by the backward rule: ``I += kc period/ti e`` before the output.
-
-    :param controller: the gains, PI.
-    :param model: the process, at rest.
+    :param controller: PI or PID gains, which :class:`SampledPid` then runs, or any other
+        controller of this period, at rest.
+    :param model: the process, at rest, without the half period that a design adds to it.
     :param period: sampling period [s].
     :param duration: s.
     :param setpoint: step of the set-point at t = 0 [y].
     :param load: step of the load at the process input [u].
     :param load_time: when it comes [s].
-    :raises TuningError: if the controller has derivative action.
+    :param low: least command [u]; of gains only.
+    :param high: largest command [u]; of gains only.
+    :param noise: added to each sample that the controller sees [y], shape (n,); None: none.
+    :raises TuningError: if period or limits make no sense.
     """
-    if controller.td > 0.0:
-        raise TuningError("the sampled closed loop is for PI control, found td > 0")
+    law: SampledController
+    if isinstance(controller, Controller):
+        law = SampledPid(controller, period, low=low, high=high)
+    else:
+        law = controller
     plant = Plant(model)
     time = np.arange(int(duration / period) + 1, dtype=np.float64) * period
+    seen = np.zeros(time.size) if noise is None else noise
     measurement, command = np.empty(time.size), np.empty(time.size)
-    integral = output = 0.0
+    output = 0.0
     for k, t in enumerate(time):
         disturbed = output + (load if t > load_time else 0.0)
-        y = plant.advance(float(t), disturbed)
-        integral += controller.i * period * (setpoint - y)
-        output = controller.kc * (controller.b * setpoint - y) + integral
-        measurement[k], command[k] = y, output
+        measurement[k] = plant.advance(float(t), disturbed)
+        command[k] = output = law.step(setpoint, float(measurement[k] + seen[k]))
     return ClosedLoop(time, measurement, command)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 
 @dataclass(frozen=True)
@@ -54,29 +61,63 @@ class Controller:
         return self.kc * self.td
 
     def transfer_function(self) -> TransferFunction:
-        """Return the controller from measurement to command, without its sign."""
-        if self.ti > 0.0 and self.td == self.tf == 0.0:
-            # The form that is asked for a hundred times, once for each model of an ensemble.
-            return TransferFunction(self.kc / self.ti, (self.ti,), (), 1)
-        bottom = [0.5 * self.tf**2, self.tf, 1.0]
-        if self.ti > 0.0:
-            top = [self.kc * self.td * self.ti, self.kc * self.ti, self.kc]
-            return TransferFunction.from_polynomials(top, [self.ti * c for c in bottom] + [0.0])
-        return TransferFunction.from_polynomials([self.kc * self.td, self.kc], bottom)
+        """Return the controller from measurement to command, without its sign.
+
+        :raises ModelError: if it has a derivative without a filter.
+        """
+        gain, zeros, lags, integrators = self._factors()
+        return TransferFunction(gain, zeros, lags, integrators)
 
     def loop(self, model: TransferFunction) -> TransferFunction:
         """Return controller times process.
 
         :param model: the process.
+        :raises ModelError: if it has a derivative without a filter, and the process no lag.
         """
-        c = self.transfer_function()
+        gain, zeros, lags, integrators = self._factors()
         return TransferFunction(
-            c.gain * model.gain,
-            c.zeros + model.zeros,
-            c.time_constants + model.time_constants,
-            c.integrators + model.integrators,
-            c.dead_time + model.dead_time,
+            gain * model.gain,
+            zeros + model.zeros,
+            lags + model.time_constants,
+            integrators + model.integrators,
+            model.dead_time,
         )
+
+    def characteristic(self, model: TransferFunction) -> tuple[TransferFunction, ...]:
+        """Return the terms L_k of the characteristic equation ``1 + sum L_k(s) = 0``.
+
+        :param model: the process.
+        """
+        return (self.loop(model),)
+
+    def __call__(self, s: ComplexArray) -> ComplexArray:
+        """Return -command per measurement at complex frequencies [u/y].
+
+        :param s: rad/s, any shape.
+        """
+        ideal = self.kc * (1.0 + self.td * s)
+        if self.ti > 0.0:
+            ideal = ideal + self.kc / (self.ti * s)
+        return np.asarray(ideal / (1.0 + self.tf * s + 0.5 * (self.tf * s) ** 2))
+
+    def from_setpoint(self, s: ComplexArray) -> ComplexArray:
+        """Return command per set-point at complex frequencies [u/y].
+
+        :param s: rad/s, any shape.
+        """
+        integral = self.kc / (self.ti * s) if self.ti > 0.0 else 0.0 * s
+        return np.asarray(self.kc * self.b + integral)
+
+    def _factors(self) -> tuple[float, tuple[complex, ...], tuple[complex, ...], int]:
+        """Return gain, zeros, time constants and integrators of the controller."""
+        half = 0.5 * self.tf
+        lags = (complex(half, half), complex(half, -half)) if self.tf > 0.0 else ()
+        if self.ti == 0.0:
+            return self.kc, (complex(self.td),), lags, 0
+        # 1 + ti s + ti td s^2; its larger constant first, since the smaller one may cancel.
+        root = cmath.sqrt(1.0 - 4.0 * self.td / self.ti)
+        first = 0.5 * self.ti * (1.0 + root)
+        return self.kc / self.ti, (first, self.ti * self.td / first), lags, 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +130,17 @@ class Performance:
     :param phase_margin: rad.
     :param delay_margin: dead time that may be added [s].
     :param iae_load: integral of the absolute error after a unit step of the load at the
-        process input [y s/u].
+        process input [y s/u]; infinite without integral action.
+    :param gain_margin_low: factor to which the loop's gain may fall; 0: any. NaN: not computed,
+        here and below.
+    :param iae_setpoint: integral of the absolute error after a unit step of the set-point [s].
+    :param overshoot: after a step of the set-point, relative to it.
+    :param settling_time: until the measurement stays within 2 % of a new set-point [s].
+    :param effort_setpoint: total variation of the command after a unit step of the set-point
+        [u/y].
+    :param effort_load: total variation of the command after a unit step of the load.
+    :param noise_gain: standard deviation of the command over that of white noise in the samples
+        of the measurement; without a sampling period the largest gain at any frequency [u/y].
     """
 
     ms: float
@@ -98,6 +149,13 @@ class Performance:
     phase_margin: float
     delay_margin: float
     iae_load: float
+    gain_margin_low: float = math.nan
+    iae_setpoint: float = math.nan
+    overshoot: float = math.nan
+    settling_time: float = math.nan
+    effort_setpoint: float = math.nan
+    effort_load: float = math.nan
+    noise_gain: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,12 +167,14 @@ class Gains(Controller, Performance):
     :param rule: name in the registry.
     :param ms_95: Ms that 95 % of the models within the uncertainty stay below.
     :param reason: why this rule and these gains, a sentence for people.
+    :param warnings: what the user must know before using them.
     """
 
     rule: str
     ms_95: float
     reason: str
     form: str = "isa"
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -125,6 +185,7 @@ class Gains(Controller, Performance):
         *,
         ms_95: float,
         reason: str,
+        warnings: tuple[str, ...] = (),
     ) -> Gains:
         """Join a controller and its performance.
 
@@ -133,5 +194,13 @@ class Gains(Controller, Performance):
         :param performance: what they do on the model.
         :param ms_95: Ms that 95 % of the models within the uncertainty stay below.
         :param reason: why this rule and these gains.
+        :param warnings: what the user must know.
         """
-        return cls(**vars(controller), **vars(performance), rule=rule, ms_95=ms_95, reason=reason)
+        return cls(
+            **vars(controller),
+            **vars(performance),
+            rule=rule,
+            ms_95=ms_95,
+            reason=reason,
+            warnings=warnings,
+        )

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.control_law import ControlLaw
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.margins import frequencies
 from relay_autotune.tuning.sampled import filter_matrices
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+
+_ANGLES = 2048
 
 # Time constants of the filter over the sampling period, between which is interpolated.
 _RATIOS = np.geomspace(1e-3, 1e4, 141)
@@ -69,3 +77,40 @@ def filter_for(td: FloatArray, largest: FloatArray, period: float) -> FloatArray
     found = np.exp(steps[inside - 1] + share * (steps[inside] - steps[inside - 1])) * period
     found = np.where(first == 0, 0.0, found)
     return np.where(first == _RATIOS.size, math.inf, found)
+
+
+def noise_gain(controller: ControlLaw, model: TransferFunction, period: float) -> float:
+    """Return the standard deviation of the command per that of white measurement noise.
+
+    The noise is that of the samples, and reaches the command directly and round the loop, in
+    which the command is held for a period. A PI or PID controller counts as
+    :class:`~relay_autotune.tuning.sampled.SampledPid` runs it.
+
+    :param controller: of a stable loop.
+    :param model: the process, with all dead time of the loop, that of the hold included.
+    :param period: of the samples [s]; 0: the largest magnitude from noise to command, which no
+        period exceeds.
+    :return: u/y.
+    """
+    if period == 0.0:
+        grid = frequencies(*controller.characteristic(model))
+        s = 1j * grid
+        return float(np.abs(controller(s) / (1.0 + controller(s) * model(s))).max())
+    angle = (np.arange(_ANGLES) + 0.5) * (math.pi / _ANGLES)
+    s = 1j * angle / period
+    sampled = _sampled(controller, angle, period)
+    held = model(s) * np.sinc(angle / (2.0 * math.pi))
+    return float(np.sqrt(np.mean(np.abs(sampled / (1.0 + sampled * held)) ** 2)))
+
+
+def _sampled(controller: ControlLaw, angle: FloatArray, period: float) -> ComplexArray:
+    if not isinstance(controller, Controller):
+        return controller(1j * angle / period)
+    turn, past, present = filter_matrices(controller.tf, period)
+    z = np.exp(1j * angle)
+    drive = past + present * z[:, None]
+    state = np.linalg.solve(z[:, None, None] * np.eye(2) - turn, drive[:, :, None])[:, :, 0]
+    integral = controller.i * period * z / (z - 1.0)
+    return np.asarray(
+        controller.kc * (state[:, 0] + controller.td * state[:, 1]) + integral * state[:, 0]
+    )

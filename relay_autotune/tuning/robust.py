@@ -9,6 +9,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.search import NoiseLimit, Optimum, Search
+from relay_autotune.tuning.setpoint import with_setpoint_weight
 from relay_autotune.tuning.task import MS_RANGE, DesignOptions, DesignTask
 
 # PID has to lower the IAE at least this far to be worth its derivative.
@@ -48,10 +49,12 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
     bounds = Bounds(options.ms, options.largest_mt(task.model))
     search = Search(model, around, options.filter_ratio, _noise_limit(options))
     if options.controller == "auto":
-        return _chosen(search, bounds)
-    derivative = options.controller == "pid"
-    found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
-    return found.optimum.controller, _promise(found, search)
+        controller, reason = _chosen(search, bounds)
+    else:
+        derivative = options.controller == "pid"
+        found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
+        controller, reason = found.optimum.controller, _promise(found, search)
+    return with_setpoint_weight(controller, model, search.frequency), reason
 
 
 def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
