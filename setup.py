@@ -31,6 +31,7 @@ setup(
             "plant_node = relay_autotune.nodes.plant:main",
             "replay = relay_autotune.cli.replay:main",
             "identify = relay_autotune.cli.identify:main",
+            "tune = relay_autotune.cli.tune:main",
             "csv_to_bag = relay_autotune.cli.csv_to_bag:main",
             "report = relay_autotune.cli.report:main",
         ],

@@ -72,7 +72,7 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "limit_cycle": _limit_cycle(analysis),
         "models": [identification_fields(model) for model in analysis.models],
         "selected": analysis.selected,
-        "gains": [_gains(gains) for gains in analysis.gains],
+        "gains": [gains_fields(gains) for gains in analysis.gains],
         "recommended": analysis.recommended,
     }
 
@@ -140,7 +140,8 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
     }
 
 
-def _gains(gains: Gains) -> dict[str, Any]:
+def gains_fields(gains: Gains) -> dict[str, Any]:
+    """Return gains with what they do on the model as they appear in documents."""
     return {
         "rule": gains.rule,
         "form": gains.form,

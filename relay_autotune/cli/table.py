@@ -52,7 +52,7 @@ def _experiment(analysis: Analysis, which: str) -> list[str]:
         lines += ["", *identification_lines(analysis.model)]
         lines += _others(analysis)
     if analysis.best_gains is not None:
-        lines += ["", *_gains(analysis.best_gains)]
+        lines += ["", *gains_lines(analysis.best_gains)]
         lines += _other_gains(analysis)
     if analysis.reason:
         lines += ["", *_wrapped("gains" if analysis.models else "process", analysis.reason)]
@@ -159,7 +159,8 @@ def _other_gains(analysis: Analysis) -> list[str]:
     ]
 
 
-def _gains(gains: Gains) -> list[str]:
+def gains_lines(gains: Gains) -> list[str]:
+    """Return a controller with what it does on the model, as lines."""
     lines = [
         _line("gains", gains.rule),
         _line(

@@ -78,8 +78,9 @@ def simc(task: DesignTask) -> tuple[Controller, str]:
         kc = process.lag / (process.gain * total)
         ti = min(process.lag, 4.0 * total)
     ideal = SeriesForm(kc, ti, process.second, 0.0).isa()
-    reason = f"SIMC with tau_c = {closed:.4g} s, effective delay {process.delay:.4g} s" + (
-        ", as given" if given is not None else ""
+    reason = (
+        f"SIMC with tau_c = {closed:.4g} s{'' if given is None else ', as given,'} and an effective "
+        f"delay of {process.delay:.4g} s"
     )
     return controller(task, ideal.kc, ideal.ti, ideal.td), reason
 

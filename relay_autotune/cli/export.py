@@ -1,0 +1,200 @@
+"""Gains as files that other programs load: ros2_controllers' pid_controller, and plain YAML.
+
+`ros2 param load` reads a file with YAML, turns each value into text and reads that once more, so
+that a number must look like a floating-point number both times: `2` would arrive as an integer,
+`0.00001` as the text 1e-05, and the parameter would be refused.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from relay_autotune.errors import SelectionError
+from relay_autotune.tuning.gains import Gains
+
+FORMATS = ("pid_controller", "yaml")
+
+_DIGITS = 10
+_NAME = re.compile(r"[A-Za-z_]\w*\Z")
+_NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
+_GAINS = (
+    *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
+    *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
+)
+_UNITS = {
+    "kc": "u/y",
+    "ti": "s",
+    "td": "s",
+    "tf": "s",
+    "p": "u/y",
+    "i": "u/(y s)",
+    "d": "u s/y",
+    "phase_margin": "rad",
+    "delay_margin": "s",
+    "iae_load": "y s/u",
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where gains for pid_controller go.
+
+    :param node: name of the controller's node, with its namespace.
+    :param dof: name of the degree of freedom, a key of the parameter `gains`.
+    :param command_min: lower clamp of the command [u]; -inf: none.
+    :param command_max: upper clamp of the command [u]; inf: none.
+    :raises SelectionError: if a name cannot be that of a node or parameter, or a clamp is NaN or
+        above the other.
+    """
+
+    node: str = "/pid_controller"
+    dof: str = "joint"
+    command_min: float = -math.inf
+    command_max: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not _NODE.match(self.node):
+            raise SelectionError(f"{self.node!r} is no name of a node, such as /pid_controller")
+        if not all(_NAME.match(part) for part in self.dof.split("/")):
+            raise SelectionError(
+                f"{self.dof!r} is no name of a degree of freedom, such as heater or joint1"
+            )
+        if not self.command_min < self.command_max:
+            raise SelectionError(
+                f"the lower clamp {self.command_min:g} must be below the upper one, "
+                f"{self.command_max:g}"
+            )
+
+
+def exported(gains: Gains, how: str, target: Target) -> str:
+    """Return gains as the text of a file.
+
+    :param gains: what is to be loaded.
+    :param how: one of ``FORMATS``.
+    :param target: for pid_controller: where they go.
+    """
+    return pid_controller(gains, target) if how == "pid_controller" else plain(gains)
+
+
+def pid_controller(gains: Gains, target: Target) -> str:
+    """Return parameters of ros2_controllers' pid_controller for one degree of freedom.
+
+    The file holds one node, since `ros2 param load` applies every section to the node that it
+    is given, and no clamp that is infinite, which would arrive as text.
+
+    :param gains: what is to be loaded.
+    :param target: where they go.
+    """
+    values: dict[str, float | str] = {"p": gains.p, "i": gains.i, "d": gains.d}
+    for name, value in (
+        ("u_clamp_max", target.command_max),
+        ("u_clamp_min", target.command_min),
+    ):
+        if math.isfinite(value):
+            values[name] = value
+    if gains.ti > 0.0:
+        values["antiwindup_strategy"] = "back_calculation"
+        # What the controller would take for 0, of which the documentation has had two versions.
+        values["tracking_time_constant"] = (
+            math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
+        )
+    else:
+        values["antiwindup_strategy"] = "none"
+    lines = [
+        *_comments(gains, (*_lacking(gains), *_signed(gains))),
+        f"# ros2 param load {target.node} FILE",
+        f"{_key(target.node)}:",
+        "  ros__parameters:",
+        "    gains:",
+        f"      {_key(target.dof)}:",
+    ]
+    for name, setting in values.items():
+        lines.append(f"        {name}: {setting if isinstance(setting, str) else number(setting)}")
+    return "\n".join(lines) + "\n"
+
+
+def plain(gains: Gains) -> str:
+    """Return gains as lines of `key: value`, which is YAML."""
+    lines = [*_comments(gains, ()), f"rule: {gains.rule}", f"form: {gains.form}"]
+    for name in _GAINS:
+        value = getattr(gains, name)
+        unit = f"  # {_UNITS[name]}" if name in _UNITS else ""
+        lines.append(f"{name}: {number(value) if math.isfinite(value) else 'null'}{unit}")
+    lines.append(f"reason: {json.dumps(gains.reason, ensure_ascii=False)}")
+    return "\n".join(lines) + "\n"
+
+
+def number(value: float) -> str:
+    """Return a finite number so that YAML, and `ros2 param load` after it, reads a double.
+
+    :param value: rounded to ten digits, or to as many more as it takes.
+    """
+    rounded = float(f"{value:.{_DIGITS}g}")
+    text = repr(rounded if math.isfinite(rounded) else float(value))
+    while "." not in text:
+        # Only what has a point is a floating-point number in YAML 1.1: 1.0000000000000002e-05.
+        rounded = math.nextafter(rounded, math.copysign(math.inf, rounded))
+        text = repr(rounded)
+    return text
+
+
+def write(text: str, path: str | None) -> None:
+    """Write a file, or to standard output.
+
+    :param text: what it holds.
+    :param path: where; None: standard output.
+    :raises SelectionError: if it is there already, or cannot be written.
+    """
+    if path is None:
+        print(text, end="", flush=True)
+        return
+    try:
+        with Path(path).open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise SelectionError(f"{path} exists already, not overwriting it") from error
+    except OSError as error:
+        raise SelectionError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _key(name: str) -> str:
+    # YAML 1.1 reads these as truth values and as nothing.
+    special = name.lower() in ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
+    return f"'{name}'" if special else name
+
+
+def _comments(gains: Gains, more: Sequence[str]) -> list[str]:
+    told = (
+        f"Gains by the rule {gains.rule} of relay_autotune: Ms {gains.ms:.3g}, Mt {gains.mt:.3g}.",
+        f"ISA form: kc {gains.kc:.6g} u/y, ti {gains.ti:.6g} s, td {gains.td:.6g} s, "
+        f"tf {gains.tf:.6g} s, b {gains.b:g}.",
+        *more,
+    )
+    return [f"# {line}" for line in told]
+
+
+def _lacking(gains: Gains) -> list[str]:
+    """Say what of the controller pid_controller has not."""
+    found = []
+    if gains.tf > 0.0:
+        found.append(
+            f"The controller has no filter on the measurement: filter it by tf = {gains.tf:.6g} s "
+            "before, or the derivative will pass all noise."
+        )
+    if gains.b != 1.0:
+        found.append(
+            f"The controller has no set-point weight: b = {gains.b:g} was asked for; a step of "
+            "the set-point will overshoot more than predicted, so ramp it."
+        )
+    return found
+
+
+def _signed(gains: Gains) -> list[str]:
+    if gains.kc > 0.0:
+        return []
+    return ["All gains are negative, since a higher command lowers the measurement."]

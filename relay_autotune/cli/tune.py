@@ -1,0 +1,305 @@
+"""From a transfer function to gains: `tune --gain K --time-constants T --dead-time D`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
+from relay_autotune.errors import SelectionError, TuningError
+
+if TYPE_CHECKING:
+    from relay_autotune.models import TransferFunction
+    from relay_autotune.tuning import DesignOptions, DesignTask, Gains
+
+PROGRAM = "tune"
+
+_EPILOG = """\
+The model is given by flags or by a JSON document: one of `replay --json` or `identify --json`,
+or an object such as {"gain": 1.65, "time_constants": [20], "dead_time": 10}; - reads standard
+input.  Units: y of the measurement, u of the command, s.
+
+Results go to standard output, everything else to standard error.
+Exit status: 0 done; 1 the rule gives no gains; 2 the command line does not fit.
+
+Examples:
+  tune --gain 1.65 --time-constants 20 --dead-time 10
+  tune --gain 1.65 --time-constants 20 --dead-time 10 --table
+  tune --gain 0.8 --time-constants 25 3 --dead-time 1 --rule simc --lambda 5
+  tune --structure integrator_inverse --gain 0.547 --zeros -0.418 --time-constants 1.06 \\
+       --dead-time 0.1 --rule luyben2003 --pid --form series
+  tune --numerator 1 --denominator 10 7 1 --dead-time 2 --ms 1.6
+  replay --json bag | tune - --export pid_controller --dof heater > gains.yaml
+"""
+
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        say(PROGRAM, f"{message}; tune --help shows what it takes")
+        sys.exit(2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    :param arguments: those of the command line; default: the process's own.
+    :return: the exit status.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    # argparse takes -1e-3 for an option, but nothing that begins with a blank.
+    options = _parser().parse_args([f" {a}" if _NEGATIVE.match(a) else a for a in given])
+    return guarded(PROGRAM, lambda: _run(options))
+
+
+def _parser() -> argparse.ArgumentParser:
+    from relay_autotune.cli.export import FORMATS
+    from relay_autotune.tuning.forms import FORMS
+    from relay_autotune.tuning.task import CONTROLLERS
+
+    parser = _Parser(
+        prog=PROGRAM,
+        usage="%(prog)s [MODEL | flags of the model] [options]",
+        description="Compute controller gains from a model of the process.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "document", nargs="?", metavar="MODEL", help="JSON document with the model; -: from stdin"
+    )
+    parser.add_argument(
+        "--experiment", type=int, metavar="N", help="which experiment of a document, from 1"
+    )
+    model = parser.add_argument_group("the model, where no document is given")
+    number: dict[str, Any] = {"type": finite}
+    several: dict[str, Any] = {"type": finite, "nargs": "+"}
+    model.add_argument(
+        "--gain", **number, metavar="K", help="gain [y/u; y/(u s) if it integrates]"
+    )
+    model.add_argument("--time-constants", **several, metavar="T", help="T of (T s + 1) [s]")
+    model.add_argument("--dead-time", **number, metavar="S", help="dead time [s]")
+    model.add_argument(
+        "--zeros", **several, metavar="Z", help="Z of (Z s + 1) above; < 0: inverse response [s]"
+    )
+    model.add_argument("--integrators", type=int, metavar="N", help="number of poles at s = 0")
+    model.add_argument("--order", type=int, metavar="N", help="number of equal lags")
+    model.add_argument("--natural-frequency", **number, metavar="W", help="of a pair [rad/s]")
+    model.add_argument("--damping", **number, metavar="ZETA", help="of a pair")
+    model.add_argument("--structure", metavar="NAME", help="structure, such as unstable_fopdt")
+    model.add_argument("--numerator", **several, metavar="B", help="powers of s, highest first")
+    model.add_argument("--denominator", **several, metavar="A", help="powers of s, highest first")
+
+    asked = parser.add_argument_group("what is asked for")
+    asked.add_argument("--rule", metavar="NAME", help="the rule; --table shows them all")
+    asked.add_argument("--table", action="store_true", help="every rule, side by side")
+    kind = asked.add_mutually_exclusive_group()
+    kind.add_argument(
+        "--controller", choices=CONTROLLERS, help="auto is PI unless the rule finds PID worth it"
+    )
+    for each in ("pi", "pid"):
+        kind.add_argument(
+            f"--{each}",
+            dest="controller",
+            action="store_const",
+            const=each,
+            help=f"the same as --controller {each}",
+        )
+    asked.add_argument("--ms", **number, metavar="M", help="largest Ms, 1.2 to 4 (1.4)")
+    asked.add_argument(
+        "--mt", **number, metavar="M", help="largest Mt (1.4, of an integrating process 1.26)"
+    )
+    asked.add_argument(
+        "--sample-period", **number, metavar="S", help="period of the controller (0: continuous)"
+    )
+    asked.add_argument(
+        "--loop-delay", **number, metavar="S", help="dead time that the loop adds (0)"
+    )
+    asked.add_argument(
+        "--lambda",
+        dest="closed_loop_time",
+        **number,
+        metavar="S",
+        help="closed-loop time constant of imc, simc and unstable (the rule's own)",
+    )
+    asked.add_argument("--noise-std", **number, metavar="Y", help="measurement noise [y]")
+    asked.add_argument(
+        "--amplitude", **number, metavar="U", help="what a command may move, as the relay's [u]"
+    )
+    asked.add_argument(
+        "--noise-share", **number, metavar="R", help="noise in the command over --amplitude (0.1)"
+    )
+    asked.add_argument("--filter-ratio", **number, metavar="N", help="largest td/tf (10)")
+    asked.add_argument(
+        "--phase-peak", **number, metavar="DEG", help="phase peak of luyben2003 (-120)"
+    )
+    asked.add_argument("--resonance", **number, metavar="DB", help="resonance of luyben2003 (2)")
+
+    shown = parser.add_argument_group("how it is shown")
+    shown.add_argument("--form", choices=FORMS, default="isa", help="form of the gains (isa)")
+    shown.add_argument("--json", action="store_true", help="print a JSON document")
+    shown.add_argument("--export", choices=FORMATS, help="print a file to be loaded")
+    add_target(shown)
+    return parser
+
+
+def add_target(group: argparse._ArgumentGroup) -> None:
+    """Add the options that say where exported gains go.
+
+    :param group: of the command's parser.
+    """
+    group.add_argument("--output", metavar="FILE", help="write the export there, not to stdout")
+    group.add_argument(
+        "--node", default="/pid_controller", metavar="NAME", help="for the export (%(default)s)"
+    )
+    group.add_argument(
+        "--dof", default="joint", metavar="NAME", help="for the export (%(default)s)"
+    )
+    group.add_argument(
+        "--command-min", type=finite, metavar="U", help="for the export: lower clamp [u]"
+    )
+    group.add_argument(
+        "--command-max", type=finite, metavar="U", help="for the export: upper clamp [u]"
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    from relay_autotune.cli.tune_model import model_of
+    from relay_autotune.tuning import DEFAULT_RULE, RULES
+
+    if options.output is not None and options.export is None:
+        raise SelectionError("--output is for --export: say what to write")
+    if options.table and options.export is not None:
+        raise SelectionError("--export writes the gains of one rule: leave out --table")
+    rule = options.rule or DEFAULT_RULE
+    if rule not in RULES:
+        raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
+    task = _task(model_of(options), _asked(options))
+    if options.table:
+        return _side_by_side(task, rule, options)
+    return _one(task, rule, options)
+
+
+def _asked(options: argparse.Namespace) -> DesignOptions:
+    import math
+    from dataclasses import fields
+
+    from relay_autotune.tuning import DesignOptions
+
+    names = {f.name for f in fields(DesignOptions)}
+    given = {n: v for n, v in vars(options).items() if n in names and v is not None}
+    if "phase_peak" in given:
+        given["phase_peak"] = math.radians(given["phase_peak"])
+    try:
+        return DesignOptions(**given)
+    except TuningError as error:
+        raise SelectionError(str(error).replace("closed_loop_time", "lambda")) from error
+
+
+def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
+    """Return the task; what a record would tell beside the model is computed from the model."""
+    from relay_autotune.tuning import DesignTask
+    from relay_autotune.tuning.rules.applicability import is_first_order
+    from relay_autotune.tuning.rules.limit_cycle import describing_point_of
+    from relay_autotune.tuning.rules.step_response import two_point_fopdt
+
+    simple = None
+    if not is_first_order(model):
+        try:
+            simple = two_point_fopdt(model)
+        except TuningError:
+            # Rules for FOPDT will say that the model is none.
+            simple = None
+    return DesignTask(
+        model=model, options=asked, simple=simple, describing=describing_point_of(model)
+    )
+
+
+def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
+    from relay_autotune.cli.export import Target, exported, write
+    from relay_autotune.cli.table import gains_lines
+    from relay_autotune.cli.tune_table import form_lines, process_lines
+    from relay_autotune.tuning import design
+
+    gains = design(task, rule)
+    if options.export is not None:
+        write(exported(gains, options.export, target_of(options, Target)), options.output)
+    elif options.json:
+        _print_document(task, [gains], {}, 0, options.form)
+    else:
+        name, isa, *rest = gains_lines(gains)
+        form = form_lines(gains, options.form)
+        print("\n".join([*process_lines(task.model), name, isa, *form, *rest]))
+    return DONE
+
+
+def target_of(options: argparse.Namespace, target: Any) -> Any:
+    """Return where exported gains go, as the options say.
+
+    :param options: with those of :func:`add_target`.
+    :param target: the class :class:`~relay_autotune.cli.export.Target`.
+    """
+    limits = {n: getattr(options, n) for n in ("command_min", "command_max")}
+    given = {n: v for n, v in limits.items() if v is not None}
+    return target(node=options.node, dof=options.dof, **given)
+
+
+def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
+    from relay_autotune.cli.tune_table import process_lines, side_by_side
+    from relay_autotune.tuning import RULES, design
+
+    gains: list[Gains] = []
+    refused: dict[str, str] = {}
+    for name in sorted(RULES, key=lambda n: n != rule):
+        try:
+            gains.append(design(task, name))
+        except TuningError as error:
+            refused[name] = str(error)
+    recommended = 0 if gains and gains[0].rule == rule else None
+    if options.json:
+        _print_document(task, gains, refused, recommended, options.form)
+    else:
+        lines = side_by_side(gains, refused, recommended, options.form)
+        print("\n".join([*process_lines(task.model), *lines]))
+    if not gains:
+        say(PROGRAM, "no rule gives gains for this model")
+        return NOTHING_FOUND
+    return DONE
+
+
+def _print_document(
+    task: DesignTask,
+    gains: Sequence[Gains],
+    refused: dict[str, str],
+    recommended: int | None,
+    form: str,
+) -> None:
+    from relay_autotune.document import gains_fields, model_fields, to_json
+    from relay_autotune.tuning.forms import series_form
+
+    found = []
+    for each in gains:
+        fields = gains_fields(each)
+        if form == "series":
+            try:
+                series = series_form(each)
+                fields["series"] = dict(vars(series))
+            except TuningError as error:
+                if len(gains) == 1:
+                    raise
+                fields["series"] = {"reason": str(error)}
+        found.append(fields)
+    model = {"structure": task.model.structure, **model_fields(task.model)}
+    print(
+        to_json({"model": model, "gains": found, "recommended": recommended, "refused": refused}),
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""Exported gains arrive as the numbers they are, the way `ros2 param load` reads them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relay_autotune.cli import export
+from relay_autotune.cli.export import Target, number, pid_controller, plain
+from relay_autotune.errors import SelectionError
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning import Controller, Gains, Performance
+
+PERFORMANCE = Performance(
+    ms=1.4,
+    mt=1.0,
+    gain_margin=math.inf,
+    phase_margin=1.0,
+    delay_margin=20.0,
+    iae_load=31.0,
+)
+
+
+def gains(*values: float, **more: float) -> Gains:
+    reason = 'so "fast": it is'
+    return Gains.of("imc", Controller(*values, **more), PERFORMANCE, ms_95=1.41, reason=reason)
+
+
+def as_loaded(text: str, prefix: str = "") -> dict[str, object]:
+    """Read parameters the way rclpy does: YAML, then each value as text, then YAML again."""
+    (section,) = yaml.safe_load(text).values()
+
+    def flat(values: dict[str, object], before: str) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for name, value in values.items():
+            assert isinstance(name, str), f"the name {name!r} is no text"
+            if isinstance(value, dict):
+                found |= flat(value, f"{before}{name}.")
+            else:
+                found[before + name] = yaml.safe_load(str(value))
+        return found
+
+    return flat(section["ros__parameters"], prefix)
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_every_number_arrives_as_a_double(value):
+    text = number(value)
+    read = yaml.safe_load(text)
+    assert type(read) is float
+    again = yaml.safe_load(str(read))
+    assert type(again) is float
+    assert again == pytest.approx(value, rel=1e-9, abs=0.0)
+
+
+@pytest.mark.parametrize(
+    "value", [2.0, 1e-5, 1e16, 3e-5, -1e-7, 1e22, 0.00012, np.float64(1e-5), 0]
+)
+def test_the_numbers_that_are_known_to_fail_otherwise(value):
+    assert type(yaml.safe_load(str(yaml.safe_load(number(value))))) is float
+
+
+def test_what_pid_controller_gets():
+    text = pid_controller(gains(0.82, 59.9), Target("/oven/pid_controller", "heater", 0.0, 100.0))
+    assert list(yaml.safe_load(text)) == ["/oven/pid_controller"]
+    assert as_loaded(text) == {
+        "gains.heater.p": pytest.approx(0.82),
+        "gains.heater.i": pytest.approx(0.82 / 59.9),
+        "gains.heater.d": 0.0,
+        "gains.heater.u_clamp_max": 100.0,
+        "gains.heater.u_clamp_min": 0.0,
+        "gains.heater.antiwindup_strategy": "back_calculation",
+        "gains.heater.tracking_time_constant": pytest.approx(59.9),
+    }
+
+
+def test_infinite_clamps_are_left_out():
+    text = pid_controller(gains(0.82, 59.9), Target(command_max=5.0))
+    assert "inf" not in text
+    assert "gains.joint.u_clamp_min" not in as_loaded(text)
+    assert as_loaded(text)["gains.joint.u_clamp_max"] == 5.0
+
+
+def test_gains_without_integral_action_have_nothing_to_wind_up():
+    found = as_loaded(pid_controller(gains(0.5, 0.0), Target()))
+    assert found["gains.joint.antiwindup_strategy"] == "none"
+    assert found["gains.joint.i"] == 0.0
+    assert "gains.joint.tracking_time_constant" not in found
+
+
+def test_what_pid_controller_lacks_is_said_in_the_file():
+    text = pid_controller(gains(-2.0, 4.0, 1.0, 0.1, b=0.0), Target())
+    assert "no filter on the measurement: filter it by tf = 0.1 s" in text
+    assert "no set-point weight: b = 0" in text
+    assert "All gains are negative" in text
+    assert as_loaded(text)["gains.joint.tracking_time_constant"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("name", ["yes", "on", "null", "Off"])
+def test_a_name_that_yaml_has_other_plans_for(name):
+    assert f"gains.{name}.p" in as_loaded(pid_controller(gains(1.0, 1.0), Target(dof=name)))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"node": "pid controller"},
+        {"node": "/a//b"},
+        {"dof": "2nd"},
+        {"dof": "a: b"},
+        {"command_min": 3.0, "command_max": 3.0},
+        {"command_min": math.nan},
+    ],
+)
+def test_targets_that_cannot_be(wrong):
+    with pytest.raises(SelectionError):
+        Target(**wrong)
+
+
+def test_plain_lines():
+    found = yaml.safe_load(plain(gains(1e-5, 2.0)))
+    assert found["kc"] == pytest.approx(1e-5)
+    assert all(type(found[name]) is float for name in ("kc", "ti", "td", "p", "i", "d", "b", "ms"))
+    assert (found["rule"], found["form"]) == ("imc", "isa")
+    assert found["gain_margin"] is None
+    assert found["reason"] == 'so "fast": it is'
+
+
+def test_a_file_is_never_overwritten(tmp_path):
+    path = tmp_path / "gains.yaml"
+    export.write("a: 1.0\n", str(path))
+    assert path.read_text() == "a: 1.0\n"
+    with pytest.raises(SelectionError, match="not overwriting"):
+        export.write("a: 2.0\n", str(path))
+    with pytest.raises(SelectionError, match="cannot be written"):
+        export.write("a: 2.0\n", str(tmp_path / "none" / "gains.yaml"))
+
+
+def test_numbers_of_numpy_are_written_like_any_other():
+    model = TransferFunction.fopdt(1.0, 1.0, 1.0)
+    assert model.gain == 1.0
+    text = pid_controller(gains(np.float64(0.5), np.float64(2.0)), Target())
+    assert "float64" not in text

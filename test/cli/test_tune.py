@@ -1,0 +1,315 @@
+"""The command `tune`: a model in, gains out, and one line where there are none."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+
+import pytest
+import yaml
+
+from relay_autotune.cli import tune
+from relay_autotune.cli.tune_model import model_of
+from relay_autotune.document import model_fields
+from relay_autotune.models import TransferFunction
+from relay_autotune.tuning import RULES, DesignOptions, DesignTask, design
+
+FOPDT = "--gain 1.65 --time-constants 20 --dead-time 10"
+
+
+def run(capsys, *arguments: str) -> tuple[int, str, str]:
+    words = [word for part in arguments for word in part.split(" ")]
+    try:
+        status = tune.main(words)
+    except SystemExit as end:
+        status = int(end.code or 0)
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def document(capsys, *arguments: str) -> dict:
+    status, out, err = run(capsys, *arguments, "--json")
+    assert (status, err) == (0, "")
+    return json.loads(out)
+
+
+def test_gains_of_one_rule(capsys):
+    status, out, err = run(capsys, FOPDT, "--rule imc")
+    assert (status, err) == (0, "")
+    assert "kc 0.8913 u/y   ti 25.00 s" in out
+    assert "IMC with lambda = 17 s" in out
+    (found,) = document(capsys, FOPDT, "--rule imc")["gains"]
+    wanted = design(DesignTask(model=TransferFunction.fopdt(1.65, 20.0, 10.0)), "imc")
+    assert found["kc"] == wanted.kc
+    assert found["ms"] == wanted.ms
+    assert found["i"] == wanted.kc / wanted.ti
+    assert found["reason"] == wanted.reason
+
+
+def test_all_rules_side_by_side(capsys):
+    _, out, _ = run(capsys, FOPDT, "--table")
+    for name in RULES:
+        assert re.search(rf"^[ *]*{name} ", out, re.MULTILINE), name
+    assert max(len(line) for line in out.splitlines()) <= 99
+    found = document(capsys, FOPDT, "--table --rule simc")
+    assert found["gains"][found["recommended"]]["rule"] == "simc"
+    assert {g["rule"] for g in found["gains"]} | set(found["refused"]) == set(RULES)
+    assert "lag" in found["refused"]["lcmax"]
+    assert all(math.isfinite(g[name]) for g in found["gains"] for name in ("kc", "ti", "ms"))
+
+
+def test_what_is_asked_for_reaches_the_rules(capsys):
+    flags = (
+        "--pid --ms 1.7 --mt 1.3 --sample-period 0.5 --loop-delay 0.25 --noise-std 0.01 "
+        "--amplitude 2 --noise-share 0.2 --filter-ratio 8 --lambda 7 --phase-peak -130 "
+        "--resonance 3"
+    )
+    asked = DesignOptions(
+        controller="pid",
+        ms=1.7,
+        mt=1.3,
+        sample_period=0.5,
+        loop_delay=0.25,
+        noise_std=0.01,
+        amplitude=2.0,
+        noise_share=0.2,
+        filter_ratio=8.0,
+        closed_loop_time=7.0,
+        phase_peak=math.radians(-130.0),
+        resonance=3.0,
+    )
+    (found,) = document(capsys, FOPDT, flags, "--rule imc")["gains"]
+    wanted = design(
+        DesignTask(model=TransferFunction.fopdt(1.65, 20.0, 10.0), options=asked), "imc"
+    )
+    assert (found["kc"], found["td"], found["tf"]) == (wanted.kc, wanted.td, wanted.tf)
+    drum = (
+        "--structure integrator_inverse --gain 0.5 --zeros -0.4 --time-constants 1 --dead-time 1"
+    )
+    flags = "--phase-peak -130 --resonance 3"
+    (found,) = document(capsys, drum, flags, "--rule luyben2003")["gains"]
+    asked = DesignOptions(phase_peak=math.radians(-130.0), resonance=3.0)
+    model = TransferFunction.integrator_inverse(0.5, 0.4, 1.0, 1.0)
+    wanted = design(DesignTask(model=model, options=asked), "luyben2003")
+    assert (found["kc"], found["ti"]) == (wanted.kc, wanted.ti)
+
+
+@pytest.mark.parametrize(
+    ("flags", "model"),
+    [
+        (FOPDT, TransferFunction.fopdt(1.65, 20.0, 10.0)),
+        ("--gain -2 --time-constants 5 --order 4", TransferFunction.lag_n(-2.0, 5.0, 4, 0.0)),
+        (
+            "--gain 1 --time-constants 5 5 --zeros -1e-1 --dead-time 1",
+            TransferFunction.lag_n_zero(1.0, 5.0, 2, -0.1, 1.0),
+        ),
+        ("--gain 1 --time-constants 5 2", TransferFunction.sopdt(1.0, (5.0, 2.0), 0.0)),
+        (
+            "--gain 1 --natural-frequency 2 --damping 0.5 --dead-time 1",
+            TransferFunction.oscillator(1.0, 2.0, 0.5, 1.0),
+        ),
+        ("--gain 1 --integrators 1 --dead-time 2", TransferFunction.ipdt(1.0, 2.0)),
+        (
+            "--gain 1 --integrators 1 --time-constants 3",
+            TransferFunction.integrator_lag(1.0, 3.0, 0.0),
+        ),
+        (
+            "--gain 1 --integrators 1 --time-constants 3 --zeros -2 --dead-time 1",
+            TransferFunction.integrator_inverse(1.0, 2.0, 3.0, 1.0),
+        ),
+        (
+            "--structure unstable_fopdt --gain 2 --time-constants 3 --dead-time 1",
+            TransferFunction.unstable_fopdt(2.0, 3.0, 1.0),
+        ),
+        (
+            "--numerator 2 --denominator 3 -1 --dead-time 1",
+            TransferFunction.unstable_fopdt(2.0, 3.0, 1.0),
+        ),
+        (
+            "--gain 1 --time-constants 3 2 1 --dead-time 1",
+            TransferFunction.three_lags(1.0, (3.0, 2.0, 1.0), 1.0),
+        ),
+    ],
+)
+def test_models_by_flags(flags, model):
+    given = [f" {word}" if word.startswith("-") and word[1].isdigit() else word
+             for word in flags.split(" ")]  # fmt: skip
+    found = model_of(tune._parser().parse_args(given))
+    assert found.structure == model.structure
+    s = [0.1j, 0.3 + 0.5j, 2j]
+    assert found(s) == pytest.approx(model(s), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        TransferFunction.fopdt(-1.65, 20.0, 10.0),
+        TransferFunction.lag_n(1.0, 1.0, 20, 0.001),
+        TransferFunction.oscillator(1.0, 1.0, 0.4, 0.5),
+        TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+        TransferFunction.unstable_sopdt(1.0, 2.0, 0.2, 0.2),
+    ],
+)
+@pytest.mark.parametrize("how", ["replay", "identify", "tune", "stdin"])
+def test_models_by_document(model, how, tmp_path, monkeypatch):
+    """A model comes back exactly, many equal lags included."""
+    fields = {"structure": model.structure, **model_fields(model)}
+    found = {
+        "replay": {"bag": "b", "experiments": [{"models": [{}, fields], "selected": 1}]},
+        "identify": {"method": "chang", **fields},
+        "tune": {"model": fields, "gains": []},
+        "stdin": fields,
+    }[how]
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(found))
+    monkeypatch.setattr("sys.stdin", io.StringIO(path.read_text()))
+    options = tune._parser().parse_args(["-" if how == "stdin" else str(path)])
+    assert model_of(options) == model
+
+
+def test_people_may_write_a_document_too(tmp_path):
+    path = tmp_path / "model.json"
+    for text, model in (
+        (
+            '{"gain": 2, "time_constants": 3, "dead_time": 1}',
+            TransferFunction.fopdt(2.0, 3.0, 1.0),
+        ),
+        (
+            '{"structure": "unstable_fopdt", "gain": 2, "time_constants": [3], "dead_time": 1}',
+            TransferFunction.unstable_fopdt(2.0, 3.0, 1.0),
+        ),
+        ('{"numerator": [2], "denominator": [3, 1]}', TransferFunction.fopdt(2.0, 3.0, 0.0)),
+    ):
+        path.write_text(text)
+        assert model_of(tune._parser().parse_args([str(path)])) == model
+
+
+def test_forms(capsys):
+    flags = "--gain 1 --time-constants 10 3 --dead-time 1 --rule simc --pid"
+    _, out, _ = run(capsys, flags, "--form series")
+    (found,) = document(capsys, flags, "--form series")["gains"]
+    # SIMC is made in the series form: td is the second lag.
+    assert found["series"]["td"] == pytest.approx(3.0)
+    assert found["series"]["kc"] == pytest.approx(5.0)
+    assert "series form    kc 5.000 u/y   ti 8.000 s   td 3.000 s" in out
+    complex_zeros = "--gain 1 --time-constants 10 10 10 --rule robust --pid"
+    status, out, err = run(capsys, complex_zeros, "--form series")
+    assert (status, out) == (1, "")
+    assert "complex zeros" in err
+    for form in ("parallel", "series"):
+        status, out, _ = run(capsys, FOPDT, "--table --form", form)
+        assert status == 0
+
+
+def test_exports(capsys, tmp_path):
+    asked = "--rule imc --export"
+    _, out, _ = run(capsys, FOPDT, asked, "pid_controller --dof heater --command-max 100")
+    (section,) = yaml.safe_load(out).values()
+    assert section["ros__parameters"]["gains"]["heater"]["p"] == pytest.approx(0.8912655971)
+    _, out, _ = run(capsys, FOPDT, asked, "yaml")
+    assert yaml.safe_load(out)["ti"] == 25.0
+    path = str(tmp_path / "gains.yaml")
+    assert run(capsys, FOPDT, asked, "yaml --output", path) == (0, "", "")
+    status, _, err = run(capsys, FOPDT, asked, "yaml --output", path)
+    assert status == 2
+    assert "not overwriting" in err
+
+
+REFUSED = [
+    ("", 2, "no model: give --gain"),
+    ("--gain 0 --time-constants 1", 2, "gain of a transfer function must not be zero"),
+    ("--gain nan --time-constants 1", 2, "expected a finite number, found nan"),
+    ("--gain 1 --time-constants -20", 2, "time constant must be > 0 s, found -20"),
+    ("--gain 1 --time-constants 0", 2, "time constant must be > 0 s, found 0"),
+    ("--structure fopdt --gain 1 --time-constants -20", 2, "must be > 0 s, found -20"),
+    ("--gain 1 --time-constants 1 --dead-time -1", 2, "dead time must be >= 0 s, found -1"),
+    ("--gain 1", 2, "no dynamics"),
+    ("--time-constants 1", 2, "lacks its gain"),
+    ("--gain 1 --time-constants 1 2 --order 3", 2, "--order 3"),
+    ("--structure blob --gain 1", 2, "unknown structure 'blob'"),
+    ("--structure fopdt --gain 1 --time-constants 1 2", 2, "time_constants of length 1, found 2"),
+    ("--numerator 1", 2, "give both"),
+    ("--numerator 1 1 1 --denominator 1 1", 2, "at least as many poles as zeros"),
+    (FOPDT + " --rule thumb", 2, "unknown rule 'thumb'; known: "),
+    (FOPDT + " --ms 1.1", 2, "ms must be from 1.2 to 4, found 1.1"),
+    (FOPDT + " --ms inf", 2, "expected a finite number"),
+    (FOPDT + " --mt 0.9", 2, "mt must be above 1"),
+    (FOPDT + " --sample-period -1", 2, "sample_period must be >= 0 s"),
+    (FOPDT + " --lambda 0", 2, "lambda must be > 0 s"),
+    (FOPDT + " --pid --controller pi", 2, "not allowed with argument"),
+    (FOPDT + " --phase-peak -30", 2, "between -180 and -90"),
+    (FOPDT + " --output there", 2, "--output is for --export"),
+    (FOPDT + " --table --export yaml", 2, "leave out --table"),
+    (FOPDT + " --export pid_controller --dof 2nd", 2, "'2nd' is no name"),
+    (FOPDT + " there.json", 2, "given twice"),
+    ("there.json", 2, "there.json cannot be read: No such file"),
+    (FOPDT + " --rule lcmax", 1, "3 or more equal lags, found fopdt"),
+    (FOPDT + " --rule imc --lambda 1", 1, "unstable loop"),
+    (
+        "--structure unstable_fopdt --gain 1 --time-constants 1 --dead-time 2.5 --rule unstable",
+        1,
+        "2 is the limit",
+    ),
+]
+
+
+@pytest.mark.parametrize(("flags", "status", "said"), REFUSED)
+def test_refusals_are_one_line_and_no_gains(flags, status, said, capsys):
+    found = run(capsys, *([flags] if flags else []))
+    assert found[0] == status
+    assert found[1] == ""
+    assert said in found[2]
+    assert found[2].startswith("tune: ")
+    assert found[2].count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is no JSON document"),
+        ("[1]", "holds a JSON list"),
+        ("{}", "holds no model"),
+        ('{"gain": NaN, "time_constants": [1]}', "must be finite, found NaN"),
+        ('{"gain": "2", "time_constants": [1]}', "gain must be a number, found '2'"),
+        ('{"gain": 2, "time_constants": [true]}', "time_constants must be a number"),
+        ('{"gain": null, "time_constants": [1]}', "gain must be a number, found None"),
+        ('{"numerator": 1, "denominator": [1, 1]}', "numerator must be a list"),
+        ('{"experiments": []}', "no experiment with a model"),
+        ('{"experiments": [{"selected": null, "models": []}]}', "no experiment with a model"),
+    ],
+)
+def test_documents_that_hold_no_model(text, said, tmp_path, capsys):
+    path = tmp_path / "model.json"
+    path.write_text(text)
+    status, out, err = run(capsys, str(path))
+    assert (status, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_of_several_experiments_one_is_chosen(tmp_path, capsys):
+    fields = [
+        model_fields(TransferFunction.fopdt(k, 20.0, 10.0)) | {"structure": "fopdt"}
+        for k in (1, 2)
+    ]
+    path = tmp_path / "two.json"
+    path.write_text(
+        json.dumps({"experiments": [{"models": [each], "selected": 0} for each in fields]})
+    )
+    status, _, err = run(capsys, str(path))
+    assert status == 2
+    assert "--experiment" in err
+    found = document(capsys, str(path), "--experiment 2 --rule imc")
+    assert found["model"]["gain"] == 2.0
+    status, _, err = run(capsys, str(path), "--experiment 3")
+    assert (status, "has 2 experiments" in err) == (2, True)
+
+
+def test_help_names_every_option_and_fits(capsys):
+    status, out, _ = run(capsys, "--help")
+    assert status == 0
+    assert "Examples:" in out
+    for flag in ("--rule", "--table", "--pid", "--form", "--export", "--lambda", "--loop-delay"):
+        assert flag in out
