@@ -21,10 +21,8 @@ from relay_autotune.tuning.responses import step_responses
 from relay_autotune.tuning.stability import closed_loop_unstable_poles, winding
 from relay_autotune.ultimate import ultimate_point
 
-control = pytest.importorskip("control")
 
-
-def _rational(controller: Controller, model: TransferFunction):
+def _rational(control, controller: Controller, model: TransferFunction):
     """Return controller and process of python-control, which knows no dead time."""
     bottom = np.array([0.5 * controller.tf**2, controller.tf, 1.0])
     c = control.tf(
@@ -32,6 +30,11 @@ def _rational(controller: Controller, model: TransferFunction):
         np.append(controller.ti * bottom, 0.0),
     )
     return c, control.tf(model.numerator, model.denominator)
+
+
+@pytest.fixture(name="control")
+def _control():
+    return pytest.importorskip("control")
 
 
 RATIONAL = [
@@ -44,8 +47,8 @@ RATIONAL = [
 
 
 @pytest.mark.parametrize(("controller", "model"), RATIONAL)
-def test_margins_agree_with_python_control(controller, model):
-    c, g = _rational(controller, model)
+def test_margins_agree_with_python_control(control, controller, model):
+    c, g = _rational(control, controller, model)
     found = analyse_loop(controller, model)
     w = np.geomspace(1e-3, 1e3, 400_001)
     loop = (c * g)(1j * w)
@@ -60,9 +63,9 @@ def test_margins_agree_with_python_control(controller, model):
 
 
 @pytest.mark.parametrize(("controller", "model"), RATIONAL)
-def test_responses_agree_with_scipy(controller, model):
+def test_responses_agree_with_scipy(control, controller, model):
     weighted = Controller(controller.kc, controller.ti, controller.td, controller.tf, 0.4)
-    c, g = _rational(weighted, model)
+    c, g = _rational(control, weighted, model)
     f = control.tf([weighted.kc * 0.4 * weighted.ti, weighted.kc], [weighted.ti, 0.0])
     for response, measurement, command in zip(
         step_responses(weighted, model, 120.0, 1 << 14),
@@ -78,10 +81,10 @@ def test_responses_agree_with_scipy(controller, model):
             assert np.abs(values - expected)[3:].max() < 2e-3 * np.abs(expected).max()
 
 
-def test_figures_of_the_set_point_response_are_those_of_scipy():
+def test_figures_of_the_set_point_response_are_those_of_scipy(control):
     controller, model = RATIONAL[0]
     found = analyse_loop(controller, model)
-    c, g = _rational(controller, model)
+    c, g = _rational(control, controller, model)
     f = control.tf([controller.kc * controller.ti, controller.kc], [controller.ti, 0.0])
     of = control.minreal(g * f / (1 + c * g), 1e-6, verbose=False)
     time = np.linspace(0.0, 60.0, 60_001)
