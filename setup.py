@@ -29,6 +29,7 @@ setup(
             "relay_node = relay_autotune.nodes.relay:main",
             "identifier_node = relay_autotune.nodes.identifier:main",
             "plant_node = relay_autotune.nodes.plant:main",
+            "controller_node = relay_autotune.nodes.controller:main",
             "replay = relay_autotune.cli.replay:main",
             "identify = relay_autotune.cli.identify:main",
             "tune = relay_autotune.cli.tune:main",

@@ -86,6 +86,7 @@ class Executor(SingleThreadedExecutor):
         error = handler.exception()
         if error is not None:
             raise error
-        if entity is self._favoured:
+        # A task has no entity, and a node may have no favourite.
+        if entity is not None and entity is self._favoured:
             self._flowing = True
         return True

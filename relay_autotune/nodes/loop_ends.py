@@ -11,7 +11,7 @@ from typing import Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from std_msgs.msg import Float64
+from std_msgs.msg import Bool, Float64
 
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.ends import Ends
@@ -54,6 +54,8 @@ class LoopEnds:
         self._follow: FollowWatch | None = None
         self._own: deque[float] = deque(maxlen=_OWN_KEPT)
         self._guard = Guard(node, stop)
+        self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
+        self._hold.publish(Bool(data=False))
         self._topic = ends.command.topic_name
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
         if takeover:
@@ -149,6 +151,7 @@ class LoopEnds:
                 )
             )
         self._guard.begin(checks)
+        self._hold.publish(Bool(data=True))
 
     def _tolerance(self, experiment: RelayExperiment) -> float:
         given = float(self._value("feedback_tolerance"))
@@ -161,6 +164,7 @@ class LoopEnds:
         :param command: what the actuator has now [u].
         """
         self._guard.end()
+        self._hold.publish(Bool(data=False))
         self._experiment, self._follow = None, None
         period = experiment.cycles[-1].period if experiment.cycle_count else 0.0
         left = math.nan if self._gives_back else command

@@ -1,0 +1,329 @@
+"""controller_node: a PI or PID controller that takes new gains when it is told to."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.parameter import Parameter
+from std_msgs.msg import Bool, Float64
+from std_srvs.srv import SetBool, Trigger
+
+from relay_autotune.errors import ParameterError, RelayAutotuneError
+from relay_autotune.messages import transfer_function_from_message
+from relay_autotune.models import TransferFunction
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS
+from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
+from relay_autotune.nodes.verifier import NotVerifiable, Verifier
+from relay_autotune.pid import Limits, PidController
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.verification import Step
+from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.msg import PidGains
+from relay_autotune_msgs.msg import TransferFunction as ModelMessage
+
+
+class ControllerNode(ServedNode):
+    """Answers each measurement with a command.
+
+    New gains wait until they are applied, and the ones before are kept for ``~/revert``. While a
+    tune runs (``hold_request``), it tracks ``command``, so that it goes on from there.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("controller_node")
+        declare(self, (*GAINS, *OTHERS))
+        declare(self, FIXED, read_only=True)
+        values = values_of(self, (*GAINS, *OTHERS, *FIXED))
+        self._gains = gains_from(values)
+        self._pending: Any = None
+        self._previous: Controller | None = None
+        self._previous_remote: dict[str, float] | None = None
+        self._model: TransferFunction | None = None
+        self._limits = limits_from(values)
+        self._pid = PidController(
+            self._gains,
+            values["initial_command"],
+            limits=self._limits,
+            automatic=not values["manual"],
+        )
+        self._setpoint: float = values["initial_setpoint"]
+        self._period: float = values["sample_period"]
+        self._simulated = bool(self.get_parameter("use_sim_time").value)
+        self._count = 0
+        self._held = False
+        self._message = Float64()
+        self._remote: RemoteGains | None = None
+        if values["apply_to"]:
+            mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
+            self._remote = RemoteGains(self, values["apply_to"], mapping)
+        reader = reader_of(values["measurement_type"], values["measurement_field"])
+        self._value, self._stamp = reader.value, reader.stamp_ns
+        self._commands = self.create_publisher(
+            Float64,
+            "controller_command",
+            quality.COMMAND,
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+        )
+        measurement = self.create_subscription(
+            reader.kind, "measurement", self._on_measurement, quality.MEASUREMENT
+        )
+        if not self._simulated:
+            self.favoured = measurement
+        self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
+        self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
+        self.create_subscription(Bool, "hold_request", self._on_hold, quality.RESULT)
+        self.create_subscription(PidGains, "pi_gains", self._on_gains, quality.RESULT)
+        self.create_subscription(ModelMessage, "transfer_function", self._on_model, quality.RESULT)
+        self.create_service(Trigger, "~/apply", self._on_apply)
+        self.create_service(Trigger, "~/discard", self._on_discard)
+        self.create_service(Trigger, "~/revert", self._on_revert)
+        self.create_service(SetBool, "~/automatic", self._on_automatic)
+        self._verifier = Verifier(
+            self, self._ready_to_verify, self._steps_of, self._after_verification
+        )
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self._after_set)
+        self.get_logger().info(
+            f"ready: {said(self._gains)}, "
+            f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
+            f"commands go to {self._commands.topic_name}"
+        )
+
+    # The loop.
+
+    def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
+        if self._remote is not None:
+            return
+        value = self._value(message)
+        if math.isnan(self._setpoint) and math.isfinite(value):
+            self._setpoint = value
+        if self._period > 0.0:
+            at = self._count * self._period
+            self._count += 1
+        elif self._simulated:
+            at = self.get_clock().now().nanoseconds * 1e-9
+        elif self._stamp is not None:
+            at = self._stamp(message) * 1e-9
+        else:
+            at = (info["source_timestamp"] or time.time_ns()) * 1e-9
+        command = self._pid.step(at, self._setpoint + self._verifier.offset, value)
+        self._message.data = self._limits.clip(command + self._verifier.load)
+        self._commands.publish(self._message)
+        if math.isfinite(value):
+            self._verifier.sample(at, value, command)
+
+    def _on_setpoint(self, message: Float64) -> None:
+        if math.isfinite(message.data):
+            self._setpoint = message.data
+
+    def _on_command(self, message: Float64) -> None:
+        if self._held and math.isfinite(message.data):
+            self._pid.track(message.data)
+
+    def _on_hold(self, message: Bool) -> None:
+        self._held = message.data
+        if self._held:
+            self._verifier.interrupt("a tune has begun")
+
+    def _on_automatic(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        self._pid.switch(automatic=request.data)
+        response.success = self._pid.is_automatic == request.data
+        response.message = (
+            ("automatic" if request.data else f"manual: {self._pid.command:g} is held")
+            if response.success
+            else "there are no gains yet: the command is held"
+        )
+        return response
+
+    # Gains.
+
+    def _on_gains(self, message: Any) -> None:
+        if not message.final:
+            return
+        try:
+            controller_from(message)
+        except RelayAutotuneError as error:
+            self.get_logger().error(f"gains that cannot be: {error}")
+            return
+        self._pending = message
+        if self.get_parameter("auto_apply").value:
+            self.executor.create_task(self._apply_and_tell)
+        else:
+            self.get_logger().info(
+                f"gains of {message.experiment_id} wait: {said(controller_from(message))}; call "
+                f"{self.get_fully_qualified_name()}/apply or /discard"
+            )
+
+    def _on_model(self, message: Any) -> None:
+        if message.final:
+            try:
+                self._model = transfer_function_from_message(message)
+            except RelayAutotuneError as error:
+                self.get_logger().error(f"a model that cannot be: {error}")
+
+    async def _apply_and_tell(self) -> None:
+        done, reason = await self._apply()
+        (self.get_logger().info if done else self.get_logger().error)(reason)
+
+    async def _apply(self) -> tuple[bool, str]:
+        message = self._pending
+        if message is None:
+            return False, "no gains wait to be applied"
+        if self._verifier.is_running:
+            return False, "a verification is running; wait for its end"
+        if self._remote is not None:
+            try:
+                self._previous_remote = await self._remote.write(message)
+            except RelayAutotuneError as error:
+                return False, str(error)
+            self._pending = None
+            return True, f"{self._remote.target} has the gains of {message.experiment_id}"
+        self._previous, self._gains = self._gains, controller_from(message)
+        self._pending = None
+        self._pid.use(self._gains)
+        return True, f"{said(self._gains)} in force; the gains before are kept for ~/revert"
+
+    async def _on_apply(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = await self._apply()
+        return response
+
+    def _on_discard(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._pending is not None
+        response.message = "discarded" if self._pending is not None else "no gains wait"
+        self._pending = None
+        return response
+
+    async def _on_revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._remote is not None:
+            if self._previous_remote is None:
+                response.message = "nothing was applied"
+                return response
+            try:
+                await self._remote.restore(self._previous_remote)
+            except RelayAutotuneError as error:
+                response.message = str(error)
+                return response
+            self._previous_remote = None
+            response.success = True
+            response.message = f"{self._remote.target} has its gains of before"
+            return response
+        response.success, response.message = self._revert()
+        return response
+
+    def _revert(self) -> tuple[bool, str]:
+        if self._previous is None and self._gains is None:
+            return False, "there are no gains before these"
+        self._gains, self._previous = self._previous, self._gains
+        self._pid.use(self._gains)
+        return True, f"{said(self._gains)} in force again"
+
+    # Proof.
+
+    def _ready_to_verify(self) -> tuple[Controller, TransferFunction, Limits]:
+        if self._remote is not None:
+            raise NotVerifiable(f"{self._remote.target} controls, not this node")
+        if self._held:
+            raise NotVerifiable("a tune is running")
+        if self._gains is None or not self._pid.is_automatic:
+            raise NotVerifiable("the controller is not in automatic, or has no gains")
+        if self._model is None:
+            raise NotVerifiable("no model has come that could predict anything")
+        return self._gains, self._model, self._limits
+
+    def _steps_of(self, request: Verify.Goal) -> list[Step]:
+        height = request.setpoint_step or self.get_parameter("verify_step").value
+        allowed = self.get_parameter("verify_load_max").value
+        if not (math.isfinite(height) and math.isfinite(request.load_step)):
+            raise NotVerifiable("a step must be finite")
+        if height == 0.0 and request.load_step == 0.0:
+            raise NotVerifiable(
+                "no step is given: set setpoint_step, or the parameter verify_step"
+            )
+        if abs(request.load_step) > allowed:
+            raise NotVerifiable(
+                f"load_step is {request.load_step:g}, verify_load_max allows {allowed:g}"
+            )
+        steps = [Step(setpoint=height)] if height else []
+        return steps + ([Step(load=request.load_step)] if request.load_step else [])
+
+    def _after_verification(self, passed: bool, reason: str) -> str:
+        if not passed and self._previous is not None:
+            reason = f"{reason}; {self._revert()[1]}"
+        self.get_logger().info(f"verification {'passed' if passed else 'failed'}: {reason}")
+        return reason
+
+    # Parameters.
+
+    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            values = merged(self, (*GAINS, *OTHERS), changes)
+            gains_from(values)
+            limits_from(values)
+            if self._verifier.is_running:
+                raise ParameterError("parameters stay as they are while a verification runs")
+        except RelayAutotuneError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _after_set(self, changes: list[Parameter]) -> None:
+        names = {change.name for change in changes}
+        values = values_of(self, (*GAINS, *OTHERS))
+        if names & {entry.name for entry in GAINS}:
+            self._previous, self._gains = self._gains, gains_from(values)
+            self._pid.use(self._gains)
+        if names & {"command_min", "command_max"}:
+            self._limits = limits_from(values)
+            self._pid.limit(self._limits)
+
+
+def gains_from(values: dict[str, Any]) -> Controller | None:
+    """Return the gains that the parameters give, None if there are none.
+
+    :param values: the parameters by name.
+    :raises RelayAutotuneError: if they cannot be.
+    """
+    if values["kc"] == 0.0:
+        return None
+    return Controller(**{name: values[name] for name in ("kc", "ti", "td", "tf", "b")})
+
+
+def controller_from(message: Any) -> Controller:
+    """Return the gains of a message.
+
+    :param message: the `PidGains`.
+    :raises RelayAutotuneError: if they cannot be.
+    """
+    return Controller(
+        **{name: float(getattr(message, name)) for name in ("kc", "ti", "td", "tf", "b")}
+    )
+
+
+def limits_from(values: dict[str, Any]) -> Limits:
+    """Return the range of the command.
+
+    :param values: the parameters by name.
+    :raises RelayAutotuneError: if they leave none.
+    """
+    return Limits(values["command_min"], values["command_max"])
+
+
+def said(gains: Controller | None) -> str:
+    """Return gains in words."""
+    if gains is None:
+        return "no gains"
+    return f"kc {gains.kc:.6g}, ti {gains.ti:.6g} s, td {gains.td:.6g} s"
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run controller_node."""
+    return run(ControllerNode, "controller_node", args)

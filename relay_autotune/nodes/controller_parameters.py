@@ -1,0 +1,80 @@
+"""The parameters of controller_node."""
+
+from __future__ import annotations
+
+import math
+
+from relay_autotune.nodes.live_types import FLOAT64
+from relay_autotune.nodes.parameters import NodeParameter
+
+GAINS = (
+    NodeParameter(
+        "kc",
+        0.0,
+        "u/y",
+        "Proportional gain, with the sign of the process; 0: no gains yet, the command is held.",
+    ),
+    NodeParameter("ti", 0.0, "s", "Integral time; 0: no integral action.", 0.0),
+    NodeParameter("td", 0.0, "s", "Derivative time.", 0.0),
+    NodeParameter("tf", 0.0, "s", "Time constant of the filter on the measurement.", 0.0),
+    NodeParameter("b", 1.0, "", "Weight of the set-point in the proportional part.", 0.0, 1.0),
+)
+OTHERS = (
+    NodeParameter("command_min", -math.inf, "u", "Lowest command."),
+    NodeParameter("command_max", math.inf, "u", "Highest command."),
+    NodeParameter(
+        "auto_apply",
+        False,
+        "",
+        "True: gains that come are put in force at once; false: only when ~/apply is called.",
+    ),
+    NodeParameter(
+        "verify_step",
+        0.0,
+        "y",
+        "Height of the set-point step of ~/verify, where the request gives none.",
+    ),
+    NodeParameter(
+        "verify_load_max",
+        0.0,
+        "u",
+        "Largest load step that ~/verify may add to the command; 0: none is allowed.",
+        0.0,
+    ),
+)
+FIXED = (
+    NodeParameter(
+        "initial_setpoint",
+        math.nan,
+        "y",
+        "Set-point until one comes; NaN: the first measurement.",
+    ),
+    NodeParameter("initial_command", 0.0, "u", "Command from which it starts."),
+    NodeParameter("manual", False, "", "True: it starts in manual, holding initial_command."),
+    NodeParameter(
+        "sample_period",
+        0.0,
+        "s",
+        "Period of the samples where they carry no time; 0: stamps.",
+        0.0,
+    ),
+    NodeParameter(
+        "measurement_type", FLOAT64, "", "Message type of the measurement, as in relay_node."
+    ),
+    NodeParameter("measurement_field", "data", "", "Path of the measurement in it."),
+    NodeParameter(
+        "apply_to",
+        "",
+        "",
+        "Name of a node that shall get the gains by its parameters, such as /pid_controller; "
+        "empty: this node controls.",
+    ),
+    NodeParameter(
+        "apply_parameters",
+        "p:p,i:i,d:d",
+        "",
+        "Which gain goes into which of that node's parameters, separated by commas, such as "
+        "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d.",
+    ),
+)
+PARAMETERS = (*GAINS, *OTHERS, *FIXED)

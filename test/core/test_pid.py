@@ -1,0 +1,170 @@
+"""The controller that runs, and the proof of its gains."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fopdt_plant import FopdtPlant
+from scipy.integrate import solve_ivp
+
+from relay_autotune.errors import TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.pid import Limits, PidController, run_loop
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.verification import Step, compare, describe, plan
+
+GAINS = Controller(kc=1.2, ti=2.0)
+PROCESS = TransferFunction.from_structure("fopdt", gain=1.5, time_constants=[2.0], dead_time=0.4)
+
+
+def closed_loop(controller, plant, period, steps, *, setpoint=1.0, load=0.0, start=0):
+    measurement, commands, command = [], [], controller.command
+    for k in range(start, start + steps):
+        y = plant.advance(k * period, command + load)
+        command = controller.step(k * period, setpoint, y)
+        measurement.append(y)
+        commands.append(command)
+    return np.array(measurement), np.array(commands)
+
+
+def test_a_pid_with_filter_follows_the_continuous_law():
+    gains = Controller(kc=2.0, ti=1.5, td=0.3, tf=0.1, b=0.6)
+    period, t = 1e-3, np.arange(3000) * 1e-3
+    y = 0.3 * np.sin(2.0 * t)
+    controller = PidController(gains, 0.0)
+    controller.step(-period, 0.0, 0.0)
+    ours = [controller.step(float(s), 1.0, float(v)) for s, v in zip(t, y, strict=True)]
+
+    def motion(time, state):
+        value, slope = state[:2]
+        acceleration = (0.3 * math.sin(2.0 * time) - value - 0.1 * slope) * 2.0 / 0.1**2
+        return [slope, acceleration, 1.0 - value]
+
+    exact = solve_ivp(motion, (0.0, t[-1]), [0.0, 0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-10).y
+    truth = 2.0 * (0.6 - exact[0] + exact[2] / 1.5 - 0.3 * exact[1])
+    assert np.abs(np.array(ours) - truth)[5:].max() < 5e-3
+
+
+def test_it_brings_the_process_to_the_set_point_and_bears_a_load():
+    controller = PidController(GAINS, 0.0)
+    plant = FopdtPlant(1.5, 2.0, 0.4)
+    y, _ = closed_loop(controller, plant, 0.05, 600)
+    assert y[-1] == pytest.approx(1.0, abs=1e-3)
+    y, u = closed_loop(controller, plant, 0.05, 800, load=0.5, start=600)
+    assert y[-1] == pytest.approx(1.0, abs=1e-3)
+    assert u[-1] == pytest.approx(1.0 / 1.5 - 0.5, abs=1e-3)
+
+
+def test_new_gains_and_the_way_to_automatic_make_no_bump():
+    controller = PidController(GAINS, 0.0)
+    plant = FopdtPlant(1.5, 2.0, 0.4)
+    _, before = closed_loop(controller, plant, 0.05, 30)
+    controller.use(Controller(kc=0.3, ti=5.0, td=0.2, tf=0.02))
+    _, after = closed_loop(controller, plant, 0.05, 2, start=30)
+    assert after[0] == before[-1]
+    controller.switch(automatic=False)
+    _, held = closed_loop(controller, plant, 0.05, 50, start=32)
+    assert set(held) == {after[-1]}
+    controller.track(0.9)
+    controller.switch(automatic=True)
+    _, again = closed_loop(controller, plant, 0.05, 2, start=82)
+    assert again[0] == 0.9
+    assert abs(again[1] - 0.9) < 0.05
+
+
+def test_the_integral_does_not_wind_up_at_a_limit():
+    limits = Limits(-0.2, 0.4)
+    controller = PidController(GAINS, 0.0, limits=limits)
+    plant = FopdtPlant(1.5, 2.0, 0.4)
+    # Out of reach for long.
+    y, u = closed_loop(controller, plant, 0.05, 1000)
+    assert u.max() == 0.4
+    assert y[-1] == pytest.approx(0.6, abs=1e-3)
+    # Back within reach it leaves the limit at once.
+    _, u = closed_loop(controller, plant, 0.05, 40, setpoint=0.3, start=1000)
+    assert np.flatnonzero(u < 0.4)[0] <= 1
+
+
+def test_a_sample_that_is_no_number_is_passed_over():
+    controller = PidController(GAINS, 0.3)
+    controller.step(0.0, 1.0, 0.0)
+    before = controller.step(0.1, 1.0, 0.0)
+    assert controller.step(0.2, 1.0, math.nan) == before
+    assert controller.step(0.3, math.inf, 0.0) == before
+    assert math.isfinite(controller.step(0.4, 1.0, 0.1))
+
+
+def test_without_gains_it_holds():
+    controller = PidController(None, 0.7)
+    assert {controller.step(0.1 * k, 1.0, 0.0) for k in range(9)} == {0.7}
+    assert not controller.is_automatic
+
+
+def test_jitter_changes_little():
+    rng = np.random.default_rng(3)
+    steady = np.arange(400) * 0.05
+    shaken = steady + np.append(0.0, rng.uniform(0.0, 0.02, 399))
+    gains = Controller(kc=1.2, ti=2.0, td=0.1, tf=0.05)
+    exact = run_loop(gains, PROCESS, steady, setpoint=1.0)
+    other = run_loop(gains, PROCESS, shaken, setpoint=1.0)
+    at = np.interp(steady, shaken, other.measurement)
+    assert np.abs(at - exact.measurement).max() < 0.03
+
+
+# Proof.
+
+
+def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
+    wanted = plan(gains, PROCESS, step, period, noise_std)
+    time = np.arange(int(wanted.duration / period)) * period
+    run = run_loop(gains, process, time, setpoint=step.setpoint, load=step.load)
+    noise = noise_std * np.random.default_rng(4).standard_normal(time.size)
+    return time, run.measurement + noise
+
+
+@pytest.mark.parametrize("step", [Step(setpoint=0.5), Step(setpoint=-0.2), Step(load=0.4)])
+@pytest.mark.parametrize("noise_std", [0.0, 0.01])
+def test_the_process_itself_passes(step, noise_std):
+    time, y = measured(PROCESS, step, noise_std)
+    found = compare(GAINS, PROCESS, step, time, y, noise_std=noise_std)
+    assert found.passed, found.reason
+    assert found.gain_ratio == pytest.approx(1.0, abs=0.05)
+    assert found.fit > 0.8
+
+
+@pytest.mark.parametrize("step", [Step(setpoint=0.5), Step(load=0.4)])
+@pytest.mark.parametrize("factor", [0.4, 2.2])
+def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
+    time, y = measured(replace(PROCESS, gain=factor * PROCESS.gain), step)
+    found = compare(GAINS, PROCESS, step, time, y)
+    assert not found.passed
+    assert found.gain_ratio == pytest.approx(factor, rel=0.05)
+    assert "another gain than the model" in found.reason
+    assert f"{found.gain_ratio:.2f} times the model's" in found.reason
+
+
+def test_a_longer_dead_time_fails():
+    slow = replace(PROCESS, dead_time=1.6)
+    time, y = measured(slow, Step(setpoint=0.5))
+    assert not compare(GAINS, PROCESS, Step(setpoint=0.5), time, y).passed
+
+
+def test_a_step_is_described_as_it_is():
+    time = np.arange(0.0, 10.0, 0.01)
+    # 1 - exp(-t/2) (cos 3 t): overshoot from its closed form at the extremum.
+    y = 1.0 - np.exp(-0.5 * time) * np.cos(3.0 * time)
+    found = describe(time, 2.0 * y, Step(setpoint=2.0))
+    peak = (math.pi - math.atan(0.5 / 3.0)) / 3.0
+    assert found.overshoot == pytest.approx(
+        -math.exp(-0.5 * peak) * math.cos(3.0 * peak), abs=1e-4
+    )
+    assert 5.0 < found.settling_time < 6.2
+    assert found.largest == pytest.approx(2.0 + 2.0 * found.overshoot)
+
+
+def test_gains_that_are_unstable_on_the_model_are_not_tried():
+    with pytest.raises(TuningError, match="unstable loop"):
+        plan(Controller(kc=20.0, ti=1.0), PROCESS, Step(setpoint=1.0), 0.05)

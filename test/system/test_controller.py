@@ -1,0 +1,189 @@
+"""The whole way over DDS: controller, tune, gains when told, proof, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatus
+from loop_rig import LATCHED, RELIABLE, Rig
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters
+from rclpy.action import ActionClient
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
+
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
+
+PLANT = {
+    "mode": "clock",
+    "speed": 4.0,
+    "sample_period": 0.02,
+    "structure": "fopdt",
+    "gain": 2.0,
+    "time_constants": [0.8],
+    "dead_time": 0.4,
+    "operating_point": [5.0, 1.0],
+    "noise_std": 0.002,
+    "seed": 5,
+}
+CONTROLLER = {
+    "use_sim_time": True,
+    "kc": 0.3,
+    "ti": 0.8,
+    "initial_command": 1.0,
+    "initial_setpoint": 5.0,
+}
+
+
+def trigger(rig: Rig, name: str) -> Any:
+    return rig.call(Trigger, f"controller_node/{name}", Trigger.Request())
+
+
+def verify(rig: Rig, **request: float) -> tuple[int, Any]:
+    client = ActionClient(rig.node, Verify, "controller_node/verify")
+    rig.until(client.server_is_ready, "the action")
+    sent = client.send_goal_async(Verify.Goal(**request))
+    rig.until(sent.done, "the goal")
+    answer = sent.result().get_result_async()
+    rig.until(answer.done, "the result")
+    client.destroy()
+    return answer.result().status, answer.result().result
+
+
+def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -> None:
+    commands = rig.listen("command", Float64, RELIABLE)
+    wanted = rig.listen("controller_command", Float64, RELIABLE)
+    measured = rig.listen("measurement", Float64, RELIABLE)
+    gains = rig.listen("pi_gains", PidGains)
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    rig.plant(**PLANT)
+    rig.relay(
+        use_sim_time=True,
+        amplitude=0.5,
+        settle_time=1.0,
+        measurement_timeout=3.0,
+        controller_timeout=3.0,
+    )
+    controller = rig.start("controller_node", **CONTROLLER, verify_load_max=0.1)
+    rig.identifier(use_sim_time=True)
+    # Passed through untouched, and the loop is closed.
+    rig.until(lambda: len(wanted) > 300 and len(commands) > 300, "a closed loop")
+    tail = len(wanted) - 5
+    assert {m.data for m in wanted[tail - 50 : tail]} <= {m.data for m in commands}
+    assert sum(m.data for m in measured[-50:]) / 50 == pytest.approx(5.0, abs=0.02)
+    assert not trigger(rig, "apply").success
+    answer = rig.tune()
+    # The mean of the controller's commands is the baseline.
+    assert float(answer.reason.split("baseline ")[1].split(";")[0]) == pytest.approx(1.0, abs=0.02)
+    rig.until(lambda: gains, "gains")
+    ended = experiments[-1]
+    assert ended.outcome == RelayExperiment.COMPLETED, ended.reason
+    # Back at the controller without a bump: no step of the size of the relay's.
+    before = len(commands)
+    rig.until(lambda: len(commands) > before + 200, "the controller's commands")
+    assert max(abs(m.data - 1.0) for m in commands[before:]) < 0.25
+    # Only when told.
+    assert "wait: kc" in controller.log
+    applied = trigger(rig, "apply")
+    assert applied.success, applied.message
+    assert f"kc {gains[-1].kc:.6g}" in applied.message
+    rig.run_for(1.0)
+    status, result = verify(rig, setpoint_step=0.2, load_step=0.1)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
+    assert result.passed, result.reason
+    assert [s.kind for s in result.steps] == [1, 2]
+    for step in result.steps:
+        assert len(step.time) == len(step.measurement) == len(step.predicted) > 20
+        assert step.gain_ratio == pytest.approx(1.0, abs=0.3)
+    # A load that is larger than allowed is refused.
+    status, result = verify(rig, load_step=5.0)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "verify_load_max allows 0.1" in result.reason
+    reverted = trigger(rig, "revert")
+    assert "kc 0.3" in reverted.message
+    # By hand.
+    answer = rig.call(SetBool, "controller_node/automatic", SetBool.Request(data=False))
+    assert answer.success
+    count = len(wanted)
+    rig.until(lambda: len(wanted) > count + 100, "held commands")
+    assert len({m.data for m in wanted[-20:]}) == 1
+    (record,) = read_experiments(rig.bag(ended)).experiments
+    assert record.settings is not None
+
+
+def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
+    """The model that came says half the gain that the process has."""
+    commands = rig.listen("command", Float64, RELIABLE)
+    rig.plant(**PLANT)
+    rig.start(
+        "controller_node",
+        "-r",
+        "controller_command:=command",
+        **CONTROLLER,
+        verify_step=0.3,
+        auto_apply=True,
+    )
+    models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+    gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+    models.publish(
+        TransferFunction(final=True, numerator=[0.9], denominator=[0.8, 1.0], dead_time=0.4)
+    )
+    gains.publish(PidGains(final=True, kc=0.9, ti=0.8, b=1.0, experiment_id="wrong"))
+    rig.until(lambda: len(commands) > 400, "a closed loop")
+    status, result = verify(rig)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
+    assert not result.passed
+    assert "kc 0.3, ti 0.8 s, td 0 s in force again" in result.reason
+    # Without gains before these there is nothing left to go back to twice.
+    assert len(result.steps) <= 1
+
+
+def test_gains_go_to_another_node_all_or_none(rig: Rig) -> None:
+    rig.start_python(
+        "pid_controller",
+        """
+import rclpy
+from rclpy.node import Node
+from rcl_interfaces.msg import SetParametersResult
+rclpy.init()
+node = Node("pid_controller")
+for name in "pid":
+    node.declare_parameter(f"gains.heater.{name}", 1.0)
+def judge(changes):
+    fine = all(c.value < 100.0 for c in changes)
+    return SetParametersResult(successful=fine, reason="" if fine else "too large for this one")
+node.add_on_set_parameters_callback(judge)
+rclpy.spin(node)
+""",
+    )
+    names = ",".join(f"{name}:gains.heater.{name}" for name in "pid")
+    controller = rig.start("controller_node", apply_to="/pid_controller", apply_parameters=names)
+    gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+
+    def values() -> list[float]:
+        request = GetParameters.Request(names=[f"gains.heater.{name}" for name in "pid"])
+        answer = rig.call(GetParameters, "pid_controller/get_parameters", request)
+        assert {v.type for v in answer.values} == {ParameterType.PARAMETER_DOUBLE}
+        return [v.double_value for v in answer.values]
+
+    assert values() == [1.0, 1.0, 1.0]
+    gains.publish(PidGains(final=True, kc=2.0, ti=4.0, p=2.0, i=0.5, d=0.25, experiment_id="one"))
+    rig.until(lambda: "gains of one wait" in controller.log, "the gains")
+    applied = rig.until(
+        lambda: ((a := trigger(rig, "apply")).success and a) or None, "the other node"
+    )
+    assert "/pid_controller has the gains of one" in applied.message
+    assert values() == [2.0, 0.5, 0.25]
+    gains.publish(
+        PidGains(final=True, kc=200.0, ti=4.0, p=200.0, i=50.0, d=0.0, experiment_id="two")
+    )
+    rig.until(lambda: "gains of two wait" in controller.log, "the gains")
+    refused = trigger(rig, "apply")
+    assert not refused.success
+    assert "too large for this one" in refused.message
+    assert values() == [2.0, 0.5, 0.25]
+    assert trigger(rig, "revert").success
+    assert values() == [1.0, 1.0, 1.0]
