@@ -7,7 +7,7 @@
 
 PYTHON ?= python3
 ENTER = . ./env.sh
-SOURCES = setup.py relay_autotune test tools $(wildcard bags benchmarks)
+SOURCES = setup.py docs/conf.py launch relay_autotune test tools $(wildcard bags benchmarks)
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 

@@ -1,8 +1,16 @@
 """Install the package relay_autotune; colcon calls this."""
 
+from pathlib import Path
+
 from setuptools import find_packages, setup
 
 PACKAGE = "relay_autotune"
+
+
+def files(folder: str) -> list[str]:
+    """Return the files in a folder, which are installed as they are."""
+    return sorted(str(path) for path in Path(folder).iterdir() if path.is_file())
+
 
 setup(
     name=PACKAGE,
@@ -16,6 +24,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/launch", files("launch")),
+        (f"share/{PACKAGE}/config", files("config")),
     ],
     python_requires=">=3.11",
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],

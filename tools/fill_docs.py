@@ -6,6 +6,8 @@ A page asks for it with a pair of comments, and what is between them is replaced
 
     <!-- parameters of relay_node -->    <!-- end -->    a table of the node's parameters
     <!-- text of FILE -->                <!-- end -->    a file, in a fenced block
+
+It also writes config/parameters.yaml, in which every parameter of every node has its default.
 """
 
 from __future__ import annotations
@@ -13,23 +15,23 @@ from __future__ import annotations
 import math
 import re
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.identifier import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.parameters import Entry
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
 from relay_autotune.nodes.tune_parameters import FIXED_PARAMETERS, TUNE_PARAMETERS
 
 ROOT = Path(__file__).resolve().parent.parent
+PARAMETER_FILE = ROOT / "config/parameters.yaml"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 TABLES: Mapping[str, Sequence[Entry]] = {
     "relay_node": (*TUNE_PARAMETERS, *FIXED_PARAMETERS),
     "identifier_node": IDENTIFIER_PARAMETERS,
     "plant_node": PLANT_PARAMETERS,
-    "controller_node": CONTROLLER_PARAMETERS,
 }
 
 _BLOCK = re.compile(
@@ -93,11 +95,46 @@ def text_of(name: str) -> str:
     return f"```text\n{(ROOT / name).read_text().rstrip()}\n```"
 
 
+def parameter_file() -> str:
+    """Return a parameter file with every parameter of every node at its default."""
+    lines = [
+        "# Every parameter of every node at its default; tools/fill_docs.py writes this file.",
+        "# Copy what you want to change. Doubles need a decimal point. `/**/` stands for any",
+        "# namespace; y is the unit of the measurement and u that of the command.",
+    ]
+    for node, entries in TABLES.items():
+        lines += ["", f"/**/{node}:", "  ros__parameters:"]
+        for entry in entries:
+            text = f"{entry.description} ({entry.range_text})"
+            lines += [f"    # {line}" for line in textwrap.wrap(text, 93)]
+            # what is not given has no value that a file could hold
+            mark = "# " if entry.default == () else ""
+            lines.append(f"    {mark}{entry.name}: {yaml_value(entry.default)}")
+    return "\n".join(lines) + "\n"
+
+
+def yaml_value(value: object) -> str:
+    """Return a value as a parameter file has it.
+
+    :param value: a default.
+    """
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(yaml_value, value))}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else f"{'-' if value < 0 else ''}.inf"
+    return str(value)
+
+
 def main() -> int:
-    """Fill all pages."""
-    for page in PAGES:
-        before = page.read_text()
-        after = filled(before)
+    """Fill all pages, and write the parameter file."""
+    contents = {page: filled(page.read_text()) for page in PAGES}
+    contents[PARAMETER_FILE] = parameter_file()
+    for page, after in contents.items():
+        before = page.read_text() if page.exists() else ""
         if after != before:
             page.write_text(after)
             print(f"filled {page.relative_to(ROOT)}")

@@ -35,7 +35,7 @@ PACKAGES = {
         f"relay_autotune_msgs/{name}"
         for name in ("package.xml", "CMakeLists.txt", "msg", "srv", "action")
     ],
-    "relay_autotune": ["package.xml", "setup.py", "setup.cfg", "resource"],
+    "relay_autotune": ["package.xml", "setup.py", "setup.cfg", "resource", "launch", "config"],
 }
 OWN_VARIABLES = ("PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from pages import GUIDE, PAGES, ROOT, block_noted, blocks, commands, rows, spans
+from parameter_values import check_parameter_file, check_value
 
 from relay_autotune.autotune import analyse
 from relay_autotune.bag.reader import read_experiments
@@ -114,23 +115,10 @@ def test_parameters_in_commands_exist_and_may_have_these_values() -> None:
                 check_value(known[name], yaml.safe_load(value))
 
 
-def check_value(entry: Any, value: Any) -> None:
-    assert entry.problem(value) is None
-    if isinstance(entry.default, float):
-        assert isinstance(value, float), f"{entry.name}: {value} lacks its decimal point"
-    elif entry.default == ():
-        assert all(isinstance(v, float) for v in value)
-    else:
-        assert isinstance(value, type(entry.default))
-
-
 def test_the_parameter_file_is_one_for_relay_node() -> None:
     content = yaml.safe_load(block_noted("docs/live.md", "a parameter file").text)
-    ((node, section),) = content.items()
-    assert node == "/tank/relay_node"
-    known = {entry.name: entry for entry in TABLES["relay_node"]}
-    for name, value in section["ros__parameters"].items():
-        check_value(known[name], value)
+    assert list(content) == ["/tank/relay_node"]
+    check_parameter_file(content, TABLES)
 
 
 def test_services_and_topics_in_commands_exist() -> None:
