@@ -18,6 +18,7 @@ from relay_autotune.identification import (
     identify_jointly,
     method_named,
 )
+from relay_autotune.identification.assessment import assess
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record
@@ -106,6 +107,7 @@ def analyse(
     models = [chosen]
     if final:
         models += _others(record, method, known, chosen)
+        models = list(assess(models, record))
     simple = next((m.model for m in models if m.structure == "fopdt"), None)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
@@ -143,7 +145,7 @@ def analyse_jointly(
         chosen = identify_jointly(records, method, known)
     except RelayAutotuneError as error:
         return Analysis(first, cycles, reason=_with_outcome(first, str(error)))
-    found = Analysis(first, cycles, (chosen,), 0)
+    found = Analysis(first, cycles, assess((chosen,), first), 0)
     for record in records:
         if record.outcome in _NO_GAINS:
             why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()

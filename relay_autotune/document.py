@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.shape import shape_of_record
+from relay_autotune.identification.validation import DIFFERENCES
 from relay_autotune.record import Outcome, Record
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ _LIMIT_CYCLE = (
     *("time_to_peak_max", "time_to_peak_min", "mean_measurement", "mean_command"),
 )
 _SHAPE = ("sharpness", "plateau", "growth", "rise", "rise_half")
+_FIT = (
+    *("residual_rms", "noise_std", "fit", "whiteness_p", "prediction"),
+    *("noise_to_signal", "noise_to_signal_power"),
+)
 _GAINS = (
     *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
     *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
@@ -119,10 +124,18 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
         **model_fields(identification.model),
         "std": _named(names, identification.std),
         "ci95": {n: _numbers(ends) for n, ends in zip(names, intervals, strict=True)},
-        "fit": {
-            name: _number(getattr(identification.fit, name))
-            for name in ("residual_rms", "noise_std", "fit", "whiteness_p", "prediction")
-        },
+        "fit": {name: _number(getattr(identification.fit, name)) for name in _FIT},
+        "validation": _validation(identification),
+        "integrated_error": _number(identification.integrated_error),
+        "points": [
+            {
+                "frequency": _number(p.frequency),
+                "real": _number(p.value.real),
+                "imaginary": _number(p.value.imag),
+                "std": _number(p.std),
+            }
+            for p in identification.points
+        ],
         "ultimate_gain": _number(identification.ultimate_gain),
         "ultimate_gain_std": _number(identification.ultimate_gain_std),
         "ultimate_frequency": _number(identification.ultimate_frequency),
@@ -137,6 +150,16 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
             }
             for r in identification.rivals
         ],
+    }
+
+
+def _validation(identification: Identification) -> dict[str, Any] | None:
+    validation = identification.validation
+    if validation is None:
+        return None
+    return {
+        **{name: _number(getattr(validation, name)) for name in DIFFERENCES},
+        "reason": validation.reason,
     }
 
 

@@ -260,6 +260,8 @@ def fill_transfer_function(
     :param final: True once the experiment has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
     """
+    from relay_autotune.identification.validation import DIFFERENCES
+
     model = identification.model
     set_stamp(message.header.stamp, stamp_ns)
     message.experiment_id = experiment_id
@@ -286,6 +288,20 @@ def fill_transfer_function(
     message.noise_std = float(identification.fit.noise_std)
     message.fit = float(identification.fit.fit)
     message.whiteness_p = float(identification.fit.whiteness_p)
+    message.prediction = float(identification.fit.prediction)
+    message.noise_to_signal = float(identification.fit.noise_to_signal)
+    message.noise_to_signal_power = float(identification.fit.noise_to_signal_power)
+    validation = identification.validation
+    for name in DIFFERENCES:
+        value = math.nan if validation is None else getattr(validation, name)
+        setattr(message, f"validation_{name}", float(value))
+    message.validation_reason = "" if validation is None else validation.reason
+    message.integrated_error = float(identification.integrated_error)
+    points = identification.points
+    message.point_frequency = float64_array([p.frequency for p in points])
+    message.point_real = float64_array([p.value.real for p in points])
+    message.point_imaginary = float64_array([p.value.imag for p in points])
+    message.point_std = float64_array([p.std for p in points])
     message.warnings = [str(text) for text in identification.warnings]
     message.undetermined = [str(name) for name in identification.undetermined]
 

@@ -16,6 +16,7 @@ from relay_autotune.record import Outcome, Record
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
     from relay_autotune.identification import Identification
+    from relay_autotune.identification.validation import Validation
     from relay_autotune.models import TransferFunction
     from relay_autotune.tuning import Gains
 
@@ -111,7 +112,9 @@ def identification_lines(found: Identification) -> list[str]:
         if math.isfinite(value):
             interval = f"± {digits(1.96 * std, 2)}" if math.isfinite(std) else ""
             lines.append(_row(label, value, unit, interval))
-    lines.append(_line("fit", _fit(found)))
+    lines += _wrapped("fit", _fit(found))
+    if found.validation is not None:
+        lines += _wrapped("limit cycle", _validation(found.validation))
     for i, rival in enumerate(found.rivals[:_RIVALS]):
         share = f"{100.0 * rival.support:.2g} % of the support"
         note = f"{rival.model.structure}, {share}"
@@ -126,7 +129,10 @@ def _others(analysis: Analysis) -> list[str]:
     others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
     lines = []
     for i, m in enumerate(others):
-        lines += _process("also" if i == 0 else "", m.model, f"{m.structure}, {m.method}")
+        note = f"{m.structure}, {m.method}"
+        if m.validation is not None and not m.validation.reason:
+            note += f", limit cycle {100.0 * m.validation.worst:.2g} % off"
+        lines += _process("also" if i == 0 else "", m.model, note)
     return lines
 
 
@@ -143,7 +149,21 @@ def _fit(found: Identification) -> str:
         parts.append(f"prediction {digits(fit.prediction, 3)} y rms")
     if math.isfinite(fit.whiteness_p):
         parts.append(f"whiteness p = {digits(fit.whiteness_p, 2)}")
+    if math.isfinite(fit.noise_to_signal):
+        power, mean = digits(fit.noise_to_signal_power, 2), digits(fit.noise_to_signal, 2)
+        parts.append(f"noise to signal N1 = {power}, N2 = {mean}")
     return ", ".join(parts) or "not estimated"
+
+
+def _validation(validation: Validation) -> str:
+    if validation.reason:
+        return f"none of the model: {validation.reason}"
+    parts = [
+        f"{name} {100.0 * getattr(validation, field):+.2g} %"
+        for name, field in (("period", "period"), ("peaks", "peak_max"), ("and", "peak_min"))
+    ]
+    shape = f"shape {100.0 * validation.shape:.2g} %"
+    return f"of the model: {parts[0]}, {parts[1]} {parts[2]}, {shape} off the record's"
 
 
 def _other_gains(analysis: Analysis) -> list[str]:

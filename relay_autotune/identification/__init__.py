@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.atv import identify_atv
 from relay_autotune.identification.chang_method import identify_chang
+from relay_autotune.identification.fourier_method import identify_fourier
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.li_method import identify_li, identify_li_jointly
 from relay_autotune.identification.luyben_method import identify_step
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.identification.thyagarajan_method import identify_thyagarajan
-from relay_autotune.identification.wang1997 import identify_biased, identify_unbiased
+from relay_autotune.identification.wang_method import identify_biased, identify_unbiased
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.record import Record
 
@@ -28,6 +29,7 @@ METHODS: dict[str, Method] = {
     "li": identify_li,
     "thyagarajan": identify_thyagarajan,
     "luyben_step": identify_step,
+    "fourier": identify_fourier,
 }
 # These take several records of one process.
 JOINT_METHODS: dict[str, JointMethod] = {

@@ -85,12 +85,12 @@ def relay_test(method: str, record: Record) -> RelayTest:
     """
     settings = record.settings or infer_settings(record)
     bounds = record.cycle_start or find_cycles(record)
-    if settings is None or len(bounds) < 2:
+    cycles = cycles_of(record)
+    if settings is None or not cycles:
         raise IdentificationError(
             f"{method} needs at least one whole cycle of a relay test and the record holds none: "
             "use the method waveform, which takes any input"
         )
-    cycles = cycles_of(record)
     average = limit_cycle(cycles)
     samples = (bounds[average.cycles[-1] + 1] - bounds[average.cycles[0]]) / len(average.cycles)
     if samples < _LEAST_SAMPLES or not average.period > 0.0:

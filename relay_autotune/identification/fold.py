@@ -10,7 +10,7 @@ one, where, and how many knots the data carry, is decided by the Bayesian inform
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -34,6 +34,11 @@ _SEARCHED = 16
 _NEGLIGIBLE = 1e-9
 _SYMMETRIC = 0.05
 _NO_BIAS = 0.01
+_GRID = 2001
+_DEVIATIONS = 6.0
+_SHARE = 0.02
+_CELLS = 64
+_QUADRATURE = np.polynomial.legendre.leggauss(4)
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,41 @@ class Fold:
         """
         return self._value(np.asarray(time, dtype=np.float64), 1)
 
+    def peaks(self) -> tuple[float, float]:
+        """Return the lowest and the highest measurement about the set-point [y].
+
+        Noise would place a smooth maximum beside a kink too high; so the kink counts where it is
+        the peak but for what the curve is uncertain by.
+        """
+        y = self(np.linspace(0.0, self.period, _GRID))
+        ends = float(np.min(y)), float(np.max(y))
+        if math.isnan(self.edge):
+            return ends
+        kinks = self(np.array([self.edge, self.period_high + self.edge]))
+        allowed = _DEVIATIONS * self.curve_std + _SHARE * 0.5 * (ends[1] - ends[0])
+        low, high = float(np.min(kinks)), float(np.max(kinks))
+        return (
+            low if low <= ends[0] + allowed else ends[0],
+            high if high >= ends[1] - allowed else ends[1],
+        )
+
+    def fundamental(self) -> complex:
+        """Return G(j w) at the frequency of the limit cycle (Wang et al. 1997, eq 23) [y/u]."""
+        w = 2.0 * math.pi / self.period
+        edge = 0.5 * self.period_high if math.isnan(self.edge) else self.edge
+        bounds = (0.0, edge, self.period_high, self.period_high + edge, self.period)
+        nodes, weights = _QUADRATURE
+        answer = 0.0j
+        for begin, end in pairwise(bounds):
+            # In each piece between kinks the spline is smooth but for its knots.
+            cells = np.linspace(begin, end, _CELLS + 1)
+            half = 0.5 * (end - begin) / _CELLS
+            time = (cells[:-1, None] + half * (nodes + 1.0)).ravel()
+            share = np.tile(weights * half, _CELLS)
+            answer += complex(np.sum(self(time) * np.exp(-1j * w * time) * share))
+        swing = self.settings.high - self.settings.low
+        return answer / (swing * (1.0 - np.exp(-1j * w * self.period_high)) / (1j * w))
+
     def _value(self, time: FloatArray, derivative: int) -> FloatArray:
         unit = self.period_high if self.mirrored else self.period
         columns = Basis(self.mirrored, self.period_high / unit)
@@ -139,6 +179,20 @@ def fold(
     time = (since + np.where(is_high, 0.0, high))[usable]
     return _smoothed(
         time, y[usable] - settings.setpoint, high, low, settings, mirrored, like, sharp
+    )
+
+
+def as_switched(seen: Fold) -> RelaySettings:
+    """Return the relay with the levels at which it was seen to switch.
+
+    :param seen: the averaged period.
+    """
+    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
+    half = 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
+    return replace(
+        seen.settings,
+        setpoint=seen.settings.setpoint + 0.5 * (at_high + at_low),
+        hysteresis=max(half, 0.0),
     )
 
 

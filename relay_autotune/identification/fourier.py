@@ -22,10 +22,13 @@ class FrequencyPoint:
 
     :param frequency: w [rad/s].
     :param value: G(j w) [y/u].
+    :param std: standard deviation of its real and of its imaginary part [y/u]; NaN: not
+        estimated.
     """
 
     frequency: float
     value: complex
+    std: float = math.nan
 
 
 def fourier_integral_held(u: PiecewiseConstant, start: float, end: float, w: float) -> complex:
@@ -112,17 +115,30 @@ def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> Freque
     :param first: cycles left out at the beginning, while the limit cycle settles.
     :raises IdentificationError: if no whole cycle is left or the command lacks the harmonic.
     """
-    start, end, cycles = cycle_window(record, first)
-    w = harmonic * 2.0 * math.pi * cycles / (end - start)
+    start, end, w = _window_of_harmonic(record, harmonic, first)
     u = record.input()
-    excitation = fourier_integral_held(u, start, end, w)
+    excited = fourier_integral_held(u, start, end, w)
     levels = np.append(u.values, u.initial)
-    if abs(excitation) < 1e-3 * (end - start) * float(np.ptp(levels)) / (2.0 * math.pi * harmonic):
+    if abs(excited) < 1e-3 * (end - start) * float(np.ptp(levels)) / (2.0 * math.pi * harmonic):
         raise IdentificationError(
             f"the command holds nothing at harmonic {harmonic} of its cycle; use an odd one"
         )
     answer = fourier_integral_sampled(record.time, record.measurement, start, end, w)
-    return FrequencyPoint(w, answer / excitation)
+    return FrequencyPoint(w, answer / excited)
+
+
+def excitation(record: Record, harmonic: int = 1, first: int = 0) -> complex:
+    """Return the Fourier integral of the command that a point is divided by [u s].
+
+    :param record: as for :func:`frequency_point`, as are the next two.
+    """
+    start, end, w = _window_of_harmonic(record, harmonic, first)
+    return fourier_integral_held(record.input(), start, end, w)
+
+
+def _window_of_harmonic(record: Record, harmonic: int, first: int) -> tuple[float, float, float]:
+    start, end, cycles = cycle_window(record, first)
+    return start, end, harmonic * 2.0 * math.pi * cycles / (end - start)
 
 
 def cycle_means(record: Record, first: int = 0) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array
 
 FloatArray = NDArray[np.float64]
 
@@ -37,8 +38,10 @@ class Spline:
         columns = basis.spline(x, knots, 0)
         if basis.mirrored:
             columns = np.column_stack((columns, np.ones(x.size)))
-        self._columns = columns * self._root
-        gram = self._columns.T @ self._columns
+        # Of the many functions four or five are not zero at any point.
+        self._columns = csr_array(columns * self._root)
+        self._transposed = csr_array(self._columns.T)
+        gram = (self._transposed @ self._columns).toarray()
         # Knots without samples leave functions that nothing tells of.
         gram[np.diag_indices_from(gram)] += _RIDGE * float(np.trace(gram))
         self._factor = cho_factor(gram)
@@ -47,7 +50,7 @@ class Spline:
         self._left = target - self._columns @ self._smooth
 
     def _along(self, columns: FloatArray) -> FloatArray:
-        return np.asarray(cho_solve(self._factor, self._columns.T @ columns))
+        return np.asarray(cho_solve(self._factor, self._transposed @ columns))
 
     def fitted(self, edge: float) -> tuple[FloatArray, float]:
         """Return the coefficients and the sum of squares that they leave.

@@ -33,6 +33,21 @@ def _products(x: FloatArray, lags: int) -> FloatArray:
     return np.asarray(np.fft.irfft(spectrum)[..., : lags + 1])
 
 
+def noise_to_signal(noise: FloatArray, signal: FloatArray) -> tuple[float, float]:
+    """Return the two noise-to-signal ratios of Wang, Hang and Zou 1997.
+
+    N1 is the ratio of the mean powers, N2 that of the mean absolute values.
+
+    :param noise: what is not the signal [y], shape (n,).
+    :param signal: deviation from the operating point [y], shape (n,).
+    :return: N1 and N2; NaN where there is no signal.
+    """
+    power, mean = float(np.mean(signal**2)), float(np.mean(np.abs(signal)))
+    if not (power > 0.0 and mean > 0.0):
+        return math.nan, math.nan
+    return float(np.mean(noise**2)) / power, float(np.mean(np.abs(noise))) / mean
+
+
 def ljung_box(residual: FloatArray, lags: int = 20) -> float:
     """Return the probability that white noise is at least as correlated (Ljung and Box 1978).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,10 @@ from numpy.typing import NDArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
+
+if TYPE_CHECKING:
+    from relay_autotune.identification.fourier import FrequencyPoint
+    from relay_autotune.identification.validation import Validation
 
 FloatArray = NDArray[np.float64]
 
@@ -29,6 +34,9 @@ class FitReport:
         Box); NaN: not estimated.
     :param prediction: root mean square error over the last cycle, predicted from those
         before [y]; NaN: not estimated.
+    :param noise_to_signal: mean|residual|/mean|model about the operating point|, N2 of Wang et
+        al. 1997; NaN: not estimated.
+    :param noise_to_signal_power: the same of mean squares, their N1; NaN: not estimated.
     """
 
     residual_rms: float = math.nan
@@ -36,6 +44,8 @@ class FitReport:
     fit: float = math.nan
     whiteness_p: float = math.nan
     prediction: float = math.nan
+    noise_to_signal: float = math.nan
+    noise_to_signal_power: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,13 @@ class Identification:
     :param fitted: the model's measurement at the record's samples, with all that was estimated
         beside the model [y], shape (n,); NaN: not part of the fit; empty: not computed.
     :param rivals: other structures with some support, the best first.
+    :param validation: how the limit cycle of the model differs from the record's; None: not
+        compared.
+    :param points: measured points of the frequency response, by rising frequency; empty: the
+        method has none.
+    :param integrated_error: ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the
+        model that counts (Thyagarajan and Yu 2003, eqs 29 and 30) [rad/s]; NaN: of that model
+        itself, or not computed.
     """
 
     method: str
@@ -91,6 +108,9 @@ class Identification:
     undetermined: tuple[str, ...] = ()
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
     rivals: tuple[Rival, ...] = ()
+    validation: Validation | None = None
+    points: tuple[FrequencyPoint, ...] = ()
+    integrated_error: float = math.nan
 
     @property
     def structure(self) -> str:
@@ -148,7 +168,7 @@ def with_uncertainty(
     model = build(values)
     cov = np.full((p, p), math.nan) if covariance is None else covariance
     std = np.sqrt(np.diag(cov))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ratio = np.exp(np.minimum(quantile * std / np.abs(values), 700.0))
         low, high = values / ratio, values * ratio
     low, high = np.minimum(low, high), np.maximum(low, high)

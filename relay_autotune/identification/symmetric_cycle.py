@@ -108,7 +108,7 @@ class CycleReader:
         :param whole: all of them.
         """
         record = whole.record
-        noise = record.noise_std if math.isfinite(record.noise_std) else _roughness(record)
+        noise = record.noise_std if math.isfinite(record.noise_std) else roughness(record)
         _, amplitude = features(whole)
         if noise <= _QUIET * amplitude:
             return cls(0.0, False)
@@ -178,7 +178,7 @@ def half_cycles(stretch: Stretch) -> tuple[FloatArray, FloatArray]:
     return since[inside], (side * (record.measurement[first:last] - middle))[inside]
 
 
-def _roughness(record: Record) -> float:
+def roughness(record: Record) -> float:
     """Estimate white noise from second differences, of which a smooth signal has little [y]."""
     second = np.diff(record.measurement, 2)
     return (

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError
-from relay_autotune.identification.fold import Fold, fold
-from relay_autotune.identification.wang1997 import steady_state
+from relay_autotune.identification.fold import Fold, as_switched, fold
+from relay_autotune.identification.steady_state import steady_state
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Record, RelaySettings
+from relay_autotune.response import response
 from relay_autotune.simulation import simulate_relay
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +28,10 @@ _FREQUENCIES = 4001
 _CYCLES = (8, 32, 128)
 _TOLERANCE = 1e-6
 _KICK = 0.1
+
+
+# What of two limit cycles is compared.
+DIFFERENCES = ("period", "period_high", "period_low", "peak_max", "peak_min", "shape")
 
 
 @dataclass(frozen=True)
@@ -58,11 +63,9 @@ class Validation:
     @property
     def worst(self) -> float:
         """Return the largest of them; infinite where the model has no limit cycle."""
-        found = [
-            *(self.period, self.period_high, self.period_low),
-            *(self.peak_max, self.peak_min, self.shape),
-        ]
-        return math.inf if self.reason else max(abs(d) for d in found)
+        if self.reason:
+            return math.inf
+        return max(abs(getattr(self, name)) for name in DIFFERENCES)
 
 
 def validate(model: TransferFunction, record: Record) -> Validation:
@@ -77,7 +80,7 @@ def validate(model: TransferFunction, record: Record) -> Validation:
     :raises IdentificationError: if the record holds no whole cycle of a relay test.
     """
     seen = fold(record)
-    return validate_fold(model, seen, steady_state(record, seen.settings)[0])
+    return validate_fold(model, seen, steady_state(record, seen.settings).value)
 
 
 def validate_fold(model: TransferFunction, seen: Fold, rest: float) -> Validation:
@@ -116,20 +119,6 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: float) -> Validatio
     )
 
 
-def as_switched(seen: Fold) -> RelaySettings:
-    """Return the relay with the levels at which it was seen to switch.
-
-    :param seen: the averaged period.
-    """
-    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
-    half = 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
-    return replace(
-        seen.settings,
-        setpoint=seen.settings.setpoint + 0.5 * (at_high + at_low),
-        hysteresis=max(half, 0.0),
-    )
-
-
 def _limit_cycle(
     model: TransferFunction, settings: RelaySettings, rest: float, kick: float
 ) -> tuple[Cycle, FloatArray]:
@@ -142,6 +131,10 @@ def _limit_cycle(
         if change <= _TOLERANCE * b.period:
             break
     at = b.start + _instants(b.period_high, b.period_low)
+    if all(t.real > 0.0 for t in model.time_constants):
+        # What does not grow has its command's response in one step.
+        delayed = replace(model, dead_time=model.dead_time + settings.extra_delay)
+        return b, rest + response(delayed, at, run.command)
     again = simulate_relay(model, settings, cycles=count, operating_point=rest, kick=kick, time=at)
     return b, again.measurement
 

@@ -9,25 +9,12 @@ eq 10 has T_u2 where T_u1 is printed, and the first logarithm of eq 22 has ``mu 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from relay_autotune.cycles import LimitCycle
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import NOT_SETTLED, Stretch, relay_test
-from relay_autotune.identification.fourier import cycle_means, frequency_point
-from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-
-FloatArray = NDArray[np.float64]
-
-_LEAST_BIAS = 0.02
 
 PARAMETERS = ("gain", "time_constant", "dead_time")
 
@@ -170,130 +157,3 @@ def _log_ratio(numerator: float, denominator: float, where: str) -> float:
             "above 1: these numbers are not the limit cycle of a FOPDT process"
         )
     return math.log(numerator / denominator)
-
-
-def steady_state(record: Record, settings: RelaySettings) -> tuple[float, bool]:
-    """Return the measurement at rest [y], and whether it was measured.
-
-    Before the first kick the command is the baseline; the mean of those samples is the steady
-    state. Without any, the set-point stands in for it.
-
-    :param record: the record.
-    :param settings: its relay.
-    """
-    moved = np.flatnonzero(record.command != settings.baseline)
-    resting = int(moved[0]) if moved.size else 0
-    # The sample that was answered by the kick was itself taken at rest.
-    if resting >= 1:
-        return float(np.mean(record.measurement[: resting + 1])), True
-    return settings.setpoint, False
-
-
-def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
-    """Identify a FOPDT model from a biased relay test (eqs 6 to 11).
-
-    Deviations are taken from the measured steady state; where the set-point lies elsewhere, the
-    bias about it is ``mu0 - (setpoint - rest)/K``.
-
-    :param record: a relay test with a bias.
-    :param known: a known gain takes the place of eq 6.
-    :raises IdentificationError: if the relay was unbiased, or the numbers are no limit cycle of a
-        FOPDT process.
-    """
-    return _identify("wang_biased", record, known, _measure_biased)
-
-
-def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
-    """Identify a FOPDT model from an unbiased relay test (eqs 22 to 25).
-
-    :param record: a relay test without bias.
-    :param known: a known gain takes the place of eqs 23 to 25.
-    :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
-    """
-    return _identify("wang_unbiased", record, known, _measure_unbiased)
-
-
-def _measure_biased(
-    record: Record, settings: RelaySettings, cycle: LimitCycle, known: Known
-) -> FloatArray:
-    # With the command turned round a reverse-acting process has a positive gain.
-    sign = -1 if settings.reverse_acting else 1
-    high, low = (cycle.period_high, cycle.period_low)[::sign]
-    about = settings.setpoint
-    rest, _ = steady_state(record, settings)
-    seen = FopdtCycle(high, low, cycle.peak_max - about, cycle.peak_min - about)
-    gain = (
-        _static_gain(record, settings, sign, rest) if math.isnan(known.gain) else sign * known.gain
-    )
-    if not gain > 0.0:
-        raise IdentificationError(
-            f"a gain of {sign * gain:g} is against the direction of the relay: the state before "
-            "the test was not steady, the load changed, or the known gain has the wrong sign"
-        )
-    bias = sign * settings.bias - (about - rest) / gain
-    k, t, dead = fopdt_from_biased(seen, gain, settings.amplitude, bias, settings.hysteresis)
-    return np.array((sign * k, t, dead))
-
-
-def _static_gain(record: Record, settings: RelaySettings, sign: int, rest: float) -> float:
-    """Eq 6, with the command turned round where the process is reverse-acting."""
-    mean_y, mean_u = cycle_means(record)
-    excursion = sign * (mean_u - settings.baseline)
-    if abs(excursion) < _LEAST_BIAS * settings.amplitude:
-        raise IdentificationError(
-            f"the mean command is only {excursion:g} away from the baseline, so that its ratio to "
-            "the measurement (eq 6) tells no gain: use a biased relay, or the method "
-            "wang_unbiased; an integrating process always has a mean of zero"
-        )
-    return (mean_y - rest) / excursion
-
-
-def _measure_unbiased(
-    record: Record, settings: RelaySettings, cycle: LimitCycle, known: Known
-) -> FloatArray:
-    if abs(settings.bias) > 0.01 * settings.amplitude:
-        raise IdentificationError(
-            f"the relay had a bias of {settings.bias:g}, but eqs 19 to 25 hold for a symmetric "
-            "one: use the method wang_biased"
-        )
-    sign = -1 if settings.reverse_acting else 1
-    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
-    if math.isnan(known.gain):
-        response = abs(frequency_point(record).value)
-        k, t, dead = fopdt_from_unbiased(
-            cycle.period, amplitude, response, settings.amplitude, settings.hysteresis
-        )
-    else:
-        k, t, dead = fopdt_with_gain(
-            sign * known.gain, cycle.period, amplitude, settings.amplitude, settings.hysteresis
-        )
-    return np.array((sign * k, t, dead))
-
-
-_Measure = Callable[[Record, RelaySettings, LimitCycle, Known], FloatArray]
-
-
-def _identify(method: str, record: Record, known: Known, measure: _Measure) -> Identification:
-    """Measure on the averaged limit cycle; its scatter from cycle to cycle is the uncertainty."""
-    test = relay_test(method, record)
-
-    def values(part: Stretch) -> FloatArray:
-        return measure(part.record, part.settings, part.cycle, known)
-
-    covariance, quantile = test.scatter(values)
-    warnings = []
-    if not test.whole.cycle.converged:
-        warnings.append(NOT_SETTLED)
-    if not steady_state(record, test.whole.settings)[1]:
-        warnings.append(
-            "no samples at rest before the test: the set-point stands in for the steady state"
-        )
-    return with_uncertainty(
-        method,
-        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
-        PARAMETERS,
-        values(test.whole),
-        covariance,
-        quantile,
-        warnings=tuple(warnings),
-    )

@@ -13,6 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.errors import RecordError
+from relay_autotune.identification.fourier import FrequencyPoint
+from relay_autotune.identification.result import FitReport
+from relay_autotune.identification.validation import Validation
 from relay_autotune.messages import (
     fill_cycle,
     fill_experiment,
@@ -176,7 +179,10 @@ def identification(model: TransferFunction) -> Any:
         ultimate_gain_std=0.1,
         ultimate_frequency=0.2,
         ultimate_frequency_std=math.nan,
-        fit=SimpleNamespace(residual_rms=0.1, noise_std=0.1, fit=0.9, whiteness_p=0.5),
+        fit=FitReport(residual_rms=0.1, noise_std=0.1, fit=0.9, whiteness_p=0.5, prediction=0.2),
+        validation=Validation(shape=0.01, reason=""),
+        integrated_error=0.3,
+        points=(FrequencyPoint(1.5, 2.0 - 3.0j, 0.1),),
         warnings=("mind",),
         undetermined=(),
     )
@@ -199,6 +205,11 @@ def test_a_model_comes_back(model: TransferFunction) -> None:
     assert np.allclose(back(s), model(s), rtol=1e-12)
     assert message.covariance == array.array("d", [0.01, 0.0, 0.0, 0.04])
     assert message.header.stamp.nanosec == 5
+    assert (message.prediction, message.integrated_error) == (0.2, 0.3)
+    assert message.validation_shape == 0.01
+    assert math.isnan(message.validation_period)
+    assert list(message.point_real) == [2.0]
+    assert list(message.point_imaginary) == [-3.0]
 
 
 def test_a_complex_pair_is_left_to_the_polynomials() -> None:

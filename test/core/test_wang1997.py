@@ -17,9 +17,8 @@ from relay_autotune.identification.wang1997 import (
     fopdt_from_unbiased,
     fopdt_limit_cycle,
     fopdt_with_gain,
-    identify_biased,
-    identify_unbiased,
 )
+from relay_autotune.identification.wang_method import identify_biased, identify_unbiased
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
 from relay_autotune.sampled_relay import simulate_sampled_relay
