@@ -19,6 +19,7 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.identifier import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.parameters import Entry
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
@@ -32,6 +33,7 @@ TABLES: Mapping[str, Sequence[Entry]] = {
     "relay_node": (*TUNE_PARAMETERS, *FIXED_PARAMETERS),
     "identifier_node": IDENTIFIER_PARAMETERS,
     "plant_node": PLANT_PARAMETERS,
+    "controller_node": CONTROLLER_PARAMETERS,
 }
 
 _BLOCK = re.compile(
