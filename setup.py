@@ -30,6 +30,7 @@ setup(
     python_requires=">=3.11",
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
     extras_require={
+        "fleet": ["distributed", "pyarrow"],
         "report": ["jinja2", "matplotlib"],
         "test": ["control", "hypothesis", "pytest"],
     },

@@ -41,6 +41,9 @@ from relay_autotune.bag.source import MAGIC, Source
 # Records outside of chunks are read in pieces of this size.
 _PIECE = 4 << 20
 
+# What a chunk takes beside its content, compressed or not.
+_CHUNK_OVERHEAD = 1 << 20
+
 # Records that declare or hold messages; others are of no use inside of a chunk.
 _INSIDE = (SCHEMA, CHANNEL, MESSAGE)
 
@@ -89,9 +92,10 @@ def segment_content(source: Source, segment: Segment, largest: int) -> Content:
     """
     if not segment.is_chunk:
         return source.read(segment.start, segment.end)
-    if segment.end - segment.start > 2 * largest:
+    if segment.end - segment.start > largest + _CHUNK_OVERHEAD:
         raise DamageError(
-            f"a chunk of {segment.end - segment.start} bytes, more than --max-chunk allows"
+            f"a chunk takes {segment.end - segment.start} bytes, more than the {largest} that "
+            f"--max-chunk allows"
         )
     body = source.read(segment.start + RECORD.size, segment.end)
     whole = segment.whole and len(body) == segment.end - segment.start - RECORD.size

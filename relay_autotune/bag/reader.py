@@ -24,6 +24,9 @@ from relay_autotune.record import Record
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
 _WHOLE = ([".mcap", ".zstd"], [".mcap", ".zst"])
 
+# Fewer are not taken apart.
+_FEWEST_SAMPLES = 12
+
 # Beyond this, two topics' lags to the recorder differ by their clocks, not by the transport.
 _CLOCK_DIFFERENCE_NS = 100_000_000
 
@@ -100,7 +103,15 @@ def read_experiments(
                 for part in paths
                 for file in _data_files(part)
             ]
-            records, notes = _of_topics(Topics(path, files, wanted.clock, progress), wanted)
+            topics = Topics(path, files, wanted.clock, progress)
+            try:
+                records, notes = _of_topics(topics, wanted)
+            except BagError as error:
+                # What was found amiss may be why.
+                amiss = [note for note in topics.notes if note not in str(error)]
+                if not amiss:
+                    raise
+                raise type(error)("; ".join((str(error), *amiss))) from error
     parts = tuple(window(record, wanted.start, wanted.end) for record in records)
     return Recording(path, parts, tuple(notes))
 
@@ -175,7 +186,7 @@ def _joined(
 
 def _experiments(record: Record, wanted: Selection) -> tuple[list[Record], list[str]]:
     """Take a record of unknown origin apart, unless a part of it was asked for."""
-    if wanted.start is not None or wanted.end is not None:
+    if wanted.start is not None or wanted.end is not None or len(record) < _FEWEST_SAMPLES:
         return [record], []
     stretches = find_experiments(record)
     if not stretches:

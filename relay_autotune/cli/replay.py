@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import (
-    DONE,
-    NOTHING_FOUND,
-    USAGE,
-    finite,
-    guarded,
-    known_facts,
-    say,
-)
+from relay_autotune.bag.limits import LARGEST_CHUNK
+from relay_autotune.bag.reader import Selection
+from relay_autotune.bag.timing import CLOCKS
+from relay_autotune.cli.arguments import DONE, finite, guarded, known_facts, say
+from relay_autotune.cli.progress import ProgressLine
+from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.errors import RelayAutotuneError, SelectionError
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
-    from relay_autotune.identification.known import Known
-    from relay_autotune.record import Record
 
 PROGRAM = "replay"
 
 _EPILOG = """\
 A BAG is a rosbag2 directory, an .mcap file, or a .csv file with a header line.  Topics need not
-be named if the bag holds experiments of relay_node, or one pair of std_msgs/Float64 topics that
-looks like measurement and command.
+be named if the bag holds experiments of relay_node, or one pair of topics, each of a single
+number, that looks like measurement and command.
 
 Results go to standard output, everything else to standard error.
 Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command line, or the
@@ -38,9 +34,12 @@ choice of topics, does not fit.
 Examples:
   replay ~/.ros/relay_autotune/20261120T234315Z_2c010118
   replay --measurement /tank/level --command /tank/valve robot_bag
+  replay --measurement /imu:angular_velocity.z --command /wheel/voltage robot_bag
+  replay --jobs 8 --output fleet.csv bags/*
   replay --json log.csv --measurement level --command valve --time t
   replay --method chang --gain 1.65 --dead-time 10 robot_bag
   replay --method li without_extra_delay with_extra_delay     (several tests, one model)
+  replay --joint unbiased biased                              (the same, by all samples)
 """
 
 
@@ -63,10 +62,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help="recordings")
     parser.add_argument(
-        "--measurement", metavar="TOPIC", help="topic, or column of a CSV, of the measurement"
+        "--measurement", metavar="TOPIC[:FIELD]", help="topic, or column of a CSV, it is in"
     )
     parser.add_argument(
-        "--command", metavar="TOPIC", help="topic, or column of a CSV, of the command"
+        "--command", metavar="TOPIC[:FIELD]", help="topic, or column of a CSV, it is in"
     )
     parser.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
     parser.add_argument(
@@ -80,14 +79,92 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
     parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
     parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
+    parser.add_argument(
+        "--loss", metavar="NAME", help="huber or tukey: for a sensor with many outliers"
+    )
+    parser.add_argument(
+        "--joint",
+        action="store_true",
+        help="take all experiments for tests of one process, with one model",
+    )
     parser.add_argument("--rule", default="thyagarajan", help="how to tune (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
+    parser.add_argument(
+        "--clock", choices=CLOCKS, default=CLOCKS[0],
+        help="time of a message: when it was published, when it was recorded, or its header's "
+        "stamp (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--join", action="store_true", help="take all BAGs for one recording on one timeline"
+    )
+    parser.add_argument(
+        "--max-chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
+        help="leave out chunks that declare more than SIZE, such as 64M or 2G "
+        f"({LARGEST_CHUNK >> 20}M)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--report", metavar="FILE", help="write a report, too: .html, or a .png, .svg or .pdf"
+    )
+    parser.add_argument(
+        "--output", metavar="FILE",
+        help="write results as they come to a .jsonl, .csv or .parquet file instead; "
+        "bags that it already has are left out",
+    )  # fmt: skip
+    parser.add_argument(
+        "--jobs", type=_count, metavar="N", default=1, help="bags at a time (%(default)s)"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
+    )
     return parser
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 1024:
+        raise argparse.ArgumentTypeError(f"expected a number from 1 to 1024, found {text!r}")
+    return int(text)
+
+
+def _size(text: str) -> int:
+    match = re.fullmatch(r"(\d{1,12})([kMG]?)", text)
+    if match is None or int(match[1]) == 0:
+        raise argparse.ArgumentTypeError(f"expected a size such as 64M or 2G, found {text!r}")
+    return int(match[1]) << {"": 0, "k": 10, "M": 20, "G": 30}[match[2]]
+
+
 def _run(options: argparse.Namespace) -> int:
+    jobs = _jobs(options)
+    if options.report:
+        from relay_autotune.cli.report import check_output
+
+        check_output(options.report)
+        if options.output or options.scheduler or options.jobs > 1:
+            raise SelectionError("--report cannot be had with --output, --jobs or --scheduler")
+    if options.output:
+        return _into_file(jobs, options)
+    status = DONE
+    analyses: list[tuple[str, Analysis]] = []
+    for done, found in _in_order(jobs, options):
+        _tell(done)
+        if done.text:
+            print(done.text, flush=True)
+        status = max(status, done.status)
+        analyses += [(done.name, analysis) for analysis in found]
+    if options.report and analyses:
+        from relay_autotune.cli.report import write_report
+        from relay_autotune.report.case import case_of
+
+        write_report([case_of(analysis, name) for name, analysis in analyses], options.report)
+    return status
+
+
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    """Return what is to be done.
+
+    :raises SelectionError: if options contradict each other, or name what there is not.
+    """
     from relay_autotune.autotune import check_names
-    from relay_autotune.identification import JOINT_METHODS
+    from relay_autotune.identification import ONLY_JOINT
 
     try:
         check_names(options.method, options.rule)
@@ -97,74 +174,96 @@ def _run(options: argparse.Namespace) -> int:
     start, end = options.start, options.end
     if start is not None and end is not None and start >= end:
         raise SelectionError(f"--start {start:g} is not before --end {end:g}")
-    selection = Selection(options.measurement, options.command, options.time, start, end)
-    if options.method in JOINT_METHODS:
-        return _replay_jointly(selection, options, known)
-    return max(_replay(bag, selection, options, known) for bag in options.bags)
-
-
-def _replay(bag: str, selection: Selection, options: argparse.Namespace, known: Known) -> int:
-    """Read, identify, tune and print one bag; return the exit status it deserves."""
-    from relay_autotune.autotune import analyse
-
-    try:
-        records = _read(bag, selection)
-    except RelayAutotuneError as error:
-        return _unreadable(bag, error, options)
-    return _show(
-        bag,
-        [analyse(r, method=options.method, rule=options.rule, known=known) for r in records],
-        options,
+    selection = Selection(
+        options.measurement,
+        options.command,
+        options.time,
+        start,
+        end,
+        options.clock,
+        options.max_chunk,
     )
+    jointly = options.joint or options.method in ONLY_JOINT
+    with_table = not (options.json or options.output)
+    bags = list(dict.fromkeys(options.bags))
+    groups = [tuple(bags)] if jointly or options.join else [(bag,) for bag in bags]
+    return [
+        Job(
+            ", ".join(group),
+            # The workers of a cluster have working directories of their own.
+            tuple(str(Path(bag).absolute()) for bag in group) if options.scheduler else group,
+            selection,
+            options.method,
+            options.rule,
+            known,
+            jointly,
+            with_table,
+        )
+        for group in groups
+    ]
 
 
-def _replay_jointly(selection: Selection, options: argparse.Namespace, known: Known) -> int:
-    """Take the experiments of all bags for tests of one process."""
-    from relay_autotune.autotune import analyse_jointly
+def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
+    """Write results to a file as they come."""
+    from relay_autotune.cli.results import Results
 
-    records: list[Record] = []
-    for bag in options.bags:
-        try:
-            records += _read(bag, selection)
-        except RelayAutotuneError as error:
-            return _unreadable(bag, error, options)
-    analysis = analyse_jointly(records, method=options.method, rule=options.rule, known=known)
-    return _show(", ".join(options.bags), [analysis], options)
-
-
-def _read(bag: str, selection: Selection) -> tuple[Record, ...]:
-    recording = read_experiments(bag, selection)
-    for note in recording.notes:
-        say(PROGRAM, f"{bag}: {note}")
-    return recording.experiments
-
-
-def _unreadable(bag: str, error: RelayAutotuneError, options: argparse.Namespace) -> int:
-    text = str(error) if bag in str(error) else f"{bag}: {error}"
-    say(PROGRAM, text)
-    if options.json:
-        _print_document(bag, error=text)
-    return USAGE if isinstance(error, SelectionError) else NOTHING_FOUND
+    with Results(options.output) as results:
+        left = [job for job in jobs if job.name not in results.done]
+        status = results.status
+        if len(left) < len(jobs):
+            say(PROGRAM, f"{len(jobs) - len(left)} of {len(jobs)} bags are in {results.path}")
+        progress = ProgressLine(f"{PROGRAM}: bags done")
+        failed = 0
+        for count, (_, done) in enumerate(_as_they_come(left, options), start=1):
+            progress.clear()
+            _tell(done)
+            results.add(done.name, done.text)
+            failed += done.status != DONE
+            status = max(status, done.status)
+            progress(count, len(left))
+        progress.clear()
+    of_these = f", {failed} of them without a model" if failed else ""
+    say(PROGRAM, f"{len(left)} bags done{of_these}; results in {options.output}")
+    return status
 
 
-def _show(bag: str, analyses: Sequence[Analysis], options: argparse.Namespace) -> int:
-    if options.json:
-        _print_document(bag, analyses)
+def _in_order(
+    jobs: Sequence[Job], options: argparse.Namespace
+) -> Iterator[tuple[Done, tuple[Analysis, ...]]]:
+    """Yield results in the order of the command line."""
+    if options.jobs > 1 or options.scheduler:
+        early: dict[int, Done] = {}
+        due = 0
+        for number, done in _as_they_come(jobs, options):
+            early[number] = done
+            while due in early:
+                yield early.pop(due), ()
+                due += 1
+        return
+    for job in jobs:
+        progress = ProgressLine(f"{PROGRAM}: {job.name} read")
+        found = replay(job, progress)
+        progress.clear()
+        yield found
+
+
+def _as_they_come(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[tuple[int, Done]]:
+    if options.scheduler:
+        from relay_autotune.cli.fleet import on_cluster
+
+        yield from on_cluster(jobs, options.scheduler)
+    elif options.jobs > 1 and len(jobs) > 1:
+        from relay_autotune.cli.fleet import in_processes
+
+        yield from in_processes(jobs, options.jobs)
     else:
-        from relay_autotune.cli.table import table
-
-        print(table(bag, analyses))
-    if any(analysis.models for analysis in analyses):
-        return DONE
-    for analysis in analyses:
-        say(PROGRAM, f"{bag}: nothing identified: {analysis.reason}")
-    return NOTHING_FOUND
+        for number, job in enumerate(jobs):
+            yield number, replay(job)[0]
 
 
-def _print_document(bag: str, analyses: Sequence[Analysis] = (), error: str | None = None) -> None:
-    from relay_autotune.document import document, to_json
-
-    print(to_json(document(bag, analyses, error=error)), flush=True)
+def _tell(done: Done) -> None:
+    for sentence in done.said:
+        say(PROGRAM, sentence)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,137 @@
+"""What `replay` makes of one bag: the same in this process, in another one and on another host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE
+from relay_autotune.errors import RelayAutotuneError, SelectionError
+
+if TYPE_CHECKING:
+    from relay_autotune.autotune import Analysis
+    from relay_autotune.identification.known import Known
+    from relay_autotune.record import Record
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One bag to replay, or several that are one.
+
+    :param name: how results call it.
+    :param paths: the recordings; several are one timeline, or tests of one process.
+    :param selection: what of them is wanted.
+    :param method: whose model counts.
+    :param rule: whose gains count.
+    :param known: what is known of the process.
+    :param jointly: whether the experiments of all recordings give one model.
+    :param with_table: whether the table for people is wanted, else the document.
+    """
+
+    name: str
+    paths: tuple[str, ...]
+    selection: Selection
+    method: str
+    rule: str
+    known: Known
+    jointly: bool = False
+    with_table: bool = False
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a job.
+
+    :param name: that of the job.
+    :param status: the exit status that it deserves.
+    :param said: sentences for standard error.
+    :param text: the table, or the document on one line; empty: there is none.
+    """
+
+    name: str
+    status: int
+    said: tuple[str, ...]
+    text: str
+
+
+def work(job: Job) -> Done:
+    """Read, identify and tune; an error becomes part of the result.
+
+    :param job: what to do.
+    """
+    return replay(job)[0]
+
+
+def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Analysis, ...]]:
+    """Read, identify and tune; return also the analyses themselves.
+
+    :param job: what to do.
+    :param progress: told of how far a bag has been read.
+    """
+    said: list[str] = []
+    try:
+        analyses = _analysed(job, said, progress)
+    except SelectionError as error:
+        return _failed(job, said, str(error), USAGE), ()
+    except RelayAutotuneError as error:
+        return _failed(job, said, str(error), NOTHING_FOUND), ()
+    except (Exception, RecursionError) as error:  # noqa: BLE001  it must not stop the other bags
+        why = f"{job.name}: could not be analysed: {type(error).__name__}: {error}"
+        return _failed(job, said, why, NOTHING_FOUND), ()
+    status = DONE
+    if not any(analysis.models for analysis in analyses):
+        status = NOTHING_FOUND
+        said += [f"{job.name}: nothing identified: {a.reason}" for a in analyses]
+    return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
+
+
+def _analysed(job: Job, said: list[str], progress: Progress | None) -> tuple[Analysis, ...]:
+    # Loading scipy takes longer than finding out that a bag does not exist.
+    if job.jointly:
+        records: list[Record] = []
+        for path in job.paths:
+            recording = read_experiments(path, job.selection, progress)
+            said += [f"{path}: {note}" for note in recording.notes]
+            records += recording.experiments
+        from relay_autotune.autotune import analyse_jointly
+
+        found = analyse_jointly(records, method=job.method, rule=job.rule, known=job.known)
+        return (found,)
+    recording = read_experiments(job.paths, job.selection, progress)
+    said += [f"{job.name}: {note}" for note in recording.notes]
+    from relay_autotune.autotune import analyse
+
+    return tuple(
+        analyse(record, method=job.method, rule=job.rule, known=job.known)
+        for record in recording.experiments
+    )
+
+
+def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:
+    if job.with_table:
+        if error is not None:
+            return ""
+        from relay_autotune.cli.table import table
+
+        return table(job.name, analyses)
+    from relay_autotune.document import document, to_json
+
+    return to_json(document(job.name, analyses, error=error))
+
+
+def _failed(job: Job, said: Sequence[str], why: str, status: int) -> Done:
+    sentence = why if any(p in why for p in (job.name, *job.paths)) else f"{job.name}: {why}"
+    return Done(job.name, status, (*said, sentence), _text(job, (), sentence))
+
+
+def died(job: Job, how: str) -> Done:
+    """Return the result of a job that took its process down.
+
+    :param job: the job.
+    :param how: what happened, for people.
+    """
+    return _failed(job, (), f"{job.name}: {how}", NOTHING_FOUND)

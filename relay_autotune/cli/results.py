@@ -1,0 +1,200 @@
+"""The results of many bags in a file, as they come; a run that was cut short goes on from it."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND
+from relay_autotune.errors import BagError, SelectionError
+
+ENDINGS = (".jsonl", ".csv", ".parquet")
+
+_OF_EXPERIMENT = ("start", "duration", "outcome", "reason", "experiment_id")
+_OF_MODEL = (
+    *("method", "structure", "gain", "zeros", "time_constants", "dead_time"),
+    *("ultimate_gain", "ultimate_gain_std", "ultimate_frequency", "ultimate_frequency_std"),
+)
+_OF_GAINS = (
+    *("rule", "kc", "ti", "td", "tf", "b", "p", "i", "d", "ms", "ms_95", "mt"),
+    *("gain_margin", "phase_margin", "delay_margin", "iae_load"),
+)
+_TEXTS = {
+    *("bag", "error", "outcome", "reason", "experiment_id", "method", "structure", "rule"),
+    *("zeros", "time_constants"),
+}
+COLUMNS = (
+    *("bag", "experiment", "error"),
+    *_OF_EXPERIMENT,
+    *_OF_MODEL,
+    *("fit", "residual_rms"),
+    *_OF_GAINS,
+)
+
+
+class Results:
+    """A file of results, one document a line; a table is made of it at the end.
+
+    :param output: the file: ``.jsonl`` holds the documents; ``.csv`` and ``.parquet`` a table
+        with a row for each experiment, and the documents are in the same name with ``.jsonl``
+        added.
+    :raises SelectionError: if the ending is another one.
+    :raises BagError: if the file cannot be written, is in use, or holds something else.
+    """
+
+    def __init__(self, output: str) -> None:
+        self._table = Path(output)
+        kind = self._table.suffix.lower()
+        if kind not in ENDINGS:
+            raise SelectionError(
+                f"--output {output!r} does not say what to write; expected an ending "
+                f"{', '.join(ENDINGS)}"
+            )
+        if kind == ".parquet":
+            _pyarrow()
+        self.path = self._table if kind == ".jsonl" else Path(f"{output}.jsonl")
+        self.done: set[str] = set()
+        self.status = DONE
+        try:
+            self._file = self.path.open("a+b")
+        except OSError as error:
+            raise BagError(f"cannot write {self.path}: {error.strerror or error}") from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._take_up()
+        except BlockingIOError:
+            self._file.close()
+            raise BagError(f"{self.path} is being written by another process") from None
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if self._table != self.path:
+                self._write_table()
+        finally:
+            self._file.close()
+
+    def add(self, name: str, document: str) -> None:
+        """Add the document of a bag, in one piece; it outlives this process.
+
+        :param name: of the bag.
+        :param document: on one line.
+        :raises BagError: if the file system refuses.
+        """
+        try:
+            self._file.write(document.encode() + b"\n")
+            self._file.flush()
+        except OSError as error:
+            raise BagError(f"cannot write {self.path}: {error.strerror or error}") from error
+        self.done.add(name)
+
+    def _take_up(self) -> None:
+        """Find what is done; a last line that was cut is taken away."""
+        self._file.seek(0)
+        end = 0
+        for line in self._file:
+            if not line.endswith(b"\n"):
+                os.ftruncate(self._file.fileno(), end)
+                break
+            document = self._document(line)
+            self.done.add(document["bag"])
+            if not _identified(document):
+                self.status = NOTHING_FOUND
+            end += len(line)
+
+    def _document(self, line: bytes) -> dict[str, Any]:
+        try:
+            document = json.loads(line)
+        except ValueError:
+            document = None
+        if isinstance(document, dict) and isinstance(document.get("bag"), str):
+            return document
+        raise BagError(
+            f"{self.path} exists and holds something else than results of replay; "
+            f"name another file, or take it away"
+        )
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        self._file.seek(0)
+        for line in self._file:
+            yield from rows(self._document(line))
+
+    def _write_table(self) -> None:
+        new = self._table.with_name(self._table.name + ".tmp")
+        try:
+            if self._table.suffix.lower() == ".csv":
+                with new.open("w", newline="", encoding="utf-8") as file:
+                    writer = csv.DictWriter(file, COLUMNS)
+                    writer.writeheader()
+                    writer.writerows(self._rows())
+            else:
+                pyarrow = _pyarrow()
+                text, number = pyarrow.string(), pyarrow.float64()
+                schema = pyarrow.schema(
+                    (name, text if name in _TEXTS else number) for name in COLUMNS
+                )
+                table = pyarrow.Table.from_pylist(list(self._rows()), schema=schema)
+                pyarrow.parquet.write_table(table, new)
+            new.replace(self._table)
+        except OSError as error:
+            raise BagError(f"cannot write {self._table}: {error.strerror or error}") from error
+
+
+def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield a row for each experiment of a bag; one with the error alone where there is none.
+
+    :param document: as `replay --json` prints it.
+    """
+    base = dict.fromkeys(COLUMNS) | {
+        "bag": document["bag"],
+        "error": document.get("error"),
+    }
+    experiments = document.get("experiments", [])
+    if not experiments:
+        yield base
+    for number, experiment in enumerate(experiments, start=1):
+        row = base | {"experiment": number} | {n: experiment[n] for n in _OF_EXPERIMENT}
+        if experiment["selected"] is not None:
+            model = experiment["models"][experiment["selected"]]
+            row |= {name: _cell(model[name]) for name in _OF_MODEL}
+            row |= {name: model["fit"][name] for name in ("fit", "residual_rms")}
+        if experiment["recommended"] is not None:
+            gains = experiment["gains"][experiment["recommended"]]
+            row |= {name: gains[name] for name in _OF_GAINS}
+        yield row
+
+
+def _cell(value: Any) -> Any:
+    return json.dumps(value) if isinstance(value, list) else value
+
+
+def _identified(document: dict[str, Any]) -> bool:
+    return any(experiment.get("models") for experiment in document.get("experiments", []))
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow  # type: ignore[import-untyped]
+        import pyarrow.parquet  # type: ignore[import-untyped]
+    except ImportError:
+        raise BagError(
+            "a .parquet file needs the Python package pyarrow; install it with: "
+            "pip install pyarrow, or choose .csv"
+        ) from None
+    return pyarrow

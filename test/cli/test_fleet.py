@@ -1,0 +1,188 @@
+"""Many bags: in processes, on a cluster, into files, and again after a run that was cut short."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import os
+
+import pytest
+from fleet_work import die_of_bag_3, die_once, mark
+from made_bags import REPOSITORY
+
+from relay_autotune.bag.reader import Selection
+from relay_autotune.cli import replay
+from relay_autotune.cli.fleet import in_processes, on_cluster
+from relay_autotune.cli.replay_bag import Job
+from relay_autotune.cli.results import COLUMNS, Results, rows
+from relay_autotune.errors import BagError
+from relay_autotune.identification.known import Known
+
+STEP = REPOSITORY / "bags" / "step_test"
+# A method that finds nothing in a step test leaves the time to what is tested here.
+QUICK = ("--method", "thyagarajan")
+
+
+def run(capsys, *arguments):
+    status = replay.main([str(a) for a in arguments])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def jobs(count, folder=None):
+    return [
+        Job(f"bag{k}", (str(folder),), Selection(), "waveform", "imc", Known())
+        for k in range(count)
+    ]
+
+
+def links(folder, count):
+    """Lay out one bag under many names."""
+    paths = [folder / f"bag_{k}" for k in range(count)]
+    for path in paths:
+        path.symlink_to(STEP)
+    return paths
+
+
+def test_processes_do_each_bag_once(tmp_path):
+    found = dict(in_processes(jobs(20, tmp_path), 2, mark))
+    assert {number: done.name for number, done in found.items()} == {
+        k: f"bag{k}" for k in range(20)
+    }
+    assert all((tmp_path / f"bag{k}").read_text() == "x" for k in range(20))
+
+
+def test_a_bag_that_takes_its_process_down_is_reported_and_the_others_are_done(tmp_path):
+    found = list(in_processes(jobs(10, tmp_path), 2, die_of_bag_3))
+    assert sorted(number for number, _ in found) == list(range(10))
+    for number, done in found:
+        assert done.status == (1 if number == 3 else 0)
+    assert "ended from outside" in dict(found)[3].said[0]
+
+
+def test_a_cluster_of_which_a_worker_is_killed_loses_nothing_and_does_nothing_twice(
+    tmp_path, monkeypatch
+):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY / "test" / "support"), prepend=os.pathsep)
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster:
+        do = functools.partial(die_once, number=10)
+        found = list(on_cluster(jobs(30, tmp_path), cluster.scheduler_address, do))
+    assert (tmp_path / "died").exists()
+    assert sorted(number for number, _ in found) == list(range(30))
+    assert all(done.name == f"bag{number}" and done.status == 0 for number, done in found)
+
+
+def test_no_scheduler_is_said_in_one_line(capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("relay_autotune.cli.fleet._CONNECT_S", 0.3)
+    status, out, err = run(capsys, STEP, "--scheduler", "tcp://127.0.0.1:9", *QUICK)
+    assert (status, out) == (1, "")
+    assert "cannot reach the scheduler tcp://127.0.0.1:9" in err.splitlines()[-1]
+
+
+def test_results_come_in_the_order_of_the_command_line(tmp_path, capsys):
+    paths = [*links(tmp_path, 3), tmp_path / "none"]
+    status, out, err = run(capsys, "--json", "--jobs", 2, *paths, *QUICK)
+    assert [json.loads(line)["bag"] for line in out.splitlines()] == list(map(str, paths))
+    assert status == 1
+    assert "none does not exist" in err
+
+
+def test_a_run_that_was_cut_short_goes_on(tmp_path, capsys):
+    paths, output = links(tmp_path, 4), tmp_path / "out.jsonl"
+    run(capsys, *paths[:2], "--output", output, *QUICK)
+    whole = output.read_bytes()
+    # The third was being written when the machine went down.
+    output.write_bytes(whole + whole[:100])
+    status, out, err = run(capsys, *paths, paths[0], "--output", output, *QUICK)
+    assert (status, out) == (1, "")
+    assert "2 of 4 bags are in" in err
+    documents = [json.loads(line) for line in output.read_text().splitlines()]
+    assert [document["bag"] for document in documents] == list(map(str, paths))
+    assert output.read_bytes().startswith(whole)
+
+
+def test_a_bad_bag_leaves_a_row_with_its_reason(tmp_path, capsys):
+    output = tmp_path / "out.csv"
+    run(capsys, STEP, tmp_path / "none", "--output", output)
+    with output.open() as file:
+        good, bad = csv.DictReader(file)
+    assert float(good["gain"]) == pytest.approx(0.8, rel=0.01)
+    assert float(good["kc"]) > 0.0
+    assert good["error"] == ""
+    assert "does not exist" in bad["error"]
+    assert bad["gain"] == ""
+
+
+def test_a_table_in_parquet(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    output = tmp_path / "out.parquet"
+    document = {"bag": "b", "experiments": [], "error": "is empty"}
+    with Results(str(output)) as results:
+        results.add("b", json.dumps(document))
+    table = parquet.read_table(output)
+    assert tuple(table.column_names) == COLUMNS
+    (row,) = table.to_pylist()
+    assert (row["bag"], row["error"], row["kc"]) == ("b", "is empty", None)
+    assert list(rows(document)) == [row]
+
+
+def test_files_that_cannot_be_results(tmp_path, capsys):
+    status, _, err = run(capsys, STEP, "--output", tmp_path / "out.txt", *QUICK)
+    assert status == 2
+    assert "expected an ending .jsonl, .csv, .parquet" in err
+    other = tmp_path / "other.jsonl"
+    other.write_text("precious\n")
+    status, _, err = run(capsys, STEP, "--output", other, *QUICK)
+    assert status == 1
+    assert "holds something else than results of replay" in err
+    assert other.read_text() == "precious\n"
+    with Results(str(tmp_path / "used.jsonl")), pytest.raises(BagError, match="being written by"):
+        Results(str(tmp_path / "used.jsonl"))
+
+
+def test_a_defect_in_one_bag_does_not_stop_the_others(tmp_path, capsys, monkeypatch):
+    def fail(path, *rest):
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr("relay_autotune.cli.replay_bag.read_experiments", fail)
+    status, out, err = run(capsys, "--json", "a", "b", *QUICK)
+    assert status == 1
+    assert [json.loads(line)["error"] for line in out.splitlines()] == [
+        f"{name}: could not be analysed: ZeroDivisionError: a defect" for name in "ab"
+    ]
+    assert err.count("\n") == 2
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--jobs", "0"],
+        ["--jobs", "many"],
+        ["--max-chunk", "0"],
+        ["--max-chunk", "4T"],
+        ["--clock", "sun"],
+    ],
+)
+def test_wrong_options_have_status_2(options, capsys):
+    with pytest.raises(SystemExit) as caught:
+        replay.main(["bag", *options])
+    assert caught.value.code == 2
+
+
+def test_a_chunk_beyond_the_limit_is_left_out_and_said(capsys):
+    arguments = (STEP, "--measurement", "/reactor/temperature", "--command", "/reactor/heater")
+    status, _, err = run(capsys, *arguments, "--max-chunk", "1k")
+    assert status == 1
+    assert "declares 53012 bytes, more than the 1024 that --max-chunk allows" in err
+
+
+def test_two_bags_on_one_timeline(tmp_path, capsys):
+    status, out, _ = run(capsys, "--json", "--join", STEP, STEP / "step_test_0.mcap", *QUICK)
+    assert status == 1
+    (document,) = map(json.loads, out.splitlines())
+    assert document["bag"] == f"{STEP}, {STEP / 'step_test_0.mcap'}"
+    assert len(document["experiments"]) == 1
