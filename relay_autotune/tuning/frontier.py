@@ -32,6 +32,8 @@ from relay_autotune.models import TransferFunction
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+_NEIGHBOURS = np.array([0.995, 1.0, 1.005])
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -62,9 +64,25 @@ class Responses:
     """
 
     def __init__(self, models: Sequence[TransferFunction], grid: FloatArray) -> None:
+        self._models = tuple(models)
         self.grid = grid
-        sign = models[0].process_sign
-        self.inverse = np.array([sign / m(1j * grid) for m in models])
+        self.inverse = self._evaluate(grid)
+
+    def _evaluate(self, grid: FloatArray) -> ComplexArray:
+        sign = self._models[0].process_sign
+        return np.array([sign / m(1j * grid) for m in self._models])
+
+    def add(self, frequencies: FloatArray) -> None:
+        """Add frequencies to the grid, with neighbours on either side.
+
+        :param frequencies: rad/s, shape (k,).
+        """
+        near = np.unique(frequencies[:, None] * _NEIGHBOURS)
+        near = near[~np.isin(near, self.grid)]
+        grid = np.concatenate((self.grid, near))
+        order = np.argsort(grid)
+        inverse = np.concatenate((self.inverse, self._evaluate(near)), axis=1)
+        self.grid, self.inverse = grid[order], inverse[:, order]
 
     def largest_ki(
         self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray

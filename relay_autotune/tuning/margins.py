@@ -20,6 +20,9 @@ Loop = Callable[[ComplexArray], ComplexArray]
 _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
 _BISECTIONS = 50
+# Below this magnitude a loop is not felt, whatever its phase.
+_FELT = 0.05
+_MOST_TURNS = 800.0 * math.pi
 
 
 @dataclass(frozen=True)
@@ -51,11 +54,18 @@ def frequencies(*terms: TransferFunction) -> FloatArray:
     :return: rad/s, increasing.
     """
     constants = [c for t in terms for c in (*t.zeros, *t.time_constants)]
-    dead_times = [t.dead_time for t in terms if t.dead_time > 0.0]
+    dead_times = sorted({t.dead_time for t in terms if t.dead_time > 0.0})
     corners = [1.0 / abs(c) for c in constants] + [1.0 / d for d in dead_times] or [1.0]
     low, high = min(corners) * 1e-3, max(corners) * 1e2
-    parts = [np.geomspace(low, high, 50 * max(int(math.log10(high / low)), 1))]
-    parts += [np.arange(0.05, 12.0 * math.pi, 0.05) / d for d in sorted(set(dead_times))]
+    grid = np.geomspace(low, high, 50 * max(int(math.log10(high / low)), 1))
+    parts = [grid]
+    if dead_times:
+        felt = np.max([np.abs(t(1j * grid)) for t in terms], axis=0) > _FELT
+        last = float(grid[felt][-1]) if felt.any() else low
+    for d in dead_times:
+        # Turn by turn, coarser where the loop only passes by again and again.
+        parts.append(np.arange(0.05, 12.0 * math.pi, 0.05) / d)
+        parts.append(np.arange(12.0 * math.pi, min(last * d, _MOST_TURNS), 0.2) / d)
     for c in constants:
         if c.imag > 0.0:
             centre, width = 1.0 / abs(c), abs(c.real) / abs(c)
@@ -69,11 +79,11 @@ def sensitivity_peaks(loop: Loop, grid: FloatArray) -> tuple[float, float]:
     :param loop: L as a function of s.
     :param grid: frequencies near which the peaks are sought [rad/s], increasing.
     """
-    (ms, _), (mt, _) = _peaks(loop, grid)
+    (ms, _), (mt, _) = peaks(loop, grid)
     return ms, mt
 
 
-def _peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
+def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the largest magnitudes of both sensitivities, each with its frequency."""
     values = loop(1j * grid)
     sensitivity = 1.0 / np.abs(1.0 + values)
@@ -142,7 +152,7 @@ def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> Margi
     crossovers = _roots(lambda w: np.log(np.abs(loop(1j * w))), grid[cells], grid[cells + 1])
     lead = np.angle(-loop(1j * crossovers)) if crossovers.size else np.empty(0)
     delays = np.mod(lead, 2.0 * math.pi) / crossovers
-    (ms, at), (mt, _) = _peaks(loop, grid)
+    (ms, at), (mt, _) = peaks(loop, grid)
     return Margins(
         # For w -> infinity the one tends to 1, for w -> 0 with integral action the other.
         ms=max(ms, 1.0),

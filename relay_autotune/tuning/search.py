@@ -22,6 +22,7 @@ from relay_autotune.tuning.frontier import Bounds, Responses
 from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.load_cost import load_iaes
+from relay_autotune.tuning.margins import frequencies, peaks
 from relay_autotune.tuning.noise import filter_for
 from relay_autotune.ultimate import ultimate_point
 
@@ -39,6 +40,8 @@ _TRIED_AT_ONCE = 40
 # What a bound may exceed 1 by.
 _LEAST_EXCESS, _LARGEST_EXCESS, _EXCESS_TOLERANCE = 0.01, 100.0, 0.01
 _MARGIN = 1.2
+# Bounds are kept to this part, after so many additions to the grid.
+_HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
 _NO_LIMIT = (
     "nothing limits the gain of a controller on this model, which has no dead time: give the "
@@ -147,17 +150,38 @@ class Search:
             return None
         if np.isinf(scanned.ki).any():
             raise TuningError(_NO_LIMIT)
-        start, iae = alone.least(scanned)
-        point, iae = alone.descend(bounds, start, iae)
+        point, iae = alone.descend(bounds, *alone.least(scanned))
+        point, iae = alone.settle(bounds, point, iae)
         if self.models:
             found = self._nearby(bounds, point)
             if found is None:
                 return None
-            point, iae = self.descend(bounds, *found)
+            point, iae = self.settle(bounds, *self.descend(bounds, *found))
         best = self._at(bounds, point[None])
         if best.kp[0] > _UNLIMITED * self._largest_kp:
             raise TuningError(_NO_LIMIT)
         return Optimum(best.controller(0, self.model.process_sign), iae)
+
+    def settle(self, bounds: Bounds, point: FloatArray, iae: float) -> tuple[FloatArray, float]:
+        """Return the optimum once the bounds hold between the frequencies of the grid as well.
+
+        Where they do not, the frequencies at which they are exceeded join the grid.
+
+        :param bounds: on the sensitivities.
+        :param point: as for :meth:`descend`.
+        :param iae: there [y s/u].
+        """
+        for _ in range(_MOST_ADDED):
+            loop = self._at(bounds, point[None]).controller(0, self.model.process_sign)
+            exact = loop.loop(self.model)
+            found = zip(peaks(exact, frequencies(exact)), (bounds.ms, bounds.mt), strict=True)
+            missed = [w for (peak, w), bound in found if peak > _HELD * bound]
+            if not missed:
+                break
+            self.responses.add(np.array(missed))
+            start = point - np.append([0.02], np.zeros(point.size - 1))
+            point, iae = self.descend(bounds, start, math.inf)
+        return point, iae
 
     def largest_integral_gain(self, bounds: Bounds) -> Controller | None:
         """Return the PI controller of largest integral gain (MIGO, Astrom et al. 1998).
