@@ -1,3 +1,94 @@
-"""Relay-feedback autotuning: experiments, identification and controller design."""
+"""Relay-feedback autotuning: experiments, identification and controller design.
+
+What is listed in ``__all__`` is the interface for programs and notebooks; it is loaded when it is
+asked for, so that nodes and commands pay only for what they use::
+
+    from relay_autotune import analyse, draw, read_records
+
+    found = analyse(read_records("log.csv")[0])
+    print(found.model.model, found.best_gains.kc, found.best_gains.ti)
+    draw(found, "tune.png", title="Tank 7")
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from relay_autotune.autotune import Analysis, analyse
+    from relay_autotune.bag.records import read_records
+    from relay_autotune.errors import RelayAutotuneError
+    from relay_autotune.identification import METHODS, Identification, Known, identify
+    from relay_autotune.models import STRUCTURES, TransferFunction
+    from relay_autotune.python_control import to_control
+    from relay_autotune.record import Outcome, PiecewiseConstant, Record, RelaySettings
+    from relay_autotune.relay import RelayExperiment
+    from relay_autotune.relay_parameters import ExperimentParameters
+    from relay_autotune.report import draw, write_report
+    from relay_autotune.tuning import RULES, Controller, Gains, tune
+    from relay_autotune.tuning.closed_loop import simulate_closed_loop
+    from relay_autotune.ultimate import ultimate_point
+    from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+_HOMES = {
+    "autotune": ("Analysis", "analyse"),
+    "bag.records": ("read_records",),
+    "errors": ("RelayAutotuneError",),
+    "identification": ("METHODS", "Identification", "Known", "identify"),
+    "models": ("STRUCTURES", "TransferFunction"),
+    "python_control": ("to_control",),
+    "record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
+    "relay": ("RelayExperiment",),
+    "relay_parameters": ("ExperimentParameters",),
+    "report": ("draw", "write_report"),
+    "tuning": ("RULES", "Controller", "Gains", "tune"),
+    "tuning.closed_loop": ("simulate_closed_loop",),
+    "ultimate": ("ultimate_point",),
+    "virtual_process": ("Disturbances", "VirtualProcess"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [  # noqa: RUF022  in the order in which one meets them
+    "read_records",
+    "analyse",
+    "Analysis",
+    "draw",
+    "write_report",
+    "Record",
+    "RelaySettings",
+    "Outcome",
+    "PiecewiseConstant",
+    "identify",
+    "Identification",
+    "Known",
+    "METHODS",
+    "TransferFunction",
+    "STRUCTURES",
+    "ultimate_point",
+    "tune",
+    "Gains",
+    "Controller",
+    "RULES",
+    "simulate_closed_loop",
+    "RelayExperiment",
+    "ExperimentParameters",
+    "VirtualProcess",
+    "Disturbances",
+    "to_control",
+    "RelayAutotuneError",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -31,3 +31,11 @@ class BagError(RelayAutotuneError, ValueError):
 
 class SelectionError(BagError):
     """A choice of topics or columns that a recording does not offer, or offers twice."""
+
+
+class MissingPackageError(RelayAutotuneError, ImportError):
+    """A Python package that is needed for this alone and is not installed."""
+
+
+class LoopError(RelayAutotuneError, RuntimeError):
+    """The nodes of a running loop are not there, or do not answer."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.errors import ModelError
+from relay_autotune.notation import process_latex, process_text
 
 ComplexArray = NDArray[np.complex128]
 
@@ -65,7 +66,7 @@ class TransferFunction:
         constants = tuple(complex(t) for t in self.time_constants if t != 0.0)
         numbers = (self.gain, self.dead_time, *zeros, *constants)
         if not all(np.isfinite(n) for n in numbers):
-            raise ModelError(f"every number of a transfer function must be finite, found {self}")
+            raise ModelError(f"every number of a transfer function must be finite, found {self!r}")
         if self.gain == 0.0:
             raise ModelError("the gain of a transfer function must not be zero")
         if self.dead_time < 0.0:
@@ -81,6 +82,14 @@ class TransferFunction:
         object.__setattr__(self, "dead_time", float(self.dead_time))
         object.__setattr__(self, "zeros", zeros)
         object.__setattr__(self, "time_constants", constants)
+
+    def __str__(self) -> str:
+        """Return the transfer function on one line."""
+        return process_text(self)
+
+    def _repr_latex_(self) -> str:
+        """Return the transfer function as notebooks show it."""
+        return f"$\\displaystyle {process_latex(self)}$"
 
     def __call__(self, s: ArrayLike) -> ComplexArray:
         """Return G at each complex frequency ``s`` [rad/s], any shape."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 PICTURES = (".png", ".svg", ".pdf")
 
-__all__ = ["PICTURES", "draw", "write_figures", "write_page", "write_picture"]
+__all__ = ["PICTURES", "draw", "write_figures", "write_page", "write_picture", "write_report"]
 
 
 def draw(
@@ -45,6 +45,29 @@ def write_picture(case: Case, path: Path | str, *, title: str = "") -> None:
     from relay_autotune.report.picture import draw_picture
 
     draw_picture(case, Path(path), title=title or case.source)
+
+
+def write_report(
+    analyses: Analysis | Sequence[Analysis],
+    path: Path | str,
+    *,
+    title: str = "",
+    truth: TransferFunction | None = None,
+) -> None:
+    """Write the report of one or several analysed records as one HTML file.
+
+    :param analyses: at least one.
+    :param path: the file.
+    :param title: of the page; default: the id of the first experiment.
+    :param truth: the process, where it was a simulated one.
+    """
+    from relay_autotune.autotune import Analysis
+    from relay_autotune.report.case import case_of
+
+    several = [analyses] if isinstance(analyses, Analysis) else list(analyses)
+    default = "Relay experiment"
+    cases = [case_of(a, a.record.experiment_id or title or default, truth=truth) for a in several]
+    write_page(cases, path, title=title)
 
 
 def write_page(cases: Sequence[Case], path: Path | str, *, title: str = "") -> None:

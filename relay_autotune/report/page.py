@@ -116,13 +116,14 @@ def _section(case: Case, number: int, many: bool) -> _Section:
     verdict: Verdict = verdict_of(case)
     present = [plate for plate in PLATES if not plate.missing(case)]
     alone = sum(not plate.wide for plate in present) == 1
-    name = case.source if not case.experiment_id else f"{case.source}, {case.experiment_id}"
+    known = not case.experiment_id or case.experiment_id in case.source
+    name = case.source if known else f"{case.source}, {case.experiment_id}"
     return _Section(
         case=case,
         name=name,
         verdict=verdict.text,
         tone=verdict.tone,
-        facts=facts_of(case, with_id=not many),
+        facts=facts_of(case, with_id=not many and not known),
         warnings=warnings_of(case),
         checks=checks_of(case),
         numbers=numbers_of(case),

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, se
 
 from relay_autotune.autotune import analyse
 from relay_autotune.cli import demo
+from relay_autotune.models import TransferFunction
 from relay_autotune.relay import RelayExperiment
 from relay_autotune.relay_parameters import ExperimentParameters
 from relay_autotune.virtual_process import Disturbances, VirtualProcess
@@ -65,6 +67,38 @@ def test_logs_of_other_tools_are_read_by_the_commands_shown(
     assert [status for _, status in said] == [0, 0, 0]
     models = [re.findall(r"process +(.*)", output) for output, _ in (said[0], said[2])]
     assert models[0] == models[1] != []
+
+
+def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("control")
+    monkeypatch.chdir(tmp_path)
+    t = np.arange(0.0, 120.0, 0.1)
+    valve = np.where(t < 20.0, 30.0, np.where(t < 75.0, 45.0, 38.0))
+    tank = TransferFunction.fopdt(0.8, 12.0, 3.4)
+    process = VirtualProcess(
+        tank,
+        rest_measurement=61.0,
+        rest_command=30.0,
+        disturbances=Disturbances(noise_std=0.02),
+        seed=3,
+    )
+    rows = ["t,level,valve"]
+    for time, position in zip(t, valve, strict=True):
+        rows.append(f"{time},{process.measure(time)},{position}")
+        process.command(position)
+    Path("log.csv").write_text("\n".join(rows) + "\n")
+    code = block_noted("README.md", "in Python").text
+    assert len([line for line in code.splitlines() if line]) == 10
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert names["model"].model.dead_time == pytest.approx(3.4, abs=0.05)
+    assert capsys.readouterr().out.splitlines()[0] in code
+    w, loop = 0.1, names["gains"].loop(names["model"].model)
+    assert names["loop"](1j * w) == pytest.approx(complex(loop(1j * w)), rel=1e-3)
+    assert Path("figure.png").read_bytes().startswith(b"\x89PNG")
+    assert "Tank 7" in Path("report.html").read_text()
 
 
 def test_the_demo_shown_is_the_one_computed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,7 +49,8 @@ def blocks(*languages: str, pages: tuple[Path, ...] = PAGES) -> list[Block]:
 
 def block_noted(page: str, note: str) -> Block:
     """Return the one block of a page that has a note."""
-    (found,) = (b for b in blocks("sh", "text", "yaml") if (b.page, b.note) == (page, note))
+    kinds = ("python", "sh", "text", "yaml")
+    (found,) = (b for b in blocks(*kinds) if (b.page, b.note) == (page, note))
     return found
 
 
