@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relay_autotune.cycles import cycles_of
+from relay_autotune.cycles import cycles_of, limit_cycle
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
 from relay_autotune.identification import (
     DEFAULT_METHOD,
@@ -22,7 +23,18 @@ from relay_autotune.identification.assessment import assess
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record
-from relay_autotune.tuning import DEFAULT_RULE, RULES, Gains, ensemble, rule_named, tune
+from relay_autotune.tuning import (
+    DEFAULT_RULE,
+    RULES,
+    DesignOptions,
+    DesignTask,
+    Gains,
+    design,
+    ensemble,
+    rule_named,
+)
+from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
+from relay_autotune.ultimate import UltimatePoint
 
 _NO_GAINS = {
     Outcome.ABORTED: "the experiment was aborted",
@@ -77,6 +89,7 @@ def analyse(
     method: str = DEFAULT_METHOD,
     rule: str = DEFAULT_RULE,
     known: Known = NOTHING,
+    options: DesignOptions | None = None,
     final: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
@@ -89,6 +102,8 @@ def analyse(
     :param method: the method whose model counts.
     :param rule: the rule whose gains count.
     :param known: what is known of the process beforehand.
+    :param options: what is asked of the controller; noise and amplitude come from the record
+        where they are not given.
     :param final: False while the experiment still runs: only the chosen model, by default a FOPDT
         unless another structure is known, and no gains; this takes a twentieth of the time.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
@@ -117,7 +132,7 @@ def analyse(
         return Analysis(
             record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
         )
-    return _tuned(found, rule, rng, simple)
+    return _tuned(found, rule, rng, simple, options)
 
 
 def analyse_jointly(
@@ -126,6 +141,7 @@ def analyse_jointly(
     method: str,
     rule: str = DEFAULT_RULE,
     known: Known = NOTHING,
+    options: DesignOptions | None = None,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
     """Identify one model from several records of a process and, where all were completed, tune.
@@ -134,6 +150,7 @@ def analyse_jointly(
     :param method: one of ``JOINT_METHODS``.
     :param rule: the rule whose gains count.
     :param known: what is known of the process beforehand.
+    :param options: as for :func:`analyse`.
     :param rng: as for :func:`analyse`.
     :raises RelayAutotuneError: if method or rule are unknown.
     """
@@ -150,17 +167,28 @@ def analyse_jointly(
         if record.outcome in _NO_GAINS:
             why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
             return replace(found, reason=why)
-    return _tuned(found, rule, rng, chosen.model if chosen.structure == "fopdt" else None)
+    simple = chosen.model if chosen.structure == "fopdt" else None
+    return _tuned(found, rule, rng, simple, options)
 
 
 def _tuned(
-    found: Analysis, rule: str, rng: np.random.Generator | None, simple: TransferFunction | None
+    found: Analysis,
+    rule: str,
+    rng: np.random.Generator | None,
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
 ) -> Analysis:
     """Add the gains of every rule that applies to the selected model, the chosen rule's first."""
     chosen = found.models[0]
-    around = ensemble(chosen, rng=rng or np.random.default_rng(0))
+    task = DesignTask(
+        model=chosen.model,
+        options=_with_noise(options or DesignOptions(), found),
+        simple=simple,
+        models=ensemble(chosen, rng=rng or np.random.default_rng(0)),
+        describing=_describing_point(found),
+    )
     try:
-        first = tune(chosen, rule, around, simple)
+        first = design(task, rule)
     except TuningError as error:
         return replace(found, reason=f"no gains: {error}")
     gains = [first]
@@ -168,11 +196,40 @@ def _tuned(
         if name == rule:
             continue
         try:
-            gains.append(tune(chosen, name, around, simple))
+            gains.append(design(task, name))
         except TuningError:
             # A rule that does not apply has nothing to compare.
             continue
     return replace(found, gains=tuple(gains), recommended=0)
+
+
+def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
+    """Take noise and amplitude from the record where they are not given."""
+    record, chosen = found.record, found.models[0]
+    if math.isnan(options.noise_std):
+        measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
+        options = replace(options, noise_std=measured)
+    if math.isnan(options.amplitude) and record.settings is not None:
+        options = replace(options, amplitude=abs(record.settings.amplitude))
+    return options
+
+
+def _describing_point(found: Analysis) -> UltimatePoint | None:
+    """Return what the describing function reads from the limit cycle; None: there is none."""
+    settings = found.record.settings
+    if not found.cycles or settings is None:
+        return None
+    cycle = limit_cycle(found.cycles)
+    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
+    if not amplitude > 0.0:
+        return None
+    return describing_point_of_cycle(
+        cycle.period,
+        cycle.period_high,
+        amplitude,
+        settings.amplitude,
+        found.models[0].model.process_sign,
+    )
 
 
 def _guarded(record: Record, method: str, known: Known) -> Identification:

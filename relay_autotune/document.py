@@ -12,6 +12,7 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.shape import shape_of_record
 from relay_autotune.identification.validation import DIFFERENCES
 from relay_autotune.record import Outcome, Record
+from relay_autotune.tuning.gains import NUMBERS
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
@@ -27,10 +28,6 @@ _SHAPE = ("sharpness", "plateau", "growth", "rise", "rise_half")
 _FIT = (
     *("residual_rms", "noise_std", "fit", "whiteness_p", "prediction"),
     *("noise_to_signal", "noise_to_signal_power"),
-)
-_GAINS = (
-    *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
-    *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
 )
 
 
@@ -168,8 +165,9 @@ def gains_fields(gains: Gains) -> dict[str, Any]:
     return {
         "rule": gains.rule,
         "form": gains.form,
-        **{name: _number(getattr(gains, name)) for name in _GAINS},
+        **{name: _number(getattr(gains, name)) for name in NUMBERS},
         "reason": gains.reason,
+        "warnings": list(gains.warnings),
     }
 
 

@@ -338,16 +338,17 @@ def fill_gains(
     :param final: True once the experiment has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
     """
+    # A relay_node, which has no gains, need not load what computes them.
+    from relay_autotune.tuning.gains import NUMBERS
+
     set_stamp(message.header.stamp, stamp_ns)
     message.experiment_id = experiment_id
     message.rule = gains.rule
     message.form = gains.form
     message.reason = gains.reason
     message.final = bool(final)
-    for name in (
-        *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
-        *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
-    ):
+    message.warnings = [str(text) for text in gains.warnings]
+    for name in NUMBERS:
         setattr(message, name, float(getattr(gains, name)))
 
 

@@ -15,17 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from relay_autotune.errors import SelectionError
-from relay_autotune.tuning.gains import Gains
+from relay_autotune.tuning.gains import NUMBERS, Gains
 
 FORMATS = ("pid_controller", "yaml")
 
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z_]\w*\Z")
 _NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
-_GAINS = (
-    *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
-    *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
-)
 _UNITS = {
     "kc": "u/y",
     "ti": "s",
@@ -37,6 +33,10 @@ _UNITS = {
     "phase_margin": "rad",
     "delay_margin": "s",
     "iae_load": "y s/u",
+    "iae_setpoint": "s",
+    "settling_time": "s",
+    "effort_setpoint": "u/y",
+    "noise_gain": "u/y",
 }
 
 
@@ -121,7 +121,7 @@ def pid_controller(gains: Gains, target: Target) -> str:
 def plain(gains: Gains) -> str:
     """Return gains as lines of `key: value`, which is YAML."""
     lines = [*_comments(gains, ()), f"rule: {gains.rule}", f"form: {gains.form}"]
-    for name in _GAINS:
+    for name in NUMBERS:
         value = getattr(gains, name)
         unit = f"  # {_UNITS[name]}" if name in _UNITS else ""
         lines.append(f"{name}: {number(value) if math.isfinite(value) else 'null'}{unit}")

@@ -205,7 +205,18 @@ def gains_lines(gains: Gains) -> list[str]:
             f"IAE of a unit load step {digits(gains.iae_load, 3)} y s/u",
         ),
     ]
-    return lines + (_wrapped("  because", gains.reason) if gains.reason else [])
+    if math.isfinite(gains.overshoot):
+        lines.append(
+            _line(
+                "",
+                f"set-point step: overshoot {digits(100.0 * gains.overshoot, 3)} %   "
+                f"settled after {digits(gains.settling_time, 3)} s",
+            )
+        )
+    lines += _wrapped("  because", gains.reason) if gains.reason else []
+    for warning in gains.warnings:
+        lines += _wrapped("  warning", warning)
+    return lines
 
 
 def _row(label: str, value: float, unit: str, interval: str) -> str:

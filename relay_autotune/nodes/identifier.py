@@ -19,6 +19,7 @@ from relay_autotune.messages import (
     start_nanoseconds,
 )
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.design_parameters import DESIGN_PARAMETERS, options_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
 from relay_autotune.record import Record
@@ -36,6 +37,7 @@ PARAMETERS = (
     NodeParameter(
         "rule", DEFAULT_RULE, "", "Rule whose gains are published.", choices=tuple(RULES)
     ),
+    *DESIGN_PARAMETERS,
 )
 
 # Latched cycles that may wait for an identifier that comes late.
@@ -124,7 +126,13 @@ class IdentifierNode(ServedNode):
     def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
         values = values_of(self, PARAMETERS)
         try:
-            return analyse(record, method=values["method"], rule=values["rule"], final=final)
+            return analyse(
+                record,
+                method=values["method"],
+                rule=values["rule"],
+                options=options_from(values),
+                final=final,
+            )
         except Exception as error:  # noqa: BLE001  one bad record must not end the node
             self.get_logger().error(
                 f"experiment {record.experiment_id} could not be analysed: "
@@ -155,6 +163,7 @@ class IdentifierNode(ServedNode):
         try:
             values = merged(self, PARAMETERS, changes)
             check_names(values["method"], values["rule"])
+            options_from(values)
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

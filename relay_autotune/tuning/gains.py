@@ -158,6 +158,15 @@ class Performance:
     noise_gain: float = math.nan
 
 
+# The numbers of gains, as messages, documents and files have them.
+NUMBERS = (
+    *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
+    *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
+    *("gain_margin_low", "iae_setpoint", "overshoot", "settling_time"),
+    *("effort_setpoint", "effort_load", "noise_gain"),
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Gains(Controller, Performance):
     """The controller that one rule gives, with what it does on the identified model.

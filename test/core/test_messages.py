@@ -29,6 +29,7 @@ from relay_autotune.messages import (
 )
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.tuning.gains import NUMBERS
 
 SETTINGS = RelaySettings(
     setpoint=5.0,
@@ -221,17 +222,11 @@ def test_a_complex_pair_is_left_to_the_polynomials() -> None:
 
 
 def test_gains_are_written_field_by_field() -> None:
-    numbers = {
-        name: float(k)
-        for k, name in enumerate(
-            [
-                *("kc", "ti", "td", "tf", "b", "p", "i", "d", "ms", "ms_95", "mt"),
-                *("gain_margin", "phase_margin", "delay_margin", "iae_load"),
-            ]
-        )
-    }
+    numbers = {name: float(k) for k, name in enumerate(NUMBERS)}
     message = SimpleNamespace(header=header())
-    gains: Any = SimpleNamespace(rule="itae", form="isa", reason="why", **numbers)
+    gains: Any = SimpleNamespace(
+        rule="itae", form="isa", reason="why", warnings=("mind",), **numbers
+    )
     fill_gains(message, gains, experiment_id="one")
     assert {name: getattr(message, name) for name in numbers} == numbers
     assert (message.rule, message.form, message.final) == ("itae", "isa", True)
