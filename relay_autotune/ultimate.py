@@ -7,11 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from relay_autotune.models import TransferFunction
+from relay_autotune.polar import Polar
 
 FloatArray = NDArray[np.float64]
+
+_MOST_STEPS = 100
+_ACCURACY = 2e-16
+_MOST_POINTS = 200_000
 
 
 @dataclass(frozen=True)
@@ -86,26 +90,23 @@ def phase_crossings(loop: TransferFunction) -> list[UltimatePoint]:
 
 
 def unstable_at_small_gain(model: TransferFunction) -> int:
-    """Closed-loop poles in the right half plane as the gain leaves zero."""
+    """Return how many closed-loop poles lie in the right half plane as the gain leaves zero.
+
+    :param model: the process.
+    """
     unstable = sum(1 for t in model.time_constants if t.real < 0.0)
     m = model.integrators
     if m < 1:
         return unstable
     # The poles at s = 0 leave along s^m = -K g; one that starts straight up goes left only if
     # the phase near zero frequency is above its limit.
+    polar = Polar.of(model)
     start = math.pi if model.gain * model.process_sign > 0.0 else 0.0
-    w = 1e-6 / max((abs(c) for c in _constants(model)), default=1.0)
-    lead = float(model.phase(w)) - float(model.phase(0.0)) > 0.0
+    lead = polar.lead(polar.corners()[0] - 14.0) > 0.0
     for k in range(m):
         cosine = math.cos((start + 2.0 * math.pi * k) / m)
         unstable += cosine > 1e-9 or (abs(cosine) <= 1e-9 and not lead)
     return unstable
-
-
-def _constants(model: TransferFunction) -> tuple[complex, ...]:
-    constants = (*model.time_constants, *model.zeros)
-    # A dead time beyond all proportion is none.
-    return (*constants, model.dead_time) if model.dead_time > 1e-30 else constants
 
 
 def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[_Crossing]:
@@ -119,74 +120,99 @@ def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[
         )
         # Near s = 0 the root is eps/(K G'(0)), and G(0) is negative.
         found.append(_Crossing(1.0 / abs(model.gain), 0.0, -1 if slope > 0.0 else 1))
-    first = _scan(model, _grid(model, _first_range(model)))
+    polar = Polar.of(model)
+    logarithms = _logarithmic(polar)
+    first = _scan(polar, _grid(polar, logarithms, *_first_range(polar, logarithms)))
     found += first
-    if not first or model.dead_time == 0.0:
+    if not first or not polar.delayed:
         return found
     # Later turns of the dead time matter only where the magnitude is larger again.
-    least = 1.0 / min(c.gain for c in first) if magnitude is None else magnitude
-    beyond = _logarithmic(model)
-    beyond = beyond[beyond > first[-1].frequency]
-    higher = beyond[np.abs(model(1j * beyond)) > 0.999 * least]
+    least = -math.log(min(c.gain for c in first)) if magnitude is None else math.log(magnitude)
+    last = math.log(first[-1].frequency)
+    beyond = np.append(last, logarithms[logarithms > last])
+    sizes = polar.size(beyond)
+    if magnitude is None and bool(np.all(np.diff(sizes) <= 0.0)):
+        return found
+    # Between two points of the grid it may be a little larger than at either.
+    higher = beyond[1:][sizes[1:] > least - 1e-3]
     if higher.size:
-        upper = float(higher[-1]) * 1.1
-        found += _scan(model, _grid(model, (first[-1].frequency * (1 + 1e-9), upper)))
+        found += _scan(polar, _grid(polar, logarithms, last + 1e-9, float(higher[-1]) + 0.1))
     return found
 
 
-def _corners(model: TransferFunction) -> list[float]:
-    return [1.0 / abs(c) for c in _constants(model)] or [1.0]
+def _logarithmic(polar: Polar) -> FloatArray:
+    """Return logarithms of frequencies, dense enough for everything but the dead time."""
+    corners = polar.corners()
+    low, high = corners[0] - 9.2, corners[-1] + 9.2
+    grid = np.linspace(low, high, int(17.4 * (high - low)))
+    return np.unique(np.concatenate((grid, polar.resonances())))
 
 
-def _logarithmic(model: TransferFunction) -> FloatArray:
-    corners = _corners(model)
-    decades = (math.log10(min(corners)) - 4.0, math.log10(max(corners)) + 4.0)
-    grid = np.logspace(*decades, int(40 * (decades[1] - decades[0])))
-    resonances = [
-        abs(1.0 / c) * (1.0 + width * c.real / abs(c))
-        for c in (*model.time_constants, *model.zeros)
-        if c.imag > 0.0
-        for width in np.linspace(-8.0, 8.0, 65)
-    ]
-    return np.unique(np.concatenate((grid, [r for r in resonances if r > 0.0])))
-
-
-def _first_range(model: TransferFunction) -> tuple[float, float]:
-    grid = _logarithmic(model)
-    if model.dead_time == 0.0:
-        return float(grid[0]), float(grid[-1])
+def _first_range(polar: Polar, logarithms: FloatArray) -> tuple[float, float]:
+    if not polar.delayed:
+        return float(logarithms[0]), float(logarithms[-1])
     # The rational part turns the phase by at most a quarter for each root, so that here the
     # dead time has passed -180 degrees for certain.
-    roots = len(model.zeros) + len(model.time_constants) + abs(model.integrators)
-    return float(grid[0]), (roots * math.pi / 2.0 + 4.0 * math.pi) / model.dead_time
+    turns = polar.roots * math.pi / 2.0 + 4.0 * math.pi
+    return float(logarithms[0]), math.log(turns) - polar.log_delay
 
 
-def _grid(model: TransferFunction, limits: tuple[float, float]) -> FloatArray:
-    low, high = limits
-    grid = _logarithmic(model)
-    grid = grid[(grid > low) & (grid < high)]
-    parts = [np.array([low, high]), grid]
-    if model.dead_time > 0.0:
-        count = min(int((high - low) * model.dead_time / 0.3) + 2, 200_000)
-        parts.append(np.linspace(low, high, count))
+def _grid(polar: Polar, logarithms: FloatArray, low: float, high: float) -> FloatArray:
+    parts = [np.array([low, high]), logarithms[(logarithms > low) & (logarithms < high)]]
+    if polar.delayed:
+        # In angles of the dead time, which no unit of time makes too large.
+        begin, end = (math.exp(min(edge + polar.log_delay, 700.0)) for edge in (low, high))
+        count = int(min((end - begin) / 0.3 + 2.0, _MOST_POINTS))
+        angles = np.linspace(begin, end, count)
+        parts.append(np.log(angles[1:-1]) - polar.log_delay)
     return np.unique(np.concatenate(parts))
 
 
-def _scan(model: TransferFunction, grid: FloatArray) -> list[_Crossing]:
-    # Odd multiples of pi become whole numbers of turns.
-    turns = (model.phase(grid) + math.pi) / (2.0 * math.pi)
-    level = np.floor(turns)
-    found = []
-    for i in np.flatnonzero(np.diff(level) != 0.0):
-        target = max(level[i], level[i + 1]) * 2.0 * math.pi - math.pi
+def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
+    """Return the crossings between the points of a grid of log frequencies."""
+    level = np.floor(polar.turns(grid))
+    cells = np.flatnonzero(np.diff(level) != 0.0)
+    if cells.size == 0:
+        return []
+    # Where the phase falls it leaves the level that it had, where it rises it enters the next.
+    target = np.maximum(level[cells], level[cells + 1])
+    falls = level[cells + 1] < level[cells]
+    place = _roots(polar, grid[cells], grid[cells + 1], target)
+    with np.errstate(over="ignore"):
+        frequency, gain = np.exp(place), np.exp(-polar.size(place))
+    usable = np.isfinite(frequency) & np.isfinite(gain) & (frequency > 0.0) & (gain > 0.0)
+    return [
+        _Crossing(float(g), float(w), 2 if fall else -2)
+        for g, w, fall, good in zip(gain, frequency, falls, usable, strict=True)
+        if good
+    ]
 
-        def excess(w: float, target: float = target) -> float:
-            return float(model.phase(w)) - target
 
-        low, high = float(grid[i]), float(grid[i + 1])
-        if excess(low) * excess(high) > 0.0:
-            continue
-        w = float(brentq(excess, low, high, xtol=1e-300, rtol=1e-15))
-        direction = 2 if turns[i + 1] < turns[i] else -2
-        found.append(_Crossing(1.0 / float(np.abs(model(1j * w))), w, direction))
-    return found
+def _roots(polar: Polar, low: FloatArray, high: FloatArray, target: FloatArray) -> FloatArray:
+    """Return where the phase has a number of turns, all at once by the Illinois method.
+
+    :param low: log frequencies at one side of each root, shape (n,).
+    :param high: at the other, shape (n,).
+    :param target: turns, shape (n,).
+    """
+    at_low, at_high = polar.turns(low, target), polar.turns(high, target)
+    place, moved = low, np.full(low.shape, 2)
+    for _ in range(_MOST_STEPS):
+        before = place
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = (low * at_high - high * at_low) / (at_high - at_low)
+        # Rounding may place it at an end, or a little beyond.
+        place = np.clip(np.where(np.isfinite(place), place, low), low, high)
+        if bool(np.all(np.abs(place - before) <= _ACCURACY * np.maximum(np.abs(place), 1.0))):
+            break
+        value = polar.turns(place, target)
+        below = np.sign(value) == np.sign(at_low)
+        # An end that stays for a second time counts half, so that both close in.
+        again = np.where(below == moved, 0.5, 1.0)
+        at_low, at_high = (
+            np.where(below, value, again * at_low),
+            np.where(below, again * at_high, value),
+        )
+        moved = below
+        low, high = np.where(below, place, low), np.where(below, high, place)
+    return place

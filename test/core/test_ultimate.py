@@ -128,3 +128,49 @@ def test_unstable_poles_are_counted_like_the_roots_of_a_pade_approximation(
     fast = np.abs(roots) * dead_time > 6.0
     assume(not np.any(fast & (roots.real > -1.0)))
     assert unstable_poles(loop) == int(np.sum(roots.real > 0.0))
+
+
+@given(
+    exponent=st.floats(-140.0, 140.0),
+    ratio=st.floats(-140.0, 140.0),
+    order=st.integers(1, 4),
+    sign=st.sampled_from((-1.0, 1.0)),
+)
+def test_the_ultimate_point_holds_over_any_number_of_decades(exponent, ratio, order, sign):
+    tau, dead_time = 10.0**exponent, 10.0 ** (exponent + ratio)
+    point = ultimate_point(TransferFunction.lag_n(sign, tau, order, dead_time))
+    x = point.frequency * tau
+    # Equal lags and the dead time turn by pi; where the lags alone do it is what they lack of pi.
+    if x > 1.0 and order == 2:
+        assert point.frequency * dead_time == pytest.approx(2.0 * math.atan(1.0 / x), rel=1e-9)
+    else:
+        turned = order * math.atan(x) + point.frequency * dead_time
+        assert turned == pytest.approx(math.pi, rel=1e-9)
+    size = 0.5 * order * np.logaddexp(0.0, 2.0 * math.log(x)) if x > 0.0 else 0.0
+    assert math.log(sign * point.gain) == pytest.approx(size, rel=1e-9, abs=1e-9)
+
+
+@given(st.floats(-140.0, 140.0), st.floats(-12.0, -0.31))
+def test_integrators_and_unstable_processes_hold_over_decades_too(exponent, ratio):
+    scale = 10.0**exponent
+    point = ultimate_point(TransferFunction.ipdt(1.0, scale))
+    assert point.frequency * scale == pytest.approx(math.pi / 2.0, rel=1e-9)
+    point = ultimate_point(TransferFunction.unstable_fopdt(1.0, scale, scale * 10.0**ratio))
+    x = point.frequency * scale
+    assert math.atan(x) == pytest.approx(x * 10.0**ratio, rel=1e-9)
+    assert point.gain == pytest.approx(math.hypot(1.0, x), rel=1e-9)
+
+
+def test_an_underdamped_process_of_any_unit_of_time():
+    reference = ultimate_point(TransferFunction.oscillator(1.0, 1.0, 0.05, 0.3))
+    for unit in (1e-100, 1e-9, 1e9, 1e100):
+        point = ultimate_point(TransferFunction.oscillator(1.0, 1.0 / unit, 0.05, 0.3 * unit))
+        assert point.gain == pytest.approx(reference.gain, rel=1e-9)
+        assert point.frequency * unit == pytest.approx(reference.frequency, rel=1e-9)
+
+
+def test_a_dead_time_beyond_any_lag_is_no_slower():
+    # Tens of thousands of later crossings lie at gains above that of the first.
+    point = ultimate_point(TransferFunction.fopdt(2.0, 1e-9, 1.0))
+    assert point.gain == pytest.approx(0.5, rel=1e-9)
+    assert point.frequency == pytest.approx(math.pi, rel=1e-8)
