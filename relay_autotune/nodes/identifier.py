@@ -8,9 +8,10 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from relay_autotune.autotune import Analysis, analyse, check_names
+from relay_autotune.autotune import Analysis, analyse, analyse_jointly, check_names
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import DEFAULT_METHOD, METHODS
+from relay_autotune.identification.li_method import METHOD as LI
 from relay_autotune.messages import (
     fill_gains,
     fill_transfer_function,
@@ -20,9 +21,10 @@ from relay_autotune.messages import (
 )
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.design_parameters import DESIGN_PARAMETERS, options_from
+from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
-from relay_autotune.record import Record
+from relay_autotune.record import Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
@@ -37,6 +39,7 @@ PARAMETERS = (
     NodeParameter(
         "rule", DEFAULT_RULE, "", "Rule whose gains are published.", choices=tuple(RULES)
     ),
+    *KNOWN_PARAMETERS,
     *DESIGN_PARAMETERS,
 )
 
@@ -57,6 +60,8 @@ class IdentifierNode(ServedNode):
         self._cycles: dict[int, Any] = {}
         self._cycles_of = ""
         self._ended = ""
+        # The method li takes the last two experiments together.
+        self._earlier: Record | None = None
         self._fit_asked_for = False
         self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
         self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
@@ -125,14 +130,19 @@ class IdentifierNode(ServedNode):
 
     def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
         values = values_of(self, PARAMETERS)
+        earlier = self._earlier
+        if final and record.outcome == Outcome.COMPLETED:
+            self._earlier = record
+        asked = {
+            "method": values["method"],
+            "rule": values["rule"],
+            "known": known_from(values),
+            "options": options_from(values),
+        }
         try:
-            return analyse(
-                record,
-                method=values["method"],
-                rule=values["rule"],
-                options=options_from(values),
-                final=final,
-            )
+            if final and values["method"] == LI and earlier is not None:
+                return analyse_jointly((record, earlier), **asked)
+            return analyse(record, final=final, **asked)
         except Exception as error:  # noqa: BLE001  one bad record must not end the node
             self.get_logger().error(
                 f"experiment {record.experiment_id} could not be analysed: "
@@ -163,6 +173,7 @@ class IdentifierNode(ServedNode):
         try:
             values = merged(self, PARAMETERS, changes)
             check_names(values["method"], values["rule"])
+            known_from(values)
             options_from(values)
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))

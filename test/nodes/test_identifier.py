@@ -1,0 +1,83 @@
+"""What identifier_node is told of the process, and the two experiments of the method li."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+
+from relay_autotune.errors import ParameterError
+from relay_autotune.identification import Known
+from relay_autotune.messages import fill_experiment
+from relay_autotune.models import TransferFunction
+from relay_autotune.nodes.domain import free_domain
+from relay_autotune.nodes.identifier import PARAMETERS, IdentifierNode
+from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
+from relay_autotune.record import RelaySettings
+from relay_autotune.simulation import simulate_relay
+from relay_autotune_msgs.msg import RelayExperiment
+
+PROCESS = TransferFunction.lag_n(2.0, 3.0, 2, 1.0)
+NOTHING = {entry.name: entry.default for entry in KNOWN_PARAMETERS}
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[IdentifierNode]:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with free_domain() as domain:
+        rclpy.init(domain_id=domain)
+        made = IdentifierNode()
+        yield made
+        made.destroy_node()
+        rclpy.try_shutdown()
+
+
+def experiment(extra_delay: float) -> Any:
+    relay = RelaySettings(5.0, 1.0, 0.7, 0.0, 0.1, extra_delay)
+    end = simulate_relay(PROCESS, relay, cycles=8).command.times[-1]
+    run = simulate_relay(PROCESS, relay, cycles=8, time=np.linspace(0.0, end, 1600))
+    message = RelayExperiment()
+    fill_experiment(message, run.record())
+    message.experiment_id = f"with {extra_delay:g} s"
+    return message
+
+
+def test_nothing_is_known_unless_it_is_given() -> None:
+    found = known_from(NOTHING)
+    assert math.isnan(found.gain)
+    assert (found.structure, found.order) == ("", 0)
+    given = {"known_gain": 2.0, "known_dead_time": 1.0, "structure": "lag_n", "order": 2}
+    assert known_from(given) == Known(2.0, 1.0, "lag_n", 2)
+    with pytest.raises(ParameterError, match="not zero"):
+        known_from({**NOTHING, "known_gain": 0.0})
+
+
+def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
+    node: IdentifierNode,
+) -> None:
+    models: list[Any] = []
+    node._models.publish = models.append
+    node._gains.publish = lambda message: None
+    node.set_parameters([Parameter("method", value="li")])
+    node._on_experiment(experiment(0.0))
+    assert models == []
+    node._on_experiment(experiment(1.5))
+    assert [m.method for m in models] == ["li"]
+    assert models[0].experiment_id == "with 1.5 s"
+    assert models[0].structure == "lag_n"
+    assert models[0].gain == pytest.approx(2.0, rel=0.02)
+    told = {"method": "chang", "known_gain": 2.0, "known_dead_time": 1.0, "structure": "lag_n"}
+    node.set_parameters([Parameter(name, value=value) for name, value in told.items()])
+    node.set_parameters([Parameter("order", value=2)])
+    node._on_experiment(experiment(0.0))
+    assert models[1].method == "chang"
+    assert list(models[1].time_constants) == pytest.approx([3.0, 3.0], rel=0.01)
+    refused = node.set_parameters([Parameter("known_gain", value=0.0)])[0]
+    assert not refused.successful
+    assert "not zero" in refused.reason
+    assert {entry.name for entry in KNOWN_PARAMETERS} <= {entry.name for entry in PARAMETERS}
