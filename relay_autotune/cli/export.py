@@ -17,8 +17,6 @@ from pathlib import Path
 from relay_autotune.errors import SelectionError
 from relay_autotune.tuning.gains import NUMBERS, Gains
 
-FORMATS = ("pid_controller", "yaml")
-
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z_]\w*\Z")
 _NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
@@ -75,7 +73,7 @@ def exported(gains: Gains, how: str, target: Target) -> str:
     """Return gains as the text of a file.
 
     :param gains: what is to be loaded.
-    :param how: one of ``FORMATS``.
+    :param how: "pid_controller" or "yaml".
     :param target: for pid_controller: where they go.
     """
     return pid_controller(gains, target) if how == "pid_controller" else plain(gains)

@@ -13,6 +13,12 @@ from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.reader import Selection
 from relay_autotune.bag.timing import CLOCKS
 from relay_autotune.cli.arguments import DONE, finite, guarded, known_facts, say
+from relay_autotune.cli.design_arguments import (
+    add_design,
+    add_export,
+    design_options,
+    export_target,
+)
 from relay_autotune.cli.progress import ProgressLine
 from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.errors import RelayAutotuneError, SelectionError
@@ -36,6 +42,7 @@ Examples:
   replay --measurement /tank/level --command /tank/valve robot_bag
   replay --measurement /imu:angular_velocity.z --command /wheel/voltage robot_bag
   replay --jobs 8 --output fleet.csv bags/*
+  replay --rule robust --ms 1.6 --export pid_controller --dof heater robot_bag > gains.yaml
   replay --json log.csv --measurement level --command valve --time t
   replay --method chang --gain 1.65 --dead-time 10 robot_bag
   replay --method li without_extra_delay with_extra_delay     (several tests, one model)
@@ -116,6 +123,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
     )
+    add_design(parser)
+    add_export(parser)
     return parser
 
 
@@ -169,6 +178,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     try:
         check_names(options.method, options.rule)
         known = known_facts(options)
+        asked = design_options(options)
     except RelayAutotuneError as error:
         raise SelectionError(str(error)) from error
     start, end = options.start, options.end
@@ -187,6 +197,13 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     with_table = not (options.json or options.output)
     bags = list(dict.fromkeys(options.bags))
     groups = [tuple(bags)] if jointly or options.join else [(bag,) for bag in bags]
+    export = None
+    if options.export:
+        if len(groups) > 1 or options.json or options.output:
+            raise SelectionError(
+                "--export writes the gains of one bag alone, without --json and --output"
+            )
+        export = (options.export, export_target(options))
     return [
         Job(
             ", ".join(group),
@@ -198,6 +215,8 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
             known,
             jointly,
             with_table,
+            asked,
+            export,
         )
         for group in groups
     ]

@@ -12,8 +12,10 @@ from relay_autotune.errors import RelayAutotuneError, SelectionError
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
+    from relay_autotune.cli.export import Target
     from relay_autotune.identification.known import Known
     from relay_autotune.record import Record
+    from relay_autotune.tuning.task import DesignOptions
 
 Progress = Callable[[int, int], None]
 
@@ -30,6 +32,8 @@ class Job:
     :param known: what is known of the process.
     :param jointly: whether the experiments of all recordings give one model.
     :param with_table: whether the table for people is wanted, else the document.
+    :param options: what is asked of the controller; None: the defaults.
+    :param export: the kind of file that is wanted instead, and where its gains go; None: none.
     """
 
     name: str
@@ -40,6 +44,8 @@ class Job:
     known: Known
     jointly: bool = False
     with_table: bool = False
+    options: DesignOptions | None = None
+    export: tuple[str, Target] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,9 @@ def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Anal
     said: list[str] = []
     try:
         analyses = _analysed(job, said, progress)
+        if job.export is not None:
+            text = _exported(analyses, *job.export)
+            return Done(job.name, DONE, tuple(said), text), analyses
     except SelectionError as error:
         return _failed(job, said, str(error), USAGE), ()
     except RelayAutotuneError as error:
@@ -99,16 +108,34 @@ def _analysed(job: Job, said: list[str], progress: Progress | None) -> tuple[Ana
             records += recording.experiments
         from relay_autotune.autotune import analyse_jointly
 
-        found = analyse_jointly(records, method=job.method, rule=job.rule, known=job.known)
+        found = analyse_jointly(
+            records, method=job.method, rule=job.rule, known=job.known, options=job.options
+        )
         return (found,)
     recording = read_experiments(job.paths, job.selection, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
     from relay_autotune.autotune import analyse
 
     return tuple(
-        analyse(record, method=job.method, rule=job.rule, known=job.known)
+        analyse(record, method=job.method, rule=job.rule, known=job.known, options=job.options)
         for record in recording.experiments
     )
+
+
+def _exported(analyses: Sequence[Analysis], how: str, target: Target) -> str:
+    """Return the gains as a file; there must be those of one experiment alone."""
+    from relay_autotune.cli.export import exported
+
+    found = [a.best_gains for a in analyses if a.best_gains is not None]
+    if not found:
+        why = analyses[0].reason if analyses else "there is no experiment"
+        raise RelayAutotuneError(f"no gains to export: {why}")
+    if len(found) > 1:
+        raise SelectionError(
+            f"{len(found)} experiments have gains and a file holds those of one: choose it by "
+            "--start and --end, or take all for tests of one process by --joint"
+        )
+    return exported(found[0], how, target).rstrip("\n")
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:

@@ -9,6 +9,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
+from relay_autotune.cli.design_arguments import (
+    add_design,
+    add_export,
+    design_options,
+    export_target,
+)
 from relay_autotune.errors import SelectionError, TuningError
 
 if TYPE_CHECKING:
@@ -59,9 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from relay_autotune.cli.export import FORMATS
     from relay_autotune.tuning.forms import FORMS
-    from relay_autotune.tuning.task import CONTROLLERS
 
     parser = _Parser(
         prog=PROGRAM,
@@ -95,77 +99,18 @@ def _parser() -> argparse.ArgumentParser:
     model.add_argument("--numerator", **several, metavar="B", help="powers of s, highest first")
     model.add_argument("--denominator", **several, metavar="A", help="powers of s, highest first")
 
-    asked = parser.add_argument_group("what is asked for")
+    asked = parser.add_argument_group("the rule")
     asked.add_argument("--rule", metavar="NAME", help="the rule; --table shows them all")
     asked.add_argument("--table", action="store_true", help="every rule, side by side")
-    kind = asked.add_mutually_exclusive_group()
-    kind.add_argument(
-        "--controller", choices=CONTROLLERS, help="auto is PI unless the rule finds PID worth it"
-    )
-    for each in ("pi", "pid"):
-        kind.add_argument(
-            f"--{each}",
-            dest="controller",
-            action="store_const",
-            const=each,
-            help=f"the same as --controller {each}",
-        )
-    asked.add_argument("--ms", **number, metavar="M", help="largest Ms, 1.2 to 4 (1.4)")
-    asked.add_argument(
-        "--mt", **number, metavar="M", help="largest Mt (1.4, of an integrating process 1.26)"
-    )
-    asked.add_argument(
-        "--sample-period", **number, metavar="S", help="period of the controller (0: continuous)"
-    )
-    asked.add_argument(
-        "--loop-delay", **number, metavar="S", help="dead time that the loop adds (0)"
-    )
-    asked.add_argument(
-        "--lambda",
-        dest="closed_loop_time",
-        **number,
-        metavar="S",
-        help="closed-loop time constant of imc, simc and unstable (the rule's own)",
-    )
-    asked.add_argument("--noise-std", **number, metavar="Y", help="measurement noise [y]")
-    asked.add_argument(
-        "--amplitude", **number, metavar="U", help="what a command may move, as the relay's [u]"
-    )
-    asked.add_argument(
-        "--noise-share", **number, metavar="R", help="noise in the command over --amplitude (0.1)"
-    )
-    asked.add_argument("--filter-ratio", **number, metavar="N", help="largest td/tf (10)")
-    asked.add_argument(
-        "--phase-peak", **number, metavar="DEG", help="phase peak of luyben2003 (-120)"
-    )
-    asked.add_argument("--resonance", **number, metavar="DB", help="resonance of luyben2003 (2)")
+    add_design(parser)
 
     shown = parser.add_argument_group("how it is shown")
     shown.add_argument("--form", choices=FORMS, default="isa", help="form of the gains (isa)")
     shown.add_argument("--json", action="store_true", help="print a JSON document")
-    shown.add_argument("--export", choices=FORMATS, help="print a file to be loaded")
-    add_target(shown)
+    add_export(parser).add_argument(
+        "--output", metavar="FILE", help="write the file there, not to standard output"
+    )
     return parser
-
-
-def add_target(group: argparse._ArgumentGroup) -> None:
-    """Add the options that say where exported gains go.
-
-    :param group: of the command's parser.
-    """
-    group.add_argument("--output", metavar="FILE", help="write the export there, not to stdout")
-    group.add_argument(
-        "--node", default="/pid_controller", metavar="NAME", help="for the export (%(default)s)"
-    )
-    group.add_argument(
-        "--dof", default="joint", metavar="NAME", help="for the export (%(default)s)"
-    )
-    group.add_argument(
-        "--command-min", type=finite, metavar="U", help="for the export: lower clamp [u]"
-    )
-    group.add_argument(
-        "--command-max", type=finite, metavar="U", help="for the export: upper clamp [u]"
-    )
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -179,26 +124,10 @@ def _run(options: argparse.Namespace) -> int:
     rule = options.rule or DEFAULT_RULE
     if rule not in RULES:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
-    task = _task(model_of(options), _asked(options))
+    task = _task(model_of(options), design_options(options))
     if options.table:
         return _side_by_side(task, rule, options)
     return _one(task, rule, options)
-
-
-def _asked(options: argparse.Namespace) -> DesignOptions:
-    import math
-    from dataclasses import fields
-
-    from relay_autotune.tuning import DesignOptions
-
-    names = {f.name for f in fields(DesignOptions)}
-    given = {n: v for n, v in vars(options).items() if n in names and v is not None}
-    if "phase_peak" in given:
-        given["phase_peak"] = math.radians(given["phase_peak"])
-    try:
-        return DesignOptions(**given)
-    except TuningError as error:
-        raise SelectionError(str(error).replace("closed_loop_time", "lambda")) from error
 
 
 def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
@@ -221,14 +150,14 @@ def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
 
 
 def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.export import Target, exported, write
+    from relay_autotune.cli.export import exported, write
     from relay_autotune.cli.table import gains_lines
     from relay_autotune.cli.tune_table import form_lines, process_lines
     from relay_autotune.tuning import design
 
     gains = design(task, rule)
     if options.export is not None:
-        write(exported(gains, options.export, target_of(options, Target)), options.output)
+        write(exported(gains, options.export, export_target(options)), options.output)
     elif options.json:
         _print_document(task, [gains], {}, 0, options.form)
     else:
@@ -236,17 +165,6 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
         form = form_lines(gains, options.form)
         print("\n".join([*process_lines(task.model), name, isa, *form, *rest]))
     return DONE
-
-
-def target_of(options: argparse.Namespace, target: Any) -> Any:
-    """Return where exported gains go, as the options say.
-
-    :param options: with those of :func:`add_target`.
-    :param target: the class :class:`~relay_autotune.cli.export.Target`.
-    """
-    limits = {n: getattr(options, n) for n in ("command_min", "command_max")}
-    given = {n: v for n, v in limits.items() if v is not None}
-    return target(node=options.node, dof=options.dof, **given)
 
 
 def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> int:

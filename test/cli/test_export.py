@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.cli import export
+from relay_autotune.cli import export, replay
 from relay_autotune.cli.export import Target, number, pid_controller, plain
 from relay_autotune.errors import SelectionError
 from relay_autotune.models import TransferFunction
@@ -146,3 +146,17 @@ def test_numbers_of_numpy_are_written_like_any_other():
     assert model.gain == 1.0
     text = pid_controller(gains(np.float64(0.5), np.float64(2.0)), Target())
     assert "float64" not in text
+
+
+def test_replay_exports_the_gains_of_a_recording(capsys):
+    bag = "bags/biased_relay"
+    asked = ["--rule", "imc", "--loop-delay", "0.5", "--export", "pid_controller", "--dof", "oven"]
+    assert replay.main([*asked, bag]) == 0
+    found = as_loaded(capsys.readouterr().out)
+    # 1.65 e^(-10 s)/(20 s + 1) with half a second more.
+    assert found["gains.oven.p"] == pytest.approx(25.25 / (1.65 * 1.7 * 10.5), rel=1e-6)
+    for more in (["bags/step_test"], ["--json"]):
+        assert replay.main([*asked, bag, *more]) == 2
+        assert "one bag alone" in capsys.readouterr().err
+    assert replay.main(["--ms", "9", bag]) == 2
+    assert "ms must be from 1.2 to 4" in capsys.readouterr().err
