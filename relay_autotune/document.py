@@ -139,6 +139,18 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
         "ultimate_frequency_std": _number(identification.ultimate_frequency_std),
         "warnings": list(identification.warnings),
         "undetermined": list(identification.undetermined),
+        "combinations": [
+            {
+                "name": c.name,
+                "unit": c.unit,
+                "value": _number(c.value),
+                "std": _number(c.std),
+                "ci95": _numbers((c.ci95_low, c.ci95_high)),
+            }
+            for c in identification.combinations
+        ],
+        "advice": list(identification.advice),
+        "support": _number(identification.support),
         "rivals": [
             {
                 "structure": r.model.structure,

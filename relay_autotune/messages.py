@@ -304,6 +304,14 @@ def fill_transfer_function(
     message.point_std = float64_array([p.std for p in points])
     message.warnings = [str(text) for text in identification.warnings]
     message.undetermined = [str(name) for name in identification.undetermined]
+    combinations = identification.combinations
+    message.combinations = [c.name for c in combinations]
+    message.combination_units = [c.unit for c in combinations]
+    for name in ("value", "std", "ci95_low", "ci95_high"):
+        numbers = float64_array([getattr(c, name) for c in combinations])
+        setattr(message, f"combination_{name}", numbers)
+    message.advice = [str(text) for text in identification.advice]
+    message.support = float(identification.support)
 
 
 def transfer_function_from_message(message: Any) -> TransferFunction:

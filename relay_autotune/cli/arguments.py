@@ -70,4 +70,5 @@ def known_facts(options: argparse.Namespace) -> Known:
         dead_time=math.nan if options.dead_time is None else options.dead_time,
         structure=options.structure,
         order=options.order,
+        loss=getattr(options, "loss", None) or Known.loss,
     )

@@ -101,7 +101,8 @@ def identification_lines(found: Identification) -> list[str]:
     lines = _process("process", found.model, name)
     rows = list(zip(found.parameters, found.values, found.ci95_low, found.ci95_high, strict=True))
     for label, value, low, high in rows:
-        interval = f"95 %: {digits(low)} to {digits(high)}" if np.isfinite(low) else ""
+        end = digits(high) if np.isfinite(high) else "any"
+        interval = f"95 %: {digits(low)} to {end}" if np.isfinite(low) else ""
         doubt = "   not determined" if label in found.undetermined else ""
         unit = _UNITS.get(label, "s")
         lines.append(_row(label.replace("_", " "), value, unit, interval + doubt))
@@ -112,6 +113,7 @@ def identification_lines(found: Identification) -> list[str]:
         if math.isfinite(value):
             interval = f"± {digits(1.96 * std, 2)}" if math.isfinite(std) else ""
             lines.append(_row(label, value, unit, interval))
+    lines += _known_all_the_same(found)
     lines += _wrapped("fit", _fit(found))
     if found.validation is not None:
         lines += _wrapped("limit cycle", _validation(found.validation))
@@ -121,6 +123,21 @@ def identification_lines(found: Identification) -> list[str]:
         lines += _process("rivals" if i == 0 else "", rival.model, note)
     for warning in found.warnings:
         lines += _wrapped("warning", warning)
+    return lines
+
+
+def _known_all_the_same(found: Identification) -> list[str]:
+    """Return what is determined beside parameters that are not, and what would help."""
+    # K_u and w_u have lines of their own.
+    shown = [c for c in found.combinations if not c.name.startswith("ultimate")]
+    lines = []
+    for c in shown:
+        interval = f"95 %: {digits(c.ci95_low)} to {digits(c.ci95_high)}"
+        lines += _wrapped(
+            "determined", f"{c.name.replace('_', ' ')} {digits(c.value)} {c.unit} ({interval})"
+        )
+    for sentence in found.advice:
+        lines += _wrapped("would help", sentence)
     return lines
 
 

@@ -8,13 +8,14 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.atv import identify_atv
 from relay_autotune.identification.chang_method import identify_chang
 from relay_autotune.identification.fourier_method import identify_fourier
+from relay_autotune.identification.intervals import Estimate, estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.li_method import identify_li, identify_li_jointly
 from relay_autotune.identification.luyben_method import identify_step
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.identification.thyagarajan_method import identify_thyagarajan
 from relay_autotune.identification.wang_method import identify_biased, identify_unbiased
-from relay_autotune.identification.waveform import identify_waveform
+from relay_autotune.identification.waveform import identify_waveform, identify_waveform_jointly
 from relay_autotune.record import Record
 
 Method = Callable[[Record, Known], Identification]
@@ -31,19 +32,24 @@ METHODS: dict[str, Method] = {
     "luyben_step": identify_step,
     "fourier": identify_fourier,
 }
-# These take several records of one process.
+# These take several records of one process; the first ones of them nothing else.
 JOINT_METHODS: dict[str, JointMethod] = {
     "li": identify_li_jointly,
+    "waveform": identify_waveform_jointly,
 }
+ONLY_JOINT = ("li",)
 DEFAULT_METHOD = "waveform"
 
 __all__ = [
     "DEFAULT_METHOD",
     "JOINT_METHODS",
     "METHODS",
+    "ONLY_JOINT",
+    "Estimate",
     "FitReport",
     "Identification",
     "Known",
+    "estimate",
     "identify",
     "identify_jointly",
     "method_named",

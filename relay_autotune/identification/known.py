@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from relay_autotune.errors import ParameterError
 
+LOSSES = ("squares", "huber", "tukey")
+
 
 @dataclass(frozen=True)
 class Known:
@@ -17,13 +19,17 @@ class Known:
     :param dead_time: dead time [s]; NaN: not known.
     :param structure: structure to be fitted; empty: the method's own choice.
     :param order: number of equal lags; 0: not known.
-    :raises ParameterError: if the gain is zero or infinite, or the dead time negative.
+    :param loss: what the waveform fit minimises: "squares"; "huber" or "tukey" where the
+        sensor's noise has many outliers.
+    :raises ParameterError: if the gain is zero or infinite, the dead time negative, or there is
+        no such loss.
     """
 
     gain: float = math.nan
     dead_time: float = math.nan
     structure: str = ""
     order: int = 0
+    loss: str = LOSSES[0]
 
     def __post_init__(self) -> None:
         if self.gain == 0.0 or math.isinf(self.gain):
@@ -36,6 +42,8 @@ class Known:
             raise ParameterError(
                 f"an order must be at least 1, or 0: not known; found {self.order}"
             )
+        if self.loss not in LOSSES:
+            raise ParameterError(f"unknown loss {self.loss!r}; known: {', '.join(LOSSES)}")
 
 
 NOTHING = Known()

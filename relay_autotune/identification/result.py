@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.combinations import DETERMINED, Combination
+from relay_autotune.identification.intervals import NORMAL
+from relay_autotune.identification.intervals import is_logarithmic as is_logarithmic
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
 
@@ -19,8 +22,6 @@ if TYPE_CHECKING:
     from relay_autotune.identification.validation import Validation
 
 FloatArray = NDArray[np.float64]
-
-_DETERMINED = 0.2
 
 
 @dataclass(frozen=True)
@@ -48,16 +49,31 @@ class FitReport:
     noise_to_signal_power: float = math.nan
 
 
+def _model_alone(_: FloatArray) -> TransferFunction:
+    raise IdentificationError("this rival is known by its model alone, without parameters")
+
+
 @dataclass(frozen=True)
 class Rival:
     """Another structure that the data do not rule out.
 
+    It has what an :class:`Identification` has to draw models from, so that an ensemble can
+    take the structures by their support.
+
     :param model: its best fit.
     :param support: its weight among all structures tried, 0 to 1.
+    :param build: the transfer function for any values of the parameters.
+    :param parameters: names of the structure's parameters; empty: only the model is known.
+    :param values: their values, shape (p,).
+    :param covariance: of the values, shape (p, p).
     """
 
     model: TransferFunction
     support: float
+    build: Callable[[FloatArray], TransferFunction] = _model_alone
+    parameters: tuple[str, ...] = ()
+    values: FloatArray = field(default_factory=lambda: np.empty(0))
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -89,6 +105,10 @@ class Identification:
     :param integrated_error: ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the
         model that counts (Thyagarajan and Yu 2003, eqs 29 and 30) [rad/s]; NaN: of that model
         itself, or not computed.
+    :param support: weight of this structure among all that were tried, 0 to 1; 1: no other was.
+    :param combinations: where a parameter is not determined, what the data determine all the
+        same.
+    :param advice: then, what test would determine it, each a sentence.
     """
 
     method: str
@@ -111,6 +131,9 @@ class Identification:
     validation: Validation | None = None
     points: tuple[FrequencyPoint, ...] = ()
     integrated_error: float = math.nan
+    support: float = 1.0
+    combinations: tuple[Combination, ...] = ()
+    advice: tuple[str, ...] = ()
 
     @property
     def structure(self) -> str:
@@ -123,21 +146,13 @@ class Identification:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def is_logarithmic(parameter: str) -> bool:
-    """Return whether a parameter cannot change sign, so that its logarithm has the interval.
-
-    :param parameter: its name.
-    """
-    return parameter not in ("dead_time", "zero")
-
-
 def with_uncertainty(
     method: str,
     build: Callable[[FloatArray], TransferFunction],
     parameters: tuple[str, ...],
     values: FloatArray,
     covariance: FloatArray | None = None,
-    quantile: float = 1.96,
+    quantile: float = NORMAL,
     fit: FitReport | None = None,
     warnings: tuple[str, ...] = (),
     fitted: FloatArray | None = None,
@@ -177,7 +192,7 @@ def with_uncertainty(
             low[i], high[i] = values[i] - quantile * std[i], values[i] + quantile * std[i]
         if name == "dead_time" and np.isfinite(low[i]):
             low[i] = max(low[i], 0.0)
-    wide = std * quantile > _DETERMINED * np.abs(values)
+    wide = std * quantile > DETERMINED * np.abs(values)
     undetermined = tuple(n for n, w in zip(parameters, wide, strict=True) if w)
     point = ultimate_point(model)
     gain = frequency = gain_std = frequency_std = math.nan
@@ -186,7 +201,7 @@ def with_uncertainty(
     else:
         gain, frequency = point.gain, point.frequency
         if covariance is not None:
-            gain_std, frequency_std = _ultimate_std(build, values, covariance, gain, frequency)
+            gain_std, frequency_std = ultimate_std(build, values, covariance, gain, frequency)
     return Identification(
         method,
         model,
@@ -207,13 +222,22 @@ def with_uncertainty(
     )
 
 
-def _ultimate_std(
+def ultimate_std(
     build: Callable[[FloatArray], TransferFunction],
     values: FloatArray,
     covariance: FloatArray,
     gain: float,
     frequency: float,
 ) -> tuple[float, float]:
+    """Return the standard deviations of K_u and w_u to first order; see with_uncertainty.
+
+    :param build: the model as a function of the values.
+    :param values: shape (p,).
+    :param covariance: of the values, shape (p, p).
+    :param gain: K_u [u/y].
+    :param frequency: w_u [rad/s].
+    """
+
     def log_response(x: FloatArray, w: float) -> complex:
         # At the ultimate point -K_u G is 1, so that its logarithm has no branch nearby.
         return complex(np.log(-gain * build(x)(1j * w)))

@@ -19,6 +19,8 @@ from relay_autotune.identification.separable import (
 )
 from relay_autotune.identification.starts import (
     Starts,
+    coarse,
+    refine_all,
     refine_best,
     refine_roughly,
     start_fopdt,
@@ -90,10 +92,11 @@ class Selection:
     def _leave_out_the_unknown(self) -> None:
         """Begin later where a record that was cut out of a movement explains itself better so."""
         whole = replace(self._problem, relaxation=True)
-        _, longest = time_scales(whole.time, whole.u)
-        later = whole.part(whole.time >= whole.time[0] + longest)
-        if 2 * later.time.size < whole.time.size or not bool(
-            np.any(later.u.times > later.time[0])
+        _, longest = time_scales(whole)
+        later = whole.part(whole.time >= whole.starts + longest)
+        if 2 * later.time.size < whole.time.size or not all(
+            part.stop > part.start and np.any(u.times > later.time[part][0])
+            for part, u in zip(later.experiments, later.inputs, strict=True)
         ):
             return
         first = refine(whole, self._fopdt.theta, tolerance=_TRIAL)
@@ -218,8 +221,9 @@ class Selection:
         weighed = [
             replace(
                 c,
-                criterion=n * worth * math.log(max(c.state.cost, self._floor) / n)
-                + c.state.parameters * math.log(max(n * worth, 3.0)),
+                criterion=information_criterion(
+                    c.state.cost, n, c.state.parameters, self._floor, worth
+                ),
             )
             for c in found
         ]
@@ -257,7 +261,7 @@ class Selection:
                     replace(self._problem, structure=known_structures.UNSTABLE_FOPDT),
                     self._unstable(),
                 )
-                chosen = starts.unstable_second(first.theta)
+                chosen = starts.unstable_second(first[0].theta)
                 return [self._best(known_structures.UNSTABLE_SOPDT, chosen)]
         return []
 
@@ -273,12 +277,18 @@ class Selection:
             # So few samples tell no more than a first order.
             return None
         rough = refine_roughly(problem, thetas)
-        hopeless = rough.cost / rough.residual.size > _BEYOND_HOPE * self._least
-        if hopeless and structure.name not in _ALWAYS:
-            return None
-        state = refine(problem, rough.theta, tolerance=_TRIAL, damping=rough.damping)
+        if structure.name not in _ALWAYS and self._is_hopeless(rough[0]):
+            # Unless it was on its way still.
+            best = rough[0]
+            rough = [refine(coarse(problem), best.theta, tolerance=_TRIAL, damping=best.damping)]
+            if self._is_hopeless(rough[0]):
+                return None
+        state = refine_all(problem, rough, _TRIAL)
         self._least = min(self._least, max(state.cost, self._floor) / samples)
         return self.candidate(problem, state)
+
+    def _is_hopeless(self, rough: State) -> bool:
+        return rough.cost / rough.residual.size > _BEYOND_HOPE * self._least
 
 
 def after_the_unknown(problem: Problem, state: State) -> Problem:
@@ -292,10 +302,11 @@ def after_the_unknown(problem: Problem, state: State) -> Problem:
     """
     if not problem.relaxation:
         return problem
-    known = problem.time >= problem.time[0] + float(state.theta[-1])
-    if np.count_nonzero(known) <= 4 * state.parameters:
+    known = problem.time >= problem.starts + float(state.theta[-1])
+    some = problem.part(known)
+    if min(part.stop - part.start for part in some.experiments) <= 4 * state.parameters:
         return problem
-    return problem.part(known)
+    return some
 
 
 def choose(candidates: list[Candidate]) -> Candidate:

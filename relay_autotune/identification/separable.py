@@ -5,7 +5,9 @@ Variable projection (Golub and Pereyra 1973) with Kaufman's approximation of the
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,27 +27,54 @@ _LITTLE_DAMPING = 0.1
 _LEAST_DAMPING = 1e-12
 _MOST_DAMPING = 1e12
 _GROWTH = 4.0
+# In lengths of the record: a slower lag answers as an integrator does, to a thousandth.
+_LONGEST = 1e3
 _WEAK = 1e-13
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Samples, input and structure, with the terms that are estimated beside the model.
+    """Samples, inputs and structure, with the terms that are estimated beside the model.
 
-    :param time: sample times, not decreasing [s], shape (n,).
+    The samples of several experiments on one process follow one another; gain and theta are
+    common to them, offset, drift and initial state are each one's own.
+
+    :param time: sample times, in each experiment not decreasing [s], shape (n,).
     :param y: what is fitted, in units of its own range, shape (n,).
-    :param u: the input.
+    :param inputs: the input of each experiment.
     :param structure: the structure.
+    :param index: number of each sample among all that were recorded, shape (n,).
+    :param bounds: number of the first sample of each experiment.
     :param drift: True: a straight line is estimated, not only an offset.
     :param relaxation: True: a free initial state is estimated.
+    :param weight: square root of what each sample counts, shape (n,); None: all count alike.
     """
 
     time: FloatArray
     y: FloatArray
-    u: PiecewiseConstant
+    inputs: tuple[PiecewiseConstant, ...]
     structure: RationalStructure
+    index: NDArray[np.int64]
+    bounds: tuple[int, ...] = (0,)
     drift: bool = False
     relaxation: bool = False
+    weight: FloatArray | None = None
+
+    @property
+    def experiments(self) -> list[slice]:
+        """The samples of each experiment."""
+        if len(self.bounds) == 1:
+            return [slice(0, self.time.size)]
+        ends = [*np.searchsorted(self.index, self.bounds).tolist(), self.time.size]
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    @property
+    def starts(self) -> FloatArray:
+        """Time of the first sample of each sample's experiment [s], shape (n,)."""
+        found = np.empty(self.time.size)
+        for part in self.experiments:
+            found[part] = self.time[part][0]
+        return found
 
     def columns(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the linear coefficients' columns and the derivatives of those that have some.
@@ -54,22 +83,88 @@ class Problem:
         :return: shapes (k, n) and (m, l, n); the k - l columns that theta does not change come
             last.
         """
-        columns, derivatives = self.structure.columns(theta, self.time, self.u)
-        rows = [columns]
+        parts = self.experiments
+        if len(parts) == 1:
+            common, by_theta, own, own_by_theta, rest = self._of_one(theta, parts[0], 0)
+            columns = np.concatenate((common, own, rest))
+            if own.shape[0]:
+                by_theta = np.concatenate((by_theta, own_by_theta), axis=1)
+            return columns, by_theta
+        found = [self._of_one(theta, part, i) for i, part in enumerate(parts)]
+        own_rows = sum(f[2].shape[0] for f in found)
+        rest_rows = sum(f[4].shape[0] for f in found)
+        k, n = found[0][0].shape[0], self.time.size
+        columns = np.zeros((k + own_rows + rest_rows, n))
+        derivatives = np.zeros((theta.size, k + own_rows, n))
+        first, last = k, k + own_rows
+        for part, (common, by_theta, own, own_by_theta, rest) in zip(parts, found, strict=True):
+            columns[:k, part], derivatives[:, :k, part] = common, by_theta
+            place = slice(first, first + own.shape[0])
+            columns[place, part], derivatives[:, place, part] = own, own_by_theta
+            columns[last : last + rest.shape[0], part] = rest
+            first, last = place.stop, last + rest.shape[0]
+        return columns, derivatives
+
+    def _of_one(
+        self, theta: FloatArray, part: slice, number: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return one experiment's responses, free motion and straight line, with derivatives."""
+        time = self.time[part]
+        common, by_theta = self.structure.columns(theta, time, self.inputs[number])
+        own, own_by_theta = np.zeros((0, time.size)), np.zeros((theta.size, 0, time.size))
         if self.relaxation or self.structure.unstable:
-            state, by_theta = self.structure.relaxation(
-                theta, self.time, growing_only=not self.relaxation
+            own, own_by_theta = self.structure.relaxation(
+                theta, time, growing_only=not self.relaxation
             )
-            rows.append(state)
-            derivatives = np.concatenate((derivatives, by_theta), axis=1)
-        rows.append(np.ones((1, self.time.size)))
+        rest = np.ones((1 + self.drift, time.size))
         if self.drift:
-            rows.append(((self.time - self.time.mean()) / np.ptp(self.time))[None, :])
-        return np.concatenate(rows), derivatives
+            rest[1] = (time - time.mean()) / np.ptp(time)
+        return common, by_theta, own, own_by_theta, rest
 
     def part(self, chosen: NDArray[np.bool_] | slice) -> Problem:
-        """Return the problem of some of the samples."""
-        return replace(self, time=self.time[chosen], y=self.y[chosen])
+        """Return the problem of some of the samples, of each experiment at least a few."""
+        return replace(
+            self,
+            time=self.time[chosen],
+            y=self.y[chosen],
+            index=self.index[chosen],
+            weight=None if self.weight is None else self.weight[chosen],
+        )
+
+    def thinned(self, most: int) -> Problem:
+        """Return the problem of evenly spaced samples.
+
+        :param most: of all experiments together; hardly more are kept.
+        """
+        share = most // len(self.bounds)
+        parts = self.experiments
+        steps = [max(1, (part.stop - part.start) // share) for part in parts]
+        if len(parts) == 1:
+            return self if steps[0] == 1 else self.part(slice(None, None, steps[0]))
+        chosen = np.zeros(self.time.size, dtype=bool)
+        for part, step in zip(parts, steps, strict=True):
+            chosen[part][::step] = True
+        return self.part(chosen)
+
+
+def problem_of(
+    records: Sequence[tuple[FloatArray, FloatArray, PiecewiseConstant]],
+    structure: RationalStructure,
+) -> Problem:
+    """Return the problem of fitting a structure to one or several experiments.
+
+    :param records: sample times [s], what is fitted, and input of each.
+    :param structure: the structure.
+    """
+    sizes = [time.size for time, _, _ in records]
+    return Problem(
+        np.concatenate([time for time, _, _ in records]),
+        np.concatenate([y for _, y, _ in records]),
+        tuple(u for _, _, u in records),
+        structure,
+        np.arange(sum(sizes)),
+        tuple(int(b) for b in np.cumsum([0, *sizes[:-1]])),
+    )
 
 
 @dataclass(frozen=True)
@@ -78,11 +173,11 @@ class State:
 
     :param theta: shape (m,).
     :param coefficients: the best linear coefficients, shape (k,).
-    :param residual: what is left, shape (n,).
+    :param residual: what is left, weighted as the samples are, shape (n,).
     :param cost: its sum of squares.
     :param basis: orthonormal columns of the linear part, shape (n, k).
-    :param derivative: of the model by theta, shape (m, n).
-    :param columns: of the linear part, shape (k, n).
+    :param derivative: of the model by theta, weighted, shape (m, n).
+    :param columns: of the linear part, weighted, shape (k, n).
     :param damping: Marquardt's, where a fit ended.
     """
 
@@ -108,15 +203,17 @@ def evaluate(problem: Problem, theta: FloatArray) -> State:
     :param theta: shape (m,).
     """
     columns, derivatives = problem.columns(theta)
+    y = problem.y
+    if problem.weight is not None:
+        y, columns, derivatives = (x * problem.weight for x in (y, columns, derivatives))
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((columns / size[:, None]).T)
     # A column that the others make up carries no information: its coefficient stays zero.
     weak = np.abs(np.diag(r)) < _WEAK
     r[np.diag_indices_from(r)] += weak
-    projection = q.T @ problem.y
-    coefficients = np.linalg.solve(r, np.where(weak, 0.0, projection)) / size
-    residual = problem.y - coefficients @ columns
+    coefficients = np.linalg.solve(r, np.where(weak, 0.0, q.T @ y)) / size
+    residual = y - coefficients @ columns
     derivative = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
     cost = float(residual @ residual)
     return State(theta, coefficients, residual, cost, q, derivative, columns)
@@ -140,6 +237,7 @@ def refine(
     """
     state = evaluate(problem, theta)
     growth = _GROWTH
+    longest = _LONGEST * float(np.ptp(problem.time))
     # A rough answer must not take as many trials as an exact one.
     rough = tolerance > _LEAST_GAIN
     for _ in range(min(most, _MOST_ROUGH_ITERATIONS) if rough else most):
@@ -157,7 +255,7 @@ def refine(
         predicted = float(step @ (2.0 * gradient - normal @ step))
         if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
             break
-        trial = evaluate(problem, problem.structure.move(state.theta, step))
+        trial = evaluate(problem, problem.structure.move(state.theta, step, longest))
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         if not trial.cost < state.cost:
             damping *= growth
@@ -192,12 +290,16 @@ def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArr
     return np.asarray(step / size)
 
 
-def information_criterion(cost: float, samples: int, parameters: int, floor: float) -> float:
-    """Return the Bayesian information criterion, ``n log(cost/n) + p log n``.
+def information_criterion(
+    cost: float, samples: int, parameters: int, floor: float, worth: float = 1.0
+) -> float:
+    """Return the Bayesian information criterion, ``n log(cost/samples) + p log n``.
 
     :param cost: sum of squared residuals.
-    :param samples: n.
+    :param samples: how many they are.
     :param parameters: p, all that was estimated.
     :param floor: what lies below it is rounding, and counts as equal.
+    :param worth: how many independent samples each is worth; n is so many times their number.
     """
-    return samples * math.log(max(cost, floor) / samples) + parameters * math.log(samples)
+    n = samples * worth
+    return n * math.log(max(cost, floor) / samples) + parameters * math.log(max(n, 3.0))

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.separable import Problem, State, evaluate, refine
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
 from relay_autotune.ultimate import ultimate_point
 
 FloatArray = NDArray[np.float64]
@@ -21,8 +20,10 @@ _COARSE = 1e-4
 _FIRST_STEPS = 5
 _SECOND_STEPS = 8
 _MORE = 3
-_SAME = 1e-4
 _HOPELESS = 4.0
+# Nearer in every direction two are one; of two whose sums differ by less, all samples decide.
+_SAME = 0.02
+_UNDECIDED = 1.05
 _EXACT = 1e-15
 
 # Dead times tried at the start, as shares of the longest one.
@@ -33,52 +34,59 @@ _SHARES = (
 )
 
 
-def time_scales(time: FloatArray, u: PiecewiseConstant) -> tuple[float, float]:
+def time_scales(problem: Problem) -> tuple[float, float]:
     """Return the shortest time that samples resolve, and the longest that a dead time can be.
 
-    :param time: sample times [s], shape (n,).
-    :param u: the input, which changes within them.
+    :param problem: the inputs change within the samples [s].
     """
-    gaps = np.diff(time)
-    shortest = float(np.median(gaps[gaps > 0.0]))
-    inside = u.times[(u.times >= time[0]) & (u.times < time[-1])]
-    rest = float(time[-1] - inside[0])
-    if inside.size < 4:
-        return shortest, rest
-    # In a relay test the process answers one switch before the next.
-    return shortest, min(1.1 * float(np.max(np.diff(inside))), rest)
+    scales = []
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        time = problem.time[part]
+        gaps = np.diff(time)
+        shortest = float(np.median(gaps[gaps > 0.0]))
+        inside = u.times[(u.times >= time[0]) & (u.times < time[-1])]
+        rest = float(time[-1] - inside[0])
+        if inside.size >= 4:
+            # In a relay test the process answers one switch before the next.
+            rest = min(1.1 * float(np.max(np.diff(inside))), rest)
+        scales.append((shortest, rest))
+    return min(s for s, _ in scales), min(longest for _, longest in scales)
 
 
 def coarse(problem: Problem) -> Problem:
     """Return the problem of a few hundred samples."""
-    return problem.part(slice(None, None, max(1, problem.time.size // _GRID_SAMPLES)))
+    return problem.thinned(_GRID_SAMPLES)
 
 
-def refine_roughly(problem: Problem, thetas: list[FloatArray]) -> State:
-    """Return the best fit to few samples that any of the starts leads to.
+def refine_roughly(problem: Problem, thetas: list[FloatArray]) -> list[State]:
+    """Return the fits to few samples that the starts lead to, the best first.
 
     :param problem: the problem.
     :param thetas: starts, at least one.
+    :return: two where few samples do not tell which of two places is the better one.
     """
     few = coarse(problem)
     if len(thetas) == 1:
-        return refine(few, thetas[0], tolerance=_COARSE)
+        return [refine(few, thetas[0], tolerance=_COARSE)]
     # A few steps show which starts are worth more.
     begun = [refine(few, theta, tolerance=_COARSE, most=_FIRST_STEPS) for theta in thetas]
-    begun.sort(key=lambda s: s.cost)
-    best = begun[0]
-    reached = [best]
-    for state in begun[1:]:
-        # Two that have come to the same place go on as one.
-        same = abs(state.cost - best.cost) <= _SAME * best.cost
-        if len(reached) < _MORE and state.cost <= _HOPELESS * best.cost and not same:
-            reached.append(state)
-    if len(reached) > 1:
-        reached = [
-            refine(few, s.theta, tolerance=_COARSE, most=_SECOND_STEPS, damping=s.damping)
-            for s in reached
-        ]
-    return min(reached, key=lambda s: s.cost)
+    reached = [
+        refine(few, s.theta, tolerance=_COARSE, most=_SECOND_STEPS, damping=s.damping)
+        for s in _apart_from_each_other(problem, begun, _HOPELESS)[:_MORE]
+    ]
+    return _apart_from_each_other(problem, reached, _UNDECIDED)[:2]
+
+
+def _apart_from_each_other(problem: Problem, states: list[State], limit: float) -> list[State]:
+    """Return the best state and those of little higher cost that are elsewhere."""
+    states = sorted(states, key=lambda s: s.cost)
+    chosen: list[State] = []
+    for state in states:
+        size = problem.structure.scale(state.theta)
+        near = (np.abs((state.theta - c.theta) / size).max() < _SAME for c in chosen)
+        if state.cost <= limit * states[0].cost and not any(near):
+            chosen.append(state)
+    return chosen
 
 
 def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> State:
@@ -88,8 +96,18 @@ def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float 
     :param thetas: starts, at least one.
     :param tolerance: relative gain of a step that is not worth another one; 0: rounding.
     """
-    rough = refine_roughly(problem, thetas)
-    return refine(problem, rough.theta, tolerance=tolerance or _EXACT, damping=rough.damping)
+    return refine_all(problem, refine_roughly(problem, thetas), tolerance or _EXACT)
+
+
+def refine_all(problem: Problem, rough: list[State], tolerance: float) -> State:
+    """Return the best fit to all samples from fits to few of them.
+
+    :param problem: the problem.
+    :param rough: fits to few samples, at least one.
+    :param tolerance: relative gain of a step that is not worth another one.
+    """
+    fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in rough]
+    return min(fits, key=lambda s: s.cost)
 
 
 def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
@@ -98,7 +116,7 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     :param problem: with a FOPDT structure.
     :param sign: of the gain, 1 or -1; 0: not known.
     """
-    shortest, longest = time_scales(problem.time, problem.u)
+    shortest, longest = time_scales(problem)
     few = coarse(problem)
     taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
     dead_times = longest * np.array(_SHARES)
@@ -124,19 +142,23 @@ def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> F
     A limit cycle looks much the same half a period later with the other sign; a lag with the
     wrong one explains nothing here.
     """
-    # A dead time only moves the response, so that one pass over moved samples gives all of them.
-    moved = (problem.time - dead_times[:, None]).ravel()
-    order = np.argsort(moved, kind="stable")
-    columns, _ = problem.structure.columns(np.array((math.log(tau), 0.0)), moved[order], problem.u)
-    r = np.empty(moved.size)
-    r[order] = columns[0]
-    table = r.reshape(dead_times.size, -1)
-    table = table - table.mean(axis=1, keepdims=True)
-    y = problem.y - problem.y.mean()
-    power = np.einsum("dn,dn->d", table, table)
+    theta = np.array((math.log(tau), 0.0))
+    along, power, total = np.zeros(dead_times.size), np.zeros(dead_times.size), 0.0
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        # A dead time only moves the response, so that one pass over moved samples gives all.
+        moved = (problem.time[part] - dead_times[:, None]).ravel()
+        order = np.argsort(moved, kind="stable")
+        columns, _ = problem.structure.columns(theta, moved[order], u)
+        r = np.empty(moved.size)
+        r[order] = columns[0]
+        table = r.reshape(dead_times.size, -1)
+        table = table - table.mean(axis=1, keepdims=True)
+        y = problem.y[part] - problem.y[part].mean()
+        power += np.einsum("dn,dn->d", table, table)
+        along += table @ y
+        total += float(y @ y)
     power[power == 0.0] = 1.0
-    along = table @ y
-    return np.asarray(float(y @ y) - np.where(sign * along < 0.0, 0.0, along**2 / power))
+    return np.asarray(total - np.where(sign * along < 0.0, 0.0, along**2 / power))
 
 
 class Starts:
@@ -148,7 +170,7 @@ class Starts:
 
     def __init__(self, problem: Problem, fopdt: State) -> None:
         self._unstable: list[FloatArray] | None = None
-        shortest, self.longest = time_scales(problem.time, problem.u)
+        shortest, self.longest = time_scales(problem)
         # A FOPDT that fits badly may run off to an integrator, which tells the others nothing.
         self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
         self.dead_time = float(fopdt.theta[1])

@@ -92,12 +92,18 @@ class RationalStructure:
         lags = sum(abs(c) for c in self.denominator.constants(theta[:-1]))
         return np.append(np.ones(theta.size - 1), lags + theta[-1] or 1.0)
 
-    def move(self, theta: FloatArray, step: FloatArray) -> FloatArray:
-        """Return theta after a step in units of :meth:`scale`, within its bounds."""
+    def move(self, theta: FloatArray, step: FloatArray, longest: float = math.inf) -> FloatArray:
+        """Return theta after a step in units of :meth:`scale`, within its bounds.
+
+        :param theta: shape (m,).
+        :param step: shape (m,).
+        :param longest: time constant beyond which a lag is an integrator [s].
+        """
         logs = theta[:-1] + np.clip(step[:-1], -_LOG_STEP, _LOG_STEP)
         logs = np.clip(logs, -_LOG_RANGE, _LOG_RANGE)
-        first = 0
+        first, limit = 0, math.log(longest)
         for factor in self.denominator.factors:
+            logs[first] = min(logs[first], limit)
             if isinstance(factor, Quadratic):
                 logs[first + 1] = np.clip(logs[first + 1], *_LOG_DAMPING)
             first += factor.parameters

@@ -36,8 +36,9 @@ PROMISED = {
         float64 gain dead_time
         float64[] zeros time_constants numerator denominator std covariance ci95_low ci95_high
         uint32 order
-        string[] parameters warnings undetermined
-        float64 ultimate_gain ultimate_gain_std ultimate_frequency ultimate_frequency_std
+        string[] parameters warnings undetermined combinations combination_units advice
+        float64[] combination_value combination_std combination_ci95_low combination_ci95_high
+        float64 support ultimate_gain ultimate_gain_std ultimate_frequency ultimate_frequency_std
         float64 residual_rms noise_std fit whiteness_p""",
     "msg/PidGains.msg": """
         std_msgs/Header header

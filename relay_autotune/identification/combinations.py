@@ -1,0 +1,112 @@
+"""What a record determines where it does not determine every parameter, and what would."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from relay_autotune.identification.intervals import Estimate, Uncertain, estimate
+from relay_autotune.models import TransferFunction
+from relay_autotune.ultimate import ultimate_point
+
+# Half an interval at most so many times the value.
+DETERMINED = 0.2
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A combination of parameters with its uncertainty.
+
+    :param name: in terms of the parameters.
+    :param unit: of the value.
+    :param value: its value.
+    :param std: its standard deviation; NaN: not estimated.
+    :param ci95_low: lower end of its 95 % interval; NaN: not estimated.
+    :param ci95_high: upper end; NaN: not estimated.
+    """
+
+    name: str
+    unit: str
+    value: float
+    std: float = math.nan
+    ci95_low: float = math.nan
+    ci95_high: float = math.nan
+
+    @property
+    def determined(self) -> bool:
+        """True if half its interval is at most 20 % of the value."""
+        return is_determined(self.value, self.ci95_low, self.ci95_high)
+
+
+def is_determined(value: float, low: float, high: float) -> bool:
+    """Return whether half an interval is at most 20 % of the value; False if it is not known."""
+    return bool(0.5 * (high - low) <= DETERMINED * abs(value))
+
+
+def determined_combinations(
+    found: Uncertain, point: tuple[Estimate, Estimate]
+) -> tuple[Combination, ...]:
+    """Return the combinations that the data hold, of a model that is not determined as a whole.
+
+    :param found: the model with its covariance.
+    :param point: K_u and w_u, whose uncertainty is known better than to first order.
+    """
+    model = found.build(found.values)
+    asked: list[tuple[str, str, Estimate]] = [
+        (name, unit, estimate(found, function)) for name, unit, function in _asked(model)
+    ]
+    if math.isfinite(point[0].value):
+        asked += [
+            ("ultimate_gain", "u/y", point[0]),
+            ("ultimate_frequency", "rad/s", point[1]),
+        ]
+    combinations = (
+        Combination(name, unit, e.value, e.std, e.low, e.high) for name, unit, e in asked
+    )
+    return tuple(c for c in combinations if c.determined)
+
+
+def point_of(model: TransferFunction) -> tuple[float, float]:
+    """Return K_u and w_u; NaN where there is none."""
+    point = ultimate_point(model)
+    return (math.nan, math.nan) if point is None else (point.gain, point.frequency)
+
+
+def _asked(
+    model: TransferFunction,
+) -> list[tuple[str, str, Callable[[TransferFunction], float]]]:
+    """Return names, units and functions of what may be determined where parameters are not."""
+    lags = len(model.time_constants)
+    found: list[tuple[str, str, Callable[[TransferFunction], float]]] = []
+    per = " s" * (model.integrators + 1)
+    if lags:
+        # How fast it moves away: of a slow process this is all that a short test shows.
+        found.append(("gain/time_constant", f"y/(u{per})", _slope))
+    if lags > 1:
+        found.append(("gain/product of lags", f"y/(u{' s' * (model.integrators + lags)})", _high))
+    small = lags if model.integrators else lags - 1
+    if small > 0 or model.zeros:
+        found.append(("dead_time + smaller lags", "s", _apparent_dead_time))
+    if lags and model.is_stable:
+        found.append(("dead_time + sum of lags", "s", _residence))
+    return found
+
+
+def _slope(model: TransferFunction) -> float:
+    return abs(model.gain) / max(abs(t) for t in model.time_constants)
+
+
+def _high(model: TransferFunction) -> float:
+    return abs(model.gain) / math.prod(abs(t) for t in model.time_constants)
+
+
+def _apparent_dead_time(model: TransferFunction) -> float:
+    lags = sorted((t.real for t in model.time_constants), key=abs)
+    some = lags if model.integrators else lags[:-1]
+    return model.dead_time + sum(some) - sum(z.real for z in model.zeros)
+
+
+def _residence(model: TransferFunction) -> float:
+    constants = sum(t.real for t in model.time_constants)
+    return model.dead_time + constants - sum(z.real for z in model.zeros)

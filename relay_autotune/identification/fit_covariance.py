@@ -1,0 +1,154 @@
+"""What a waveform fit is, and the covariance of its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.quantisation import quantisation_step
+from relay_autotune.identification.residuals import covariance_meat
+from relay_autotune.identification.robust import mean_slope, scale_of, weights
+from relay_autotune.identification.selection import Candidate
+from relay_autotune.identification.separable import Problem, State
+from relay_autotune.record import Record
+
+FloatArray = NDArray[np.float64]
+
+# Parts of the measurement's range that are rounding.
+NEGLIGIBLE = 1e-10
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fit with all that it came from.
+
+    :param problem: what was fitted.
+    :param state: the fit.
+    :param candidates: all structures tried, the best first.
+    :param scale: range of the measurement, in which the problem counts [y].
+    :param base: what the samples' weights would be without the loss, shape (n,); None: the
+        weights themselves.
+    :param loss: what was minimised.
+    :param warnings: sentences on what was left out.
+    """
+
+    problem: Problem
+    state: State
+    candidates: tuple[Candidate, ...]
+    scale: float
+    base: FloatArray | None = None
+    loss: str = "squares"
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the residual is like.
+
+    :param coloured: True: its samples are correlated.
+    :param inflation: how many times larger the covariance is than for white noise of its size.
+    :param step: of the sensor's grid [y]; 0: none, or far below the noise.
+    """
+
+    coloured: bool
+    inflation: float = 1.0
+    step: float = 0.0
+
+
+def raw_residual(problem: Problem, state: State) -> FloatArray:
+    """Return what a fit leaves of each sample, whatever it counts, shape (n,)."""
+    if problem.weight is None:
+        return state.residual
+    columns, _ = problem.columns(state.theta)
+    return np.asarray(problem.y - state.coefficients @ columns)
+
+
+def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
+    """Recognise correlated noise, and a sensor whose steps are larger than its noise."""
+    step = max(quantisation_step(r.measurement) for r in records)
+    if step == 0.0 or rms >= step:
+        return Noise(coloured)
+    # Rounding errors stay alike until the next level is crossed: each level that is held is
+    # one piece of news, however many samples it lasts, with the variance of a rounding.
+    held = sum(1 + int(np.count_nonzero(np.diff(r.measurement))) for r in records)
+    samples = sum(len(r) for r in records)
+    larger = max(step**2 / 12.0 / rms**2, 1.0) if rms > 0.0 else 1.0
+    return Noise(coloured, larger * samples / held, step)
+
+
+def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return the covariance of the parameters of the field, to first order, shape (p, p).
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    :param fit: where scale and loss are told.
+    :param noise: what the residual is like.
+    """
+    scale = fit.scale
+    gradient = _gradient(problem, state, scale)
+    return np.asarray(gradient @ _covariance(problem, state, fit, noise) @ gradient.T)
+
+
+def _covariance(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return the covariance of all linear coefficients and theta, in this order.
+
+    Of least squares it is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
+    ``J r`` between two inverses. Of a robust loss r is its derivative, over the mean of its
+    second one (Huber 1981).
+    """
+    n = state.residual.size
+    jacobian, scores, slope = _scores(problem, state, fit)
+    size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
+    size[size == 0.0] = 1.0
+    inverse = np.linalg.pinv((jacobian @ jacobian.T) / np.outer(size, size), rcond=1e-15)
+    inverse = inverse / np.outer(size, size)
+    degrees = max(n - state.parameters, 1)
+    if noise.coloured:
+        meat = covariance_meat(jacobian * scores, scores) * (n / degrees)
+        covariance = inverse @ meat @ inverse
+        white = inverse * (float(scores @ scores) / degrees)
+        # Each of the two reasons for fewer independent samples may hold; the larger one counts.
+        larger = np.sqrt(
+            np.diag(white) * noise.inflation / np.maximum(np.diag(covariance), 1e-300)
+        )
+        factor = np.maximum(larger, 1.0)
+        covariance = covariance * np.outer(factor, factor)
+    else:
+        covariance = inverse * (float(scores @ scores) / degrees * noise.inflation)
+    return np.asarray(covariance / slope**2)
+
+
+def _scores(problem: Problem, state: State, fit: Fit) -> tuple[FloatArray, FloatArray, float]:
+    """Return Jacobian, derivative of the loss at each sample, and mean of its second one."""
+    if fit.loss == "squares" or fit.base is None:
+        return np.concatenate((state.columns, state.derivative)), state.residual, 1.0
+    columns, derivatives = problem.columns(state.theta)
+    derivative = np.einsum("k,mkn->mn", state.coefficients[: derivatives.shape[1]], derivatives)
+    residual = fit.base * (problem.y - state.coefficients @ columns)
+    scale = max(scale_of(residual), NEGLIGIBLE)
+    scores = weights(residual, scale, fit.loss) * residual
+    jacobian = fit.base * np.concatenate((columns, derivative))
+    return jacobian, scores, max(mean_slope(residual, scale, fit.loss), 0.1)
+
+
+def _gradient(problem: Problem, state: State, scale: float) -> FloatArray:
+    """Return d(parameters of the field)/d(linear coefficients, theta), shape (p, k + m)."""
+    structure, k = problem.structure, state.coefficients.size
+    point = np.concatenate((state.coefficients, state.theta))
+    columns = []
+    for i, value in enumerate(point):
+        h = 1e-6 * (abs(value) or 1.0)
+        # A logarithm near zero is a time near one second, not a small one.
+        h = max(h, 1e-6) if k <= i < point.size - 1 else h
+        ends = []
+        for side in (h, -h):
+            moved = point.copy()
+            moved[i] += side
+            reading = structure.read(moved[k:], scale * moved[:k], like=state.theta)
+            assert reading is not None
+            ends.append(reading.values)
+        columns.append((ends[0] - ends[1]) / (2.0 * h))
+    return np.stack(columns, axis=1)
