@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.cycles import cycles_of, limit_cycle
+from relay_autotune.disturbance import without_disturbance
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
 from relay_autotune.identification import (
     DEFAULT_METHOD,
@@ -119,6 +120,10 @@ def analyse(
         chosen = _guarded(record, method, known)
     except RelayAutotuneError as error:
         return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
+    if final:
+        chosen = without_disturbance(
+            chosen, record, cycles, lambda part: _guarded(part, method, known)
+        )
     models = [chosen]
     if final:
         models += _others(record, method, known, chosen)

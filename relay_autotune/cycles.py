@@ -210,13 +210,19 @@ def cycles_of(
     cycles: list[Cycle] = []
     for first, last in pairwise(bounds):
         part = slice(first, last + 1)
+        sent = record.command[first:last]
+        low, high = float(sent.min()), float(sent.max())
+        middle = settings.baseline + settings.bias
+        if not low < middle < high:
+            # The levels were shifted later, to bear a load.
+            middle = 0.5 * (low + high)
         cycles.append(
             next_cycle(
                 cycles,
                 record.time[part],
                 record.measurement[part],
-                record.command[first:last],
-                middle=settings.baseline + settings.bias,
+                sent,
+                middle=middle,
                 reverse_acting=settings.reverse_acting,
                 noise_std=record.noise_std,
                 min_cycles=min_cycles,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 
 from relay_autotune.cycles import next_cycle
 from relay_autotune.levels import Levels, clear_swing
@@ -23,6 +24,13 @@ _SHORT_STAY = 0.2
 # of the sample interval.
 _ROUNDING = 1e-6
 
+# The part of a period at the high level is known when two cycles agree in it this far; a load has
+# come when it then differs by more than the other. A load that stops the oscillation altogether
+# is borne by shifts of half the amplitude, so many at a time.
+_SAME_SHARE = 0.03
+_OTHER_SHARE = 0.08
+_MOST_SHIFTS = 4
+
 _SIGNS = {1: "positive", -1: "negative"}
 
 
@@ -30,7 +38,8 @@ class Oscillation:
     """Answer samples with the relay until its cycles agree, or until there is no oscillation.
 
     An amplitude that is to be found grows from cycle to cycle until the oscillation is large
-    enough; cycles count from there on.
+    enough; cycles count from there on. A load that comes changes the mean command that the process
+    needs, and with it the half periods; the levels follow, so that these stay as they were.
 
     :param parameters: what the user set, valid.
     :param baseline: command of the operating point [u].
@@ -85,6 +94,8 @@ class Oscillation:
         self._until_converged = until_converged
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
         self._limit = first_limit
+        self._share = math.nan
+        self._shifts = 0
         self._begin()
 
     @property
@@ -101,6 +112,7 @@ class Oscillation:
         relay = self._relay
         if relay.update(t, y):
             self._learn(relay.last_stay)
+            self._shifts = 0
             begins = relay.is_high and not self._is_noise()
             due = t + self._parameters.extra_delay
             self._on_the_way.append((due, relay.is_high, begins))
@@ -167,6 +179,8 @@ class Oscillation:
                 if self._until_converged
                 else f"max_cycles, {p.max_cycles}, reached",
             )
+        else:
+            self._bear_load()
 
     def _has_grown(self) -> bool:
         """Make an amplitude that is being found larger if the last cycle was too small."""
@@ -208,12 +222,33 @@ class Oscillation:
             tolerance=p.cycle_tolerance,
         )
 
+    def _bear_load(self) -> None:
+        """Shift the levels by what a load has changed of the mean command."""
+        share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in self.cycles[-2:]]
+        if math.isnan(self._share):
+            if len(share) == 2 and abs(share[1] - share[0]) < _SAME_SHARE:
+                self._share = share[1]
+            return
+        change = share[-1] - self._share
+        # Once a load has come, what is left of it is borne, too.
+        if abs(change) > (_SAME_SHARE if self.cycles[-2].disturbed else _OTHER_SHARE):
+            self._shift(2.0 * change * self._levels.amplitude)
+            self.cycles[-1] = replace(self.cycles[-1], disturbed=True)
+
+    def _shift(self, by: float) -> None:
+        self._levels.shift(by)
+        note = "a load came during the test, and the relay's levels were shifted to bear it"
+        if note not in self.notes:
+            self.notes.append(note)
+
     # The end.
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self.cycles)
         if outcome is Outcome.COMPLETED and disturbed:
-            self.notes.append(f"{disturbed} of the cycles have a long gap in their samples")
+            self.notes.append(
+                f"{disturbed} of the cycles have a long gap in their samples, or a load came"
+            )
         self.verdict = outcome, reason
 
     def _no_return(self, t: float, y: float) -> None:
@@ -233,6 +268,14 @@ class Oscillation:
             self.cycle_start.clear()
             self._begin()
             return
+        if self.cycles and self._shifts < _MOST_SHIFTS:
+            # It did oscillate: a load may have come that one of the levels cannot bear.
+            before = self.command
+            self._shift((0.5 if self._is_high else -0.5) * self._levels.amplitude)
+            if self.command != before:
+                self._shifts += 1
+                self._relay.since = t
+                return
         stay = [k for k, s in enumerate(self._samples.time) if s >= self._relay.since]
         time, measurement, _ = self._samples.columns(stay[0], len(self._samples))
         towards = self.sign if self._relay.is_high else -self.sign

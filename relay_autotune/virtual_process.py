@@ -76,6 +76,11 @@ class VirtualProcess:
         """Present time of the process [s]."""
         return self._plant.time
 
+    @property
+    def position(self) -> float:
+        """Where the actuator is [u]."""
+        return self._actuator.position
+
     def command(self, value: float, time: float | None = None) -> None:
         """Give a command that holds until the next one.
 

@@ -6,6 +6,7 @@ import math
 import time
 from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -67,6 +68,41 @@ PARAMETERS = (
     NodeParameter("stiction", 0.0, "u", "Band in which the actuator sticks.", 0.0),
     NodeParameter("dead_band", 0.0, "u", "Play of the actuator.", 0.0),
     NodeParameter(
+        "falling_gain",
+        1.0,
+        "",
+        "Factor on what the command is below rest, for a process that cools slower than it heats.",
+        1e-3,
+        1e3,
+    ),
+    NodeParameter(
+        "jitter",
+        0.0,
+        "s",
+        "Largest delay of a sample after its time, evenly spread, in the mode realtime.",
+        0.0,
+    ),
+    NodeParameter(
+        "loss",
+        0.0,
+        "",
+        "Share of the samples that are not published, in the modes realtime and clock.",
+        0.0,
+        0.9,
+    ),
+    NodeParameter(
+        "on_change",
+        False,
+        "",
+        "True: a sample is published only if it differs from the last one; not in lockstep.",
+    ),
+    NodeParameter(
+        "feedback",
+        False,
+        "",
+        "True: the actuator's position is published on command_feedback after each command.",
+    ),
+    NodeParameter(
         "mode",
         "realtime",
         "",
@@ -100,6 +136,7 @@ def process_from(values: dict[str, Any]) -> VirtualProcess:
             maximum=values["command_max"],
             dead_band=values["dead_band"],
             stiction=values["stiction"],
+            falling_gain=values["falling_gain"],
         ),
         disturbances=Disturbances(
             noise_std=values["noise_std"],
@@ -140,6 +177,42 @@ def model_from(values: dict[str, Any]) -> TransferFunction:
     )
 
 
+class Sensor:
+    """What a real sensor does besides measuring: it comes late, loses samples, repeats none.
+
+    :param values: the node's parameters.
+    :raises ParameterError: in lockstep, where each sample has to come.
+    """
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self._jitter, self._loss = values["jitter"], values["loss"]
+        self._on_change = values["on_change"]
+        self._last = math.nan
+        self._random = np.random.default_rng((values["seed"], 1))
+        if values["mode"] == "lockstep" and (self._jitter or self._loss or self._on_change):
+            raise ParameterError(
+                "in lockstep each sample leads to a command and that to the next sample: jitter, "
+                "loss and on_change are for the other modes"
+            )
+
+    def wait(self) -> None:
+        """Come late, as the jitter says."""
+        if self._jitter > 0.0:
+            time.sleep(float(self._random.uniform(0.0, self._jitter)))
+
+    def speaks(self, value: float) -> bool:
+        """Return True if a sample is to be published.
+
+        :param value: the sample [y].
+        """
+        if self._loss > 0.0 and self._random.uniform() < self._loss:
+            return False
+        if self._on_change and value == self._last:
+            return False
+        self._last = value
+        return True
+
+
 class PlantNode(ServedNode):
     """A simulated process.
 
@@ -156,15 +229,22 @@ class PlantNode(ServedNode):
         self._period: float = values["sample_period"]
         self._samples = 0
         self._message = Float64()
+        self._sensor = Sensor(values)
+        self._position: Any = None
         # Each event that an end watches costs every turn of the executor a little.
         overridable = QoSOverridingOptions.with_default_policies()
+        unseen = PublisherEventCallbacks(use_default_callbacks=False)
         self._measurement = self.create_publisher(
             Float64,
             "measurement",
             quality.MEASUREMENT,
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            event_callbacks=unseen,
             qos_overriding_options=overridable,
         )
+        if values["feedback"]:
+            self._position = self.create_publisher(
+                Float64, "command_feedback", quality.COMMAND, event_callbacks=unseen
+            )
         received = {
             "realtime": self._on_command_in_time,
             "clock": self._on_command_with_clock,
@@ -206,10 +286,18 @@ class PlantNode(ServedNode):
     # Real time: both sides act when they come.
 
     def _sample(self) -> None:
-        self._publish(self._process.measure(time.monotonic() - self._start))
+        self._sensor.wait()
+        value = self._process.measure(time.monotonic() - self._start)
+        if self._sensor.speaks(value):
+            self._publish(value)
 
     def _on_command_in_time(self, message: Float64) -> None:
         self._process.command(message.data, time.monotonic() - self._start)
+        self._tell_position()
+
+    def _tell_position(self) -> None:
+        if self._position is not None:
+            self._position.publish(Float64(data=self._process.position))
 
     # Simulated time: it stands still between two messages of /clock.
 
@@ -227,10 +315,12 @@ class PlantNode(ServedNode):
         message = ClockMessage()
         set_stamp(message.clock, round((CLOCK_START + now) * 1e9))
         self._clock.publish(message)
-        self._publish(value)
+        if self._sensor.speaks(value):
+            self._publish(value)
 
     def _on_command_with_clock(self, message: Float64) -> None:
         self._process.command(message.data)
+        self._tell_position()
         self._waiting, self._answered = False, True
 
     # Lockstep: each command is a step.
@@ -244,6 +334,7 @@ class PlantNode(ServedNode):
 
     def _on_command_in_lockstep(self, message: Float64, _: dict[str, Any]) -> None:
         self._process.command(message.data)
+        self._tell_position()
         if self._waiting:
             self._waiting = False
             time.sleep(QUIET_AFTER_GO)

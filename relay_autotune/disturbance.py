@@ -1,0 +1,100 @@
+"""Leave out the part of a record that a disturbance has made useless."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification import Identification
+from relay_autotune.record import Cycle, PiecewiseConstant, Record
+
+# A fit is looked at again if its residual is larger than so many times the noise, and than this
+# part of the measurement's spread; its record's end alone is better if it fits so much better.
+_MORE_THAN_NOISE = 2.0
+_MORE_THAN_SPREAD = 0.02
+_BETTER = 0.5
+
+# So many last cycles are kept.
+KEPT_CYCLES = 3
+
+
+def fits_badly(found: Identification, record: Record) -> bool:
+    """Return True if the model leaves more than noise, so that a disturbance may be the cause.
+
+    :param found: what was identified from the whole record.
+    :param record: the record.
+    """
+    residual, noise = found.fit.residual_rms, record.noise_std
+    if math.isnan(residual):
+        return False
+    if residual <= _MORE_THAN_SPREAD * float(np.std(record.measurement)):
+        return False
+    return math.isnan(noise) or residual > _MORE_THAN_NOISE * noise
+
+
+def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
+    """Return the end of a record, from the begin of its last cycles on.
+
+    A load that came before them is then part of the offset.
+
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :return: the end; None where nothing would be left out.
+    """
+    starts = record.cycle_start
+    if len(cycles) < KEPT_CYCLES + 1 or len(starts) < len(cycles) + 1:
+        return None
+    first = starts[-(KEPT_CYCLES + 1)]
+    origin = float(record.time[first])
+    held = record.held_input
+    if held is not None:
+        held = PiecewiseConstant(held.times - origin, held.values, held.initial)
+    return replace(
+        record,
+        time=record.time[first:] - origin,
+        measurement=record.measurement[first:],
+        command=record.command[first:],
+        receive_time=record.receive_time[first:] - origin,
+        command_time=record.command_time[first:] - origin,
+        cycle_start=tuple(s - first for s in starts if s >= first),
+        start=record.start + origin if record.start else 0.0,
+        held_input=held,
+    )
+
+
+def without_disturbance(
+    found: Identification,
+    record: Record,
+    cycles: tuple[Cycle, ...],
+    identify: Callable[[Record], Identification],
+) -> Identification:
+    """Identify the end of a record alone where that fits much better than the whole.
+
+    :param found: what was identified from the whole record.
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param identify: identifies a record by the same method.
+    :return: the better identification; what it has left out is a warning, and NaN in ``fitted``.
+    """
+    end = last_cycles(record, cycles) if fits_badly(found, record) else None
+    if end is None:
+        return found
+    try:
+        alone = identify(end)
+    except RelayAutotuneError:
+        return found
+    if not alone.fit.residual_rms < _BETTER * found.fit.residual_rms:
+        return found
+    left_out = len(record) - len(end)
+    fitted = alone.fitted
+    if len(fitted) == len(end):
+        fitted = np.concatenate((np.full(left_out, math.nan), fitted))
+    warning = (
+        f"all before {record.time[left_out]:.4g} s is left out, since no model fits it together "
+        f"with the last {KEPT_CYCLES} cycles: a load or another disturbance came"
+    )
+    return replace(alone, fitted=fitted, warnings=(*alone.warnings, warning))
