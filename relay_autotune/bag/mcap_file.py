@@ -47,8 +47,8 @@ class McapFile:
         self.channels: dict[int, Channel] = layout.declared.channels
         self.metadata = layout.declared.metadata
         self.notes = [*self._source.notes, *layout.notes]
+        self.segments = layout.segments
         self._counts = layout.declared.message_counts
-        self._segments = layout.segments
 
     def __enter__(self) -> Self:
         return self
@@ -84,7 +84,7 @@ class McapFile:
             different channels can be put into the order of the file; the messages.
         """
         wanted, before = frozenset(channels), 0
-        for segment in self._segments:
+        for segment in self.segments:
             if segment.channels is not None and segment.channels.isdisjoint(wanted):
                 continue
             try:

@@ -45,7 +45,7 @@ class SignalReader:
 
     def __init__(self, name: str, clock: str, *, both: bool = False, expected: int = 0) -> None:
         self._name = name
-        self._clock = clock
+        self.clock = clock
         self._values: Column[np.float64] = Column(np.float64, expected)
         self._times: Column[np.int64] = Column(np.int64, expected)
         self._log_times: Column[np.int64] | None = Column(np.int64, expected) if both else None
@@ -76,7 +76,7 @@ class SignalReader:
             return
         self._rising &= int(times[0]) >= self._last and bool((times[1:] >= times[:-1]).all())
         self._last = int(times[-1])
-        if self._clock != "log":
+        if self.clock != "log":
             self._all_dated &= bool(times.all())
             self._lag = min(self._lag, int((log_times - times).min()))
         self._values.extend(values)
@@ -105,7 +105,7 @@ class SignalReader:
                 f"{self._unfit} of {self._unfit + values.size} messages of {self._name} do not "
                 f"fit their definition, or lack the field; they are left out"
             )
-        lag = 0 if self._clock == "log" or values.size == 0 else self._lag
+        lag = 0 if self.clock == "log" or values.size == 0 else self._lag
         if self._log_times is not None:
             log_times = self._log_times.values()
             order = np.argsort(log_times, kind="stable")
@@ -113,9 +113,9 @@ class SignalReader:
             back = bool((times[1:] < times[:-1]).any())
             if back or not self._all_dated:
                 times, lag = log_times, 0
-            if back and self._all_dated and self._clock != "log":
+            if back and self._all_dated and self.clock != "log":
                 notes.append(
-                    f"the {self._clock} times of {self._name} go backwards; "
+                    f"the {self.clock} times of {self._name} go backwards; "
                     f"its log times are used instead"
                 )
         return TimedSignal(Signal(self._name, times, values), lag, tuple(notes))

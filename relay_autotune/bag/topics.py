@@ -19,7 +19,7 @@ from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Struct, message_type
 from relay_autotune.bag.timing import SignalReader, TimedSignal
-from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.errors import BagError
 from relay_autotune.record import FloatArray, IntArray
 
 # Told of how far a file has been read: bytes done, bytes in all.
@@ -173,37 +173,34 @@ class Topics:
         return {name: self._signals[name] for name in chosen}
 
     def _read(self, names: Sequence[str]) -> dict[str, TimedSignal]:
-        readers = self._readers(names, self.clock)
+        readers = self._readers(names)
         again = [name for name, reader in readers.items() if not reader.in_order]
         if again:
             # Only where the times are not in order are the recorder's needed beside them.
-            readers |= self._readers(again, self.clock, both=True)
+            readers |= self._readers(again, both=True)
         return {name: readers[name].signal() for name in names}
 
-    def _readers(
-        self, names: Sequence[str], clock: str, *, both: bool = False
-    ) -> dict[str, SignalReader]:
+    def _readers(self, names: Sequence[str], *, both: bool = False) -> dict[str, SignalReader]:
         wanted: dict[tuple[int, int], list[tuple[SignalReader, Path, Any]]] = {}
-        readers = {
-            name: SignalReader(name, clock, both=both, expected=self._expected(name))
-            for name in names
-        }
-        for name, reader in readers.items():
+        readers: dict[str, SignalReader] = {}
+        for name in names:
             topic, wanted_field = split_name(name)
-            for number, channel in self._channels(topic):
-                root = self._type(channel)
-                stamp = stamp_of(root) if clock == "header" else None
-                if clock == "header" and stamp is None:
-                    raise SelectionError(
-                        f"--clock header: {topic} is of type {channel.type}, which has no header; "
-                        f"expected publish or log"
-                    )
-                path = named_field(root, wanted_field, topic)
-                wanted.setdefault((number, channel.id), []).append((reader, path, stamp))
-        for key, _, messages in self._messages(wanted):
-            for reader, path, stamp in wanted[key]:
+            channels = self._channels(topic)
+            stamps = {key: stamp_of(self._type(channel)) for key, channel in channels}
+            # A topic without a header, as a command often is, has no such time.
+            clock = self.clock
+            if clock == "header" and None in stamps.values():
+                clock = "publish"
+            reader = SignalReader(name, clock, both=both, expected=self._expected(name))
+            readers[name] = reader
+            for key, channel in channels:
+                path = named_field(self._type(channel), wanted_field, topic)
+                stamp = stamps[key] if clock == "header" else None
+                wanted.setdefault((key, channel.id), []).append((reader, path, stamp))
+        for place, _, messages in self._messages(wanted):
+            for reader, path, stamp in wanted[place]:
                 values, good = _values(path, messages)
-                times = messages.log_time if clock == "log" else messages.publish_time
+                times = messages.log_time if reader.clock == "log" else messages.publish_time
                 if stamp is not None:
                     times, dated = _stamps(stamp, messages)
                     good = good & dated

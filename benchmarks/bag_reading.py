@@ -1,0 +1,254 @@
+"""Time and memory of reading bags: `python3 benchmarks/bag_reading.py [--quick] [--folder DIR]`.
+
+Two topics of std_msgs/Float64 are read with their times, by this package and by the fastest way of
+each library that reads the same file, in one run. The files, up to 4 GB, are made in a temporary
+folder and taken away again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import zstandard
+from made_recordings import (
+    Chunk,
+    among_images,
+    among_others,
+    pair_of_numbers,
+    write_recording,
+)
+from markdown import table, three
+
+from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.topics import Topics
+
+TOPICS = ("/measurement", "/command")
+MESSAGES, QUICK_MESSAGES = 2_000_000, 20_000
+GROWTH = (100_000, 1_000_000, 10_000_000, 30_000_000)
+QUICK_GROWTH = (10_000, 100_000)
+# 27 MB a second.
+IMAGE_SECONDS, QUICK_IMAGE_SECONDS = 150, 2
+LARGE, QUICK_LARGE = 68_000_000, 100_000
+TURNS = 7
+
+
+def ours(path: Path) -> int:
+    """Read the pair with this package; return the number of values."""
+    with McapFile(path) as file:
+        signals = Topics(path, [file]).signals(TOPICS)
+    return sum(len(timed.signal) for timed in signals.values())
+
+
+def by_mcap(path: Path) -> int:
+    """Read the pair by the iteration of the package mcap, values unpacked by hand."""
+    from mcap.reader import make_reader
+
+    unpack = struct.Struct("<d").unpack_from
+    found: dict[str, list[tuple[int, float]]] = {topic: [] for topic in TOPICS}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(topics=TOPICS):
+            found[channel.topic].append((message.publish_time, unpack(message.data, 4)[0]))
+    return sum(map(len, found.values()))
+
+
+def by_rosbags(path: Path) -> int:
+    """Read the pair by rosbags."""
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    decode, kind = store.deserialize_cdr, "std_msgs/msg/Float64"
+    found: dict[str, list[tuple[int, float]]] = {topic: [] for topic in TOPICS}
+    with Reader(path) as reader:
+        wanted = [c for c in reader.connections if c.topic in TOPICS]
+        for connection, stamp, data in reader.messages(wanted):
+            found[connection.topic].append((stamp, decode(data, kind).data))
+    return sum(map(len, found.values()))
+
+
+def by_mcap_ros2(path: Path) -> int:
+    """Read the pair by mcap-ros2-support."""
+    from mcap_ros2.reader import read_ros2_messages
+
+    found: dict[str, list[tuple[int, float]]] = {topic: [] for topic in TOPICS}
+    for message in read_ros2_messages(str(path), topics=list(TOPICS)):
+        found[message.channel.topic].append((message.publish_time_ns, message.ros_msg.data))
+    return sum(map(len, found.values()))
+
+
+LIBRARIES: dict[str, Callable[[Path], int]] = {
+    "mcap": by_mcap,
+    "rosbags": by_rosbags,
+    "mcap-ros2-support": by_mcap_ros2,
+}
+
+
+def seconds(work: Callable[..., object], *arguments: object) -> float:
+    """Return how long a work takes."""
+    begin = time.perf_counter()
+    work(*arguments)
+    return time.perf_counter() - begin
+
+
+def compressed_chunks(chunks: Iterable[Chunk]) -> list[tuple[bytes, int]]:
+    """Return the chunks as the file holds them, with their sizes."""
+    compressor = zstandard.ZstdCompressor()
+    return [(compressor.compress(chunk.content), len(chunk.content)) for chunk in chunks]
+
+
+def expand(chunks: list[tuple[bytes, int]]) -> None:
+    """Do what zstd alone has to do."""
+    decompressor = zstandard.ZstdDecompressor()
+    for data, size in chunks:
+        decompressor.decompress(data, max_output_size=size)
+
+
+def comparison(folder: Path, count: int, turns: int) -> list[tuple[str, ...]]:
+    """Compare with the libraries, on pairs in regular and irregular turns."""
+    cases = (
+        ("in turns, zstd", pair_of_numbers, "zstd", 30),
+        ("in turns, uncompressed", pair_of_numbers, "", 30),
+        ("irregular among others, zstd", among_others, "zstd", 15),
+        ("irregular among others, uncompressed", among_others, "", 15),
+    )
+    rows = []
+    for name, make, compression, target in cases:
+        path = folder / "pair.mcap"
+        write_recording(path, make(count), compression=compression)
+        chunks = compressed_chunks(make(count)) if compression else []
+        assert ours(path) == count
+        times = {library: seconds(read, path) for library, read in LIBRARIES.items()}
+        mine, alone = [], []
+        for _ in range(turns):
+            mine.append(seconds(ours, path))
+            alone.append(seconds(expand, chunks))
+        best = min(times, key=times.__getitem__)
+        ratio = f"{min(mine) / min(alone):.2f}" if compression else ""
+        rates = (three(count / t / 1e6) for t in (min(mine), *times.values()))
+        factor = f"{times[best] / min(mine):.0f} x {best}"
+        rows.append((name, *rates, factor, f">= {target}", ratio, "<= 2.5" if compression else ""))
+        path.unlink()
+    return rows
+
+
+def needed_bytes(path: Path) -> Callable[[], None]:
+    """Return the work of reading the bytes of the chunks in which the pair lies."""
+    with McapFile(path) as file:
+        ranges = [(s.start, s.end) for s in file.segments if s.channels and s.channels & {1, 2}]
+
+    def work() -> None:
+        with path.open("rb") as handle:
+            for begin, end in ranges:
+                os.pread(handle.fileno(), end - begin, begin)
+
+    return work
+
+
+def images(folder: Path, length: int, turns: int) -> list[tuple[str, ...]]:
+    """Compare with the time to read the needed chunks' bytes."""
+    rows = []
+    for apart, compression in ((True, "zstd"), (True, ""), (False, "zstd"), (False, "")):
+        path = folder / "images.mcap"
+        write_recording(path, among_images(length, apart=apart), compression=compression)
+        plain = needed_bytes(path)
+        mine, base = [], []
+        for _ in range(turns):
+            mine.append(seconds(ours, path))
+            base.append(seconds(plain))
+        name = f"{'apart' if apart else 'mixed'}, {compression or 'uncompressed'}"
+        size = path.stat().st_size / 1e9
+        peak, signals = memory(path)
+        rows.append(
+            (
+                *(name, three(size), three(1e3 * min(mine)), three(1e3 * min(base))),
+                *(three(min(mine) / min(base)), "<= 3" if apart else "", three(peak - signals)),
+                "<= 300",
+            )
+        )
+        path.unlink()
+    return rows
+
+
+def memory(path: Path) -> tuple[float, float]:
+    """Return the peak memory of reading beyond that of the imports, and the signals' [MB]."""
+    done = subprocess.run(
+        [sys.executable, __file__, "--memory-of", str(path)],
+        stdout=subprocess.PIPE, text=True, check=True,
+    )  # fmt: skip
+    peak, signals = map(float, done.stdout.split())
+    return peak, signals
+
+
+def print_memory(path: Path) -> None:
+    """Print what `memory` asks for."""
+    begin = high_water()
+    values = ours(path)
+    print(high_water() - begin, 16 * values / 1e6)
+
+
+def high_water() -> float:
+    """Return the most memory that this process ever took [MB]."""
+    status = Path("/proc/self/status").read_text()
+    return float(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6
+
+
+def growth(folder: Path, counts: Iterable[int], turns: int) -> list[tuple[str, ...]]:
+    """Measure the time for a message, at many numbers of them."""
+    rows = []
+    for count in counts:
+        path = folder / "growth.mcap"
+        write_recording(path, pair_of_numbers(count))
+        best = min(seconds(ours, path) for _ in range(turns if count < 10**7 else 3))
+        rows.append((f"{count:,}", three(1e3 * best), three(1e9 * best / count)))
+        path.unlink()
+    return rows
+
+
+def main() -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small files: does it run?")
+    parser.add_argument("--folder", type=Path, help="where to make the files, 5 GB")
+    parser.add_argument("--memory-of", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.memory_of:
+        print_memory(options.memory_of)
+        return 0
+    quick = options.quick
+    turns = 1 if quick else TURNS
+    with tempfile.TemporaryDirectory(dir=options.folder, prefix="bag_reading_") as name:
+        folder = Path(name)
+        count = QUICK_MESSAGES if quick else MESSAGES
+        print(f"Million messages a second, of {count:,} on two topics; least time of {turns}:\n")
+        headings = ("pair", "this", *LIBRARIES, "faster", "target", "x zstd alone", "target")
+        print(table(headings, comparison(folder, count, turns)))
+        print("\nThe pair, 100 messages a second, in a bag of camera images:\n")
+        headings = (
+            *("images and numbers", "[GB]", "this [ms]", "bytes alone [ms]", "x", "target"),
+            *("memory beyond the signals [MB]", "target"),
+        )
+        length = QUICK_IMAGE_SECONDS if quick else IMAGE_SECONDS
+        print(table(headings, images(folder, length, turns)))
+        print("\nPeak memory of a bag that holds nothing but the pair:\n")
+        path = folder / "large.mcap"
+        write_recording(path, pair_of_numbers(QUICK_LARGE if quick else LARGE))
+        peak, signals = memory(path)
+        row = (*map(three, (path.stat().st_size / 1e9, peak, signals, peak - signals)), "<= 300")
+        path.unlink()
+        print(table(("[GB]", "peak [MB]", "signals [MB]", "beyond them [MB]", "target"), [row]))
+        print("\nTime and number of messages, uncompressed:\n")
+        rows = growth(folder, QUICK_GROWTH if quick else GROWTH, turns)
+        print(table(("messages", "[ms]", "ns/message"), rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
