@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from relay_autotune import threads  # noqa: F401  before numpy
@@ -12,7 +12,8 @@ from relay_autotune import threads  # noqa: F401  before numpy
 import numpy as np
 
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
+from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.sampled_relay import simulate_sampled_relay
 from relay_autotune.simulation import RelayRun, exact_limit_cycle, simulate_relay
 from relay_autotune.ultimate import UltimatePoint, ultimate_point
 
@@ -27,12 +28,14 @@ class Process:
     :param model: the process.
     :param bias: of the relay [u].
     :param cycles: the record is as long as so many limit cycles.
+    :param extra_delay: dead time that the relay adds [s].
     """
 
     title: str
     model: TransferFunction
     bias: float = 0.0
     cycles: int = 5
+    extra_delay: float = 0.0
 
     @cached_property
     def truth(self) -> UltimatePoint:
@@ -42,20 +45,34 @@ class Process:
     @cached_property
     def run(self) -> RelayRun:
         """The ideal experiment, 200 samples for each limit cycle from the kick on."""
-        settings = RelaySettings(0.0, 0.0, 1.0, self.bias)
+        settings = RelaySettings(0.0, 0.0, 1.0, self.bias, 0.0, self.extra_delay)
         period = exact_limit_cycle(self.model, settings, tolerance=1e-6).period / PER_CYCLE
         time = period * np.arange(PER_CYCLE * self.cycles)
         return simulate_relay(self.model, settings, cycles=self.cycles + 2, time=time)
 
-    def record(self, ratio: float, seed: int) -> Record:
-        """Return one experiment with noise that the relay does not see.
+    def record(self, ratio: float, seed: int, *, relay_sees_noise: bool = False) -> Record:
+        """Return one noisy experiment.
 
         :param ratio: noise-to-signal ratio.
         :param seed: of the noise.
+        :param relay_sees_noise: False: the relay is ideal and switches between samples; True: it
+            looks at the noisy samples, with the hysteresis that relay_node would choose, three
+            standard deviations.
         """
         std = noise_std(self.run, ratio)
         rng = np.random.default_rng((seed, round(1000.0 * ratio), *self.title.encode()))
-        return self.run.record(noise_std=std, rng=rng)
+        if not relay_sees_noise:
+            return self.run.record(noise_std=std, rng=rng)
+        noise = std * rng.standard_normal(self.run.time.size)
+        settings = replace(self.run.settings, hysteresis=3.0 * std)
+        period = float(self.run.time[1])
+        record = simulate_sampled_relay(self.model, settings, period=period, noise=noise)
+        u = record.input()
+        # The samples begin with the kick; that the process rested before it is known here too.
+        kicked = PiecewiseConstant(
+            np.append(record.time[0], u.times), np.append(u.initial, u.values), settings.baseline
+        )
+        return replace(record, noise_std=std, held_input=kicked)
 
 
 def noise_std(run: RelayRun, ratio: float) -> float:
