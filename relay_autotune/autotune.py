@@ -172,8 +172,20 @@ def analyse_jointly(
         if record.outcome in _NO_GAINS:
             why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
             return replace(found, reason=why)
-    simple = chosen.model if chosen.structure == "fopdt" else None
-    return _tuned(found, rule, rng, simple, options)
+    return _tuned(found, rule, rng, _simple(records, known, chosen), options)
+
+
+def _simple(
+    records: Sequence[Record], known: Known, chosen: Identification
+) -> TransferFunction | None:
+    """Return the FOPDT that fits best, on which most rules are built; None if there is none."""
+    if chosen.structure == "fopdt":
+        return chosen.model
+    try:
+        found = identify_jointly(records, DEFAULT_METHOD, replace(known, structure="fopdt"))
+    except RelayAutotuneError:
+        return None
+    return found.model
 
 
 def _tuned(

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.errors import RecordError
+from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.fourier import FrequencyPoint
 from relay_autotune.identification.result import FitReport
 from relay_autotune.identification.validation import Validation
@@ -186,6 +187,9 @@ def identification(model: TransferFunction) -> Any:
         points=(FrequencyPoint(1.5, 2.0 - 3.0j, 0.1),),
         warnings=("mind",),
         undetermined=(),
+        combinations=(Combination("gain/time_constant", "y/(u s)", 0.5, 0.01, 0.48, 0.52),),
+        advice=("step longer",),
+        support=0.8,
     )
 
 
