@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
     from relay_autotune.identification import Identification
     from relay_autotune.models import TransferFunction
-    from relay_autotune.tuning import Gains
+    from relay_autotune.tuning import Gains, Performance
 
 _LIMIT_CYCLE = (
     *("period", "period_high", "period_low", "peak_max", "peak_min"),
@@ -181,6 +181,11 @@ def gains_fields(gains: Gains) -> dict[str, Any]:
         "reason": gains.reason,
         "warnings": list(gains.warnings),
     }
+
+
+def number_fields(performance: Performance) -> dict[str, Any]:
+    """Return what a controller does on a model as it appears in documents."""
+    return {name: _number(value) for name, value in vars(performance).items()}
 
 
 def _named(names: Sequence[str], values: Iterable[float]) -> dict[str, Any]:

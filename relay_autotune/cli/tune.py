@@ -19,7 +19,8 @@ from relay_autotune.errors import SelectionError, TuningError
 
 if TYPE_CHECKING:
     from relay_autotune.models import TransferFunction
-    from relay_autotune.tuning import DesignOptions, DesignTask, Gains
+    from relay_autotune.tuning import DesignOptions, DesignTask, Gains, Performance
+    from relay_autotune.tuning.compensators import Compensator
 
 PROGRAM = "tune"
 
@@ -168,7 +169,12 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
 
 
 def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.tune_table import process_lines, side_by_side
+    from relay_autotune.cli.tune_table import (
+        compensator_lines,
+        process_lines,
+        refusal_lines,
+        side_by_side,
+    )
     from relay_autotune.tuning import RULES, design
 
     gains: list[Gains] = []
@@ -179,15 +185,34 @@ def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> i
         except TuningError as error:
             refused[name] = str(error)
     recommended = 0 if gains and gains[0].rule == rule else None
+    inside = _compensators(task, refused)
     if options.json:
-        _print_document(task, gains, refused, recommended, options.form)
+        _print_document(task, gains, refused, recommended, options.form, inside)
     else:
-        lines = side_by_side(gains, refused, recommended, options.form)
+        lines = side_by_side(gains, recommended, options.form)
+        lines += [*compensator_lines(inside), *refusal_lines(refused)]
         print("\n".join([*process_lines(task.model), *lines]))
     if not gains:
         say(PROGRAM, "no rule gives gains for this model")
         return NOTHING_FOUND
     return DONE
+
+
+def _compensators(
+    task: DesignTask, refused: dict[str, str]
+) -> list[tuple[Compensator, Performance]]:
+    """Return the controllers with a model inside, and note why others are none."""
+    from relay_autotune.tuning import analyse_loop
+    from relay_autotune.tuning.compensators import COMPENSATORS
+
+    found = []
+    for name, make in COMPENSATORS.items():
+        try:
+            made = make(task)
+            found.append((made, analyse_loop(made.law, task.in_loop(task.model))))
+        except TuningError as error:
+            refused[name] = str(error)
+    return found
 
 
 def _print_document(
@@ -196,8 +221,9 @@ def _print_document(
     refused: dict[str, str],
     recommended: int | None,
     form: str,
+    inside: Sequence[tuple[Compensator, Performance]] = (),
 ) -> None:
-    from relay_autotune.document import gains_fields, model_fields, to_json
+    from relay_autotune.document import gains_fields, model_fields, number_fields, to_json
     from relay_autotune.tuning.forms import series_form
 
     found = []
@@ -212,11 +238,20 @@ def _print_document(
                     raise
                 fields["series"] = {"reason": str(error)}
         found.append(fields)
+    compensators = [
+        {
+            "name": each.name,
+            "closed_loop_time": each.closed_loop_time,
+            **number_fields(performance),
+            "reason": each.reason,
+        }
+        for each, performance in inside
+    ]
     model = {"structure": task.model.structure, **model_fields(task.model)}
-    print(
-        to_json({"model": model, "gains": found, "recommended": recommended, "refused": refused}),
-        flush=True,
-    )
+    document = {"model": model, "gains": found, "recommended": recommended, "refused": refused}
+    if compensators:
+        document["compensators"] = compensators
+    print(to_json(document), flush=True)
 
 
 if __name__ == "__main__":

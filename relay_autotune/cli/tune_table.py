@@ -13,7 +13,8 @@ from relay_autotune.tuning.forms import series_form
 
 if TYPE_CHECKING:
     from relay_autotune.models import TransferFunction
-    from relay_autotune.tuning import Gains
+    from relay_autotune.tuning import Gains, Performance
+    from relay_autotune.tuning.compensators import Compensator
 
 _WIDTH = 99
 _INDENT = 22
@@ -41,13 +42,10 @@ def form_lines(gains: Gains, form: str) -> list[str]:
     ]
 
 
-def side_by_side(
-    gains: Sequence[Gains], refused: Mapping[str, str], recommended: int | None, form: str
-) -> list[str]:
-    """Return every rule in a line, and why the others give none.
+def side_by_side(gains: Sequence[Gains], recommended: int | None, form: str) -> list[str]:
+    """Return every rule that applies in a line.
 
     :param gains: of the rules that apply.
-    :param refused: by name, why a rule gives none.
     :param recommended: index of the gains that count.
     :param form: in which they are shown.
     """
@@ -74,11 +72,42 @@ def side_by_side(
             "series": ("u/y", "s", "s"),
         }[form]
         lines.append(_row("", (*units, "", "", "", "deg", "y s/u")))
-    if refused:
-        lines += ["", "  no gains by"]
-        for name, why in refused.items():
-            lines += _wrapped(f"  {name}", why, _INDENT + 4)
     return lines
+
+
+def refusal_lines(refused: Mapping[str, str]) -> list[str]:
+    """Return why rules give no gains.
+
+    :param refused: by name, why a rule gives none.
+    """
+    lines = ["", "  no gains by"] if refused else []
+    for name, why in refused.items():
+        lines += _wrapped(f"  {name}", why, _INDENT + 4)
+    return lines
+
+
+def compensator_lines(
+    inside: Sequence[tuple[Compensator, Performance]],
+) -> list[str]:
+    """Return the controllers with a model inside, a line for each.
+
+    :param inside: each with what it does on the model.
+    """
+    if not inside:
+        return []
+    headings = ("lambda", "DM", "", *_HEADINGS[3:])
+    lines = ["", "  with a model inside", _row("", headings)]
+    for each, p in inside:
+        cells = (
+            digits(each.closed_loop_time),
+            digits(p.delay_margin, 3),
+            "",
+            *(digits(x, 3) for x in (p.ms, p.mt, p.gain_margin)),
+            digits(math.degrees(p.phase_margin), 3),
+            digits(p.iae_load, 3),
+        )
+        lines.append(_row(f"  {each.name}", cells))
+    return [*lines, _row("", ("s", "s", "", "", "", "", "deg", "y s/u"))]
 
 
 def _in_form(gains: Gains, form: str) -> tuple[str, str, str]:

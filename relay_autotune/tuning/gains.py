@@ -45,6 +45,10 @@ class Controller:
                 f"kc = {self.kc:g}, ti = {self.ti:g}, td = {self.td:g}, tf = {self.tf:g}"
             )
 
+    def __str__(self) -> str:
+        more = f", td = {self.td:.4g} s" if self.td > 0.0 else ""
+        return f"kc = {self.kc:.4g}, ti = {self.ti:.4g} s{more}"
+
     @property
     def p(self) -> float:
         """Proportional gain of the parallel form [u/y]."""

@@ -15,6 +15,7 @@ from relay_autotune.cli.tune_model import model_of
 from relay_autotune.document import model_fields
 from relay_autotune.models import TransferFunction
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, design
+from relay_autotune.tuning.compensators import COMPENSATORS
 
 FOPDT = "--gain 1.65 --time-constants 20 --dead-time 10"
 
@@ -55,7 +56,8 @@ def test_all_rules_side_by_side(capsys):
     assert max(len(line) for line in out.splitlines()) <= 99
     found = document(capsys, FOPDT, "--table --rule simc")
     assert found["gains"][found["recommended"]]["rule"] == "simc"
-    assert {g["rule"] for g in found["gains"]} | set(found["refused"]) == set(RULES)
+    named = {g["rule"] for g in found["gains"]} | set(found["refused"])
+    assert named - set(COMPENSATORS) == set(RULES)
     assert "lag" in found["refused"]["lcmax"]
     assert all(math.isfinite(g[name]) for g in found["gains"] for name in ("kc", "ti", "ms"))
 
@@ -313,3 +315,12 @@ def test_help_names_every_option_and_fits(capsys):
     assert "Examples:" in out
     for flag in ("--rule", "--table", "--pid", "--form", "--export", "--lambda", "--loop-delay"):
         assert flag in out
+
+
+def test_compensators_stand_beside_the_rules(capsys):
+    _, out, _ = run(capsys, "--gain 1.5 --time-constants 10 --order 5 --table")
+    assert re.search(r"high_order_compensator +4\.500 +26\.3", out)
+    found = document(capsys, FOPDT, "--table --lambda 30")["compensators"]
+    assert [c["name"] for c in found] == ["dead_time_compensator"]
+    assert found[0]["closed_loop_time"] == 30.0
+    assert found[0]["mt"] == pytest.approx(1.0)

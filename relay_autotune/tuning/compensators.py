@@ -1,0 +1,222 @@
+r"""Controllers with a model inside: compensation of dead time and of higher order.
+
+Thyagarajan and Yu, "Improved Autotuning Using the Shape Factor from Relay Feedback", Ind. Eng.
+Chem. Res. 2003, section 4.3, with internal model control (Morari and Zafiriou 1989). From error
+to command the controller is ``Q/(1 - Q G)`` with ``Q = F/G_-``, F the filter and G_- the model
+without its dead time:
+
+    eq 50:  1/K (tau s + 1)/(lambda s + 1 - e^{-D s}),                    lambda = 2 tau;
+    eq 54:  1/(n K lambda s) (tau s + 1)^n/(...) = (tau s + 1)^n/(K [(lambda s + 1)^n - 1]),
+            lambda = 0.45 tau,
+
+the latter here for any n, and with the dead time that the model has. On a perfect model the
+set-point response is that of the filter, whatever lambda. What limits them is the model: as the
+dead time grows over lambda, the Ms of eq 50 grows towards 2 and its delay margin falls to about
+1.5 lambda, so that a dead time known to 10 % does not allow the lambda of a few percent of it.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from relay_autotune.errors import TuningError
+from relay_autotune.models import TransferFunction
+from relay_autotune.simulation import Plant
+from relay_autotune.tuning.control_law import InternalModelLaw
+from relay_autotune.tuning.rules.applicability import fopdt_of, named, process_of
+from relay_autotune.tuning.task import DesignTask
+
+DEAD_TIME_LAMBDA = 2.0
+HIGH_ORDER_LAMBDA = 0.45
+
+_EQUAL = 1e-6
+
+
+@dataclass(frozen=True)
+class Compensator:
+    """A controller with a model inside.
+
+    :param name: what it is called.
+    :param model: the model inside.
+    :param closed_loop_time: lambda [s].
+    :param reason: what it is, and where lambda comes from.
+    """
+
+    name: str
+    model: TransferFunction
+    closed_loop_time: float
+    reason: str
+
+    @property
+    def law(self) -> InternalModelLaw:
+        """The controller, to be analysed."""
+        lags = self.model.time_constants
+        fast = (complex(self.closed_loop_time),) * len(lags)
+        q = TransferFunction(1.0 / self.model.gain, lags, fast)
+        return InternalModelLaw(q, TransferFunction(1.0, (), fast, 0, self.model.dead_time))
+
+    def transfer_function(self) -> TransferFunction:
+        """Return the controller from error to command, where the model has no dead time (eq 54).
+
+        ``(lambda s + 1)^n - 1`` has the roots ``(e^{2 pi j k/n} - 1)/lambda``, k = 0 to n - 1.
+
+        :raises TuningError: if the model has a dead time: the controller is not rational then.
+        """
+        if self.model.dead_time > 0.0:
+            raise TuningError(
+                "a controller with a dead time inside is no rational function of s; found "
+                f"{self.model.dead_time:g} s: use its law, or run it sampled"
+            )
+        n = len(self.model.time_constants)
+        slow = self.closed_loop_time
+        lags = tuple(_clean(slow / (1.0 - cmath.exp(2j * math.pi * k / n))) for k in range(1, n))
+        return TransferFunction(
+            1.0 / (self.model.gain * n * slow), self.model.time_constants, lags, 1
+        )
+
+    def sampled(
+        self,
+        period: float,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        offset: float = 0.0,
+    ) -> SampledCompensator:
+        """Return the controller as it runs.
+
+        :param period: of the samples [s].
+        :param low: least command [u].
+        :param high: largest command [u].
+        :param offset: command at which the process rests at the set-point [u].
+        :raises TuningError: if the period is not positive or the limits leave no range.
+        """
+        return SampledCompensator(self, period, low=low, high=high, offset=offset)
+
+
+class SampledCompensator:
+    """A compensator that is called once for each sample.
+
+    The model inside moves exactly between the commands, which it sees as they were limited, so
+    that nothing winds up. Each section ``(tau s + 1)/(lambda s + 1)`` of the filter is exact for
+    an input that runs straight from one sample to the next.
+
+    :param compensator: the controller.
+    :param period: of the samples [s].
+    :param low: least command [u].
+    :param high: largest command [u].
+    :param offset: command at which the process rests at the set-point [u].
+    :raises TuningError: if the period is not positive or the limits leave no range.
+    """
+
+    def __init__(
+        self,
+        compensator: Compensator,
+        period: float,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        offset: float = 0.0,
+    ) -> None:
+        if not 0.0 < period < math.inf:
+            raise TuningError(f"the sampling period must be > 0 s and finite, found {period:g} s")
+        if not low < high:
+            raise TuningError(f"the command's limits leave no range, found {low:g} to {high:g}")
+        self.period = period
+        self._low, self._high, self._offset = low, high, offset
+        self._gain = compensator.model.gain
+        slow = compensator.closed_loop_time
+        self._sections = [
+            _Section(tau.real, slow, period) for tau in compensator.model.time_constants
+        ]
+        self._inside = Plant(compensator.model)
+        self._command, self._count = 0.0, 0
+
+    def step(self, setpoint: float, measurement: float) -> float:
+        """Return the command for this sample [u].
+
+        :param setpoint: y.
+        :param measurement: y.
+        """
+        expected = self._inside.advance(self._count * self.period, self._command)
+        signal = setpoint - measurement + expected
+        for section in self._sections:
+            signal = section.step(signal)
+        wanted = self._offset + signal / self._gain
+        given = min(max(wanted, self._low), self._high)
+        self._command = given - self._offset
+        self._count += 1
+        return given
+
+
+class _Section:
+    """(tau s + 1)/(lambda s + 1), exact for an input that runs straight between samples."""
+
+    def __init__(self, tau: float, slow: float, period: float) -> None:
+        ratio = period / slow
+        self._decay = math.exp(-ratio)
+        # What the slope of the input leaves behind in the state over one period.
+        self._present = 1.0 + math.expm1(-ratio) / ratio
+        self._past = 1.0 - self._decay - self._present
+        self._through = tau / slow
+        self._state = self._last = 0.0
+
+    def step(self, value: float) -> float:
+        self._state = self._decay * self._state + self._past * self._last + self._present * value
+        self._last = value
+        return self._through * value + (1.0 - self._through) * self._state
+
+
+def dead_time_compensator(task: DesignTask) -> Compensator:
+    """Return the controller that compensates the dead time of a FOPDT process (eq 50).
+
+    :param task: a stable FOPDT process; its ``closed_loop_time`` is lambda.
+    :raises TuningError: for any other.
+    """
+    process = fopdt_of("dead_time_compensator", task)
+    default = DEAD_TIME_LAMBDA * process.time_constant
+    closed, why = _lambda(task, default, "2 tau (eq 51)")
+    model = TransferFunction.fopdt(process.gain, process.time_constant, process.dead_time)
+    reason = f"dead-time compensator (eq 50) with lambda = {why}{process.note}"
+    return Compensator("dead_time_compensator", model, closed, reason)
+
+
+def high_order_compensator(task: DesignTask) -> Compensator:
+    """Return the controller that compensates n equal lags (eq 54, any n).
+
+    :param task: a process of two or more equal lags; its ``closed_loop_time`` is lambda.
+    :raises TuningError: for any other.
+    """
+    model = process_of(task)
+    lags = model.time_constants
+    equal = len(lags) >= 2 and all(
+        t.imag == 0.0 and abs(t - lags[0]) <= _EQUAL * abs(lags[0]) for t in lags
+    )
+    if not equal or model.integrators or model.zeros or lags[0].real <= 0.0:
+        raise TuningError(
+            "the high_order_compensator is for two or more equal lags, found "
+            f"{named(task.model)}: use dead_time_compensator, or gains of a rule"
+        )
+    closed, why = _lambda(task, HIGH_ORDER_LAMBDA * lags[0].real, "0.45 tau")
+    reason = f"higher-order IMC (eq 54) for {len(lags)} equal lags with lambda = {why}"
+    return Compensator("high_order_compensator", model, closed, reason)
+
+
+COMPENSATORS: dict[str, Callable[[DesignTask], Compensator]] = {
+    "dead_time_compensator": dead_time_compensator,
+    "high_order_compensator": high_order_compensator,
+}
+
+
+def _lambda(task: DesignTask, default: float, why: str) -> tuple[float, str]:
+    given = task.options.closed_loop_time
+    if given is None:
+        return default, f"{why} = {default:.4g} s"
+    return given, f"{given:.4g} s, as given"
+
+
+def _clean(value: complex) -> complex:
+    """Take away an imaginary part that is rounding; conjugates must match to the last digit."""
+    return complex(value.real) if abs(value.imag) < 1e-12 * abs(value) else value
