@@ -27,6 +27,7 @@ from relay_autotune.nodes.parameters import NodeParameter, declare, merged, valu
 from relay_autotune.record import Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
+from relay_autotune_msgs.srv import Identify
 
 PARAMETERS = (
     NodeParameter(
@@ -71,6 +72,7 @@ class IdentifierNode(ServedNode):
         self.create_subscription(
             RelayExperiment, "relay_experiment", self._on_experiment, quality.latched(10)
         )
+        self.create_service(Identify, "~/identify", self._on_identify)
         self.add_on_set_parameters_callback(self._on_set)
         self.get_logger().info(
             f"ready: waiting for {self.resolve_topic_name('relay_experiment')}; model and gains "
@@ -127,6 +129,37 @@ class IdentifierNode(ServedNode):
             f"experiment {self._ended}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
             f"ti {gains.ti:.6g} s, td {gains.td:.6g} s"
         )
+
+    def _on_identify(self, request: Any, response: Any) -> Any:
+        """Answer with every method's model and every rule's gains for a record."""
+        values = values_of(self, PARAMETERS)
+        try:
+            record = record_from_message(request.experiment)
+            found = analyse(
+                record,
+                method=request.method or values["method"],
+                rule=request.rule or values["rule"],
+                known=known_from(values),
+                options=options_from(values),
+            )
+        except Exception as error:  # noqa: BLE001  one bad record must not end the node
+            response.reason = str(error) or type(error).__name__
+            return response
+        name, stamp = record.experiment_id, _last_stamp(record)
+        response.success, response.reason = found.model is not None, found.reason
+        for identification in found.models:
+            message = TransferFunction()
+            fill_transfer_function(
+                message, identification, experiment_id=name, final=True, stamp_ns=stamp
+            )
+            response.models.append(message)
+        for gains in found.gains:
+            message = PidGains()
+            fill_gains(message, gains, experiment_id=name, stamp_ns=stamp)
+            response.gains.append(message)
+        response.selected = found.selected or 0
+        response.recommended = found.recommended or 0
+        return response
 
     def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
         values = values_of(self, PARAMETERS)

@@ -1,0 +1,64 @@
+"""Publish a bag's messages at their times, as `ros2 bag play` does: `bag_player.py BAG RATE`.
+
+It stands in for that command where only the wheels of rclpy are installed. Messages go out with
+the bytes that were recorded, on their topics, in the order and at the distances of their log
+times divided by the rate, once each topic has as many subscribers as the third argument says.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import Float64
+
+from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
+
+KINDS: dict[str, Any] = {
+    "std_msgs/msg/Float64": Float64,
+    "relay_autotune_msgs/msg/RelayCycle": RelayCycle,
+    "relay_autotune_msgs/msg/RelayExperiment": RelayExperiment,
+}
+
+
+def main() -> None:
+    (path,), rate = Path(sys.argv[1]).glob("*.mcap"), float(sys.argv[2])
+    rclpy.init()
+    node = rclpy.create_node("bag_player")
+    waiting: list[tuple[int, int, Any]] = []
+    publishers: dict[int, Any] = {}
+    with McapFile(path) as file:
+        for channel in file.channels.values():
+            if channel.type in KINDS:
+                latched = "transient_local" in channel.metadata["offered_qos_profiles"]
+                qos = QoSProfile(depth=1000)
+                if latched:
+                    qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+                kind = KINDS[channel.type]
+                publishers[channel.id] = node.create_publisher(kind, channel.topic, qos)
+        for channel, _, found in file.read(publishers.keys()):
+            kind = KINDS[file.channels[channel].type]
+            places = zip(found.begin.tolist(), found.end.tolist(), strict=True)
+            for stamp, (begin, end) in zip(found.log_time.tolist(), places, strict=True):
+                data = bytes(found.content[begin:end])
+                waiting.append((stamp, channel, deserialize_message(data, kind)))
+    waiting.sort(key=lambda item: item[0])
+    while any(publisher.get_subscription_count() == 0 for publisher in publishers.values()):
+        rclpy.spin_once(node, timeout_sec=0.05)
+    begin, first = time.monotonic(), waiting[0][0]
+    for stamp, channel, message in waiting:
+        time.sleep(max(0.0, begin + (stamp - first) / 1e9 / rate - time.monotonic()))
+        publishers[channel].publish(message)
+    while True:
+        # What is latched stays until the test has seen it.
+        rclpy.spin_once(node, timeout_sec=1.0)
+
+
+if __name__ == "__main__":
+    main()
