@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 
 import numpy as np
 
 from relay_autotune.errors import RecordError
 from relay_autotune.foreign import find_cycles, infer_settings
-from relay_autotune.record import Cycle, FloatArray, Outcome, Record
+from relay_autotune.record import Cycle, CycleFeatures, FloatArray, Outcome, Record
 
 __all__ = [
     "MIN_CYCLES",
@@ -239,43 +239,21 @@ def _bounds(record: Record) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class LimitCycle:
+class LimitCycle(CycleFeatures):
     """Averages over the cycles that agree, or over the last ones if none do.
 
-    :param period: whole period [s], as are ``period_high`` and ``period_low``.
-    :param peak_max: highest measurement [y], as are ``peak_min`` and ``mean_measurement``.
-    :param time_to_peak_max: see :class:`~relay_autotune.record.Cycle` [s].
-    :param mean_command: time average of the command [u].
-    :param std: standard deviation of each of these between the cycles, by name; 0 for one cycle.
+    :param std: standard deviation of each of the features between the cycles, by name; 0 for one
+        cycle.
     :param cycles: indices of the cycles averaged.
     :param converged: True if they agree.
     """
 
-    period: float
-    period_high: float
-    period_low: float
-    peak_max: float
-    peak_min: float
-    time_to_peak_max: float
-    time_to_peak_min: float
-    mean_measurement: float
-    mean_command: float
     std: dict[str, float] = field(default_factory=dict)
     cycles: tuple[int, ...] = ()
     converged: bool = False
 
 
-_AVERAGED = (
-    "period",
-    "period_high",
-    "period_low",
-    "peak_max",
-    "peak_min",
-    "time_to_peak_max",
-    "time_to_peak_min",
-    "mean_measurement",
-    "mean_command",
-)
+_AVERAGED = tuple(f.name for f in fields(CycleFeatures))
 
 
 def limit_cycle(

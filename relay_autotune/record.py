@@ -64,11 +64,9 @@ class RelaySettings:
 
 
 @dataclass(frozen=True)
-class Cycle:
-    """One whole cycle, from a switch to the high level to the next such switch.
+class CycleFeatures:
+    """What is measured of a cycle, or averaged over several.
 
-    :param index: number of the cycle in its experiment, from 0.
-    :param start: time of the switch that begins it [s, on the record's time axis].
     :param period: whole period [s].
     :param period_high: time with the command high, T_u1 of Wang et al. [s].
     :param period_low: time with the command low, T_u2 of Wang et al. [s].
@@ -78,12 +76,8 @@ class Cycle:
     :param time_to_peak_min: from the switch that turns the measurement up to the minimum [s].
     :param mean_measurement: time average of the measurement [y].
     :param mean_command: time average of the command [u].
-    :param converged: True if it agrees with the cycles before it.
-    :param disturbed: True if it should be left out of averages.
     """
 
-    index: int
-    start: float
     period: float
     period_high: float
     period_low: float
@@ -93,6 +87,20 @@ class Cycle:
     time_to_peak_min: float
     mean_measurement: float
     mean_command: float
+
+
+@dataclass(frozen=True)
+class Cycle(CycleFeatures):
+    """One whole cycle, from a switch to the high level to the next such switch.
+
+    :param index: number of the cycle in its experiment, from 0.
+    :param start: time of the switch that begins it [s, on the record's time axis].
+    :param converged: True if it agrees with the cycles before it.
+    :param disturbed: True if it should be left out of averages.
+    """
+
+    index: int
+    start: float
     converged: bool = False
     disturbed: bool = False
 

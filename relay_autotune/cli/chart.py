@@ -153,9 +153,7 @@ def identify_chart(method: str, numbers: Numbers, known: Known) -> Identificatio
         is none that the method takes.
     :raises IdentificationError: if no model has these numbers.
     """
-    if method not in CHART_METHODS:
-        raise SelectionError(f"unknown method {method!r}; known: {', '.join(CHART_METHODS)}")
-    chart = CHART_METHODS[method]
+    chart = look_up(CHART_METHODS, method, "method", SelectionError)
     lacking = [option(n) for n in chart.required if n not in numbers]
     if lacking:
         raise SelectionError(f"{method} also needs {', '.join(lacking)}")

@@ -17,6 +17,7 @@ from relay_autotune.identification.thyagarajan_method import identify_thyagaraja
 from relay_autotune.identification.wang_method import identify_biased, identify_unbiased
 from relay_autotune.identification.waveform import identify_waveform, identify_waveform_jointly
 from relay_autotune.record import Record
+from relay_autotune.registry import look_up
 
 Method = Callable[[Record, Known], Identification]
 JointMethod = Callable[[Sequence[Record], Known], Identification]
@@ -61,9 +62,7 @@ def method_named(name: str) -> Method:
 
     :raises IdentificationError: if there is none of that name; the message lists those there are.
     """
-    if name not in METHODS:
-        raise IdentificationError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
-    return METHODS[name]
+    return look_up(METHODS, name, "method", IdentificationError)
 
 
 def identify(

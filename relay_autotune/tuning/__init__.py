@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
 from relay_autotune.models import TransferFunction
+from relay_autotune.registry import look_up
 from relay_autotune.tuning.analysis import analyse_loop, is_stable
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
 from relay_autotune.tuning.gains import Controller, Gains, Performance
@@ -41,9 +42,7 @@ def rule_named(name: str) -> Rule:
 
     :raises TuningError: if there is none of that name; the message lists those there are.
     """
-    if name not in RULES:
-        raise TuningError(f"unknown rule {name!r}; known: {', '.join(RULES)}")
-    return RULES[name]
+    return look_up(RULES, name, "rule", TuningError)
 
 
 def tune(

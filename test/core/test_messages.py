@@ -127,7 +127,7 @@ def cycle_messages(whole: Record, start_ns: int) -> list[SimpleNamespace]:
         message = empty_message()
         fill_cycle(
             message,
-            Cycle(index, float(whole.time[first]), 1.0, 0.5, 0.5, 1.0, -1.0, 0.2, 0.3, 0.0, 0.0),
+            Cycle(1.0, 0.5, 0.5, 1.0, -1.0, 0.2, 0.3, 0.0, 0.0, index, float(whole.time[first])),
             settings=SETTINGS,
             experiment_id="one",
             start_ns=start_ns,
