@@ -17,6 +17,7 @@ from relay_autotune.cli.chart_wang import identify_biased_chart, identify_unbias
 from relay_autotune.errors import SelectionError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.result import Identification
+from relay_autotune.registry import look_up
 
 Numbers = Mapping[str, float]
 ChartMethod = Callable[[Numbers, Known], Identification]
