@@ -22,6 +22,7 @@ QUICK = {
     "structure_choice": ("--quick",),
     "coverage": ("--quick",),
     "ah_batch": ("--quick",),
+    "paper_designs": ("--quick",),
 }
 
 
