@@ -12,11 +12,15 @@ from scipy.special import stdtrit
 
 from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, infer_settings, limit_cycle
 from relay_autotune.errors import IdentificationError
-from relay_autotune.record import Record, RelaySettings
+from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
+# A command so far off both levels, in amplitudes, for more than this share of the time is none
+# of a relay.
+_OFF_LEVEL = 0.05
+_MOST_BETWEEN = 0.01
 _LEAST_SAMPLES = 4
 # So many cycles tell their scatter within 10 %.
 _MOST_SINGLES = 60
@@ -76,12 +80,14 @@ class RelayTest:
         return away.T @ away / ((count - 1) * averaged), quantile
 
 
-def relay_test(method: str, record: Record) -> RelayTest:
+def relay_test(method: str, record: Record, *, two_levels: bool = True) -> RelayTest:
     """Take a record for a relay test.
 
     :param method: on whose behalf, for the message.
     :param record: the record.
-    :raises IdentificationError: if it holds no whole cycle, too few samples in one, or no motion.
+    :param two_levels: False: the command may take the time it needs from level to level.
+    :raises IdentificationError: if it holds no whole cycle, too few samples in one, no motion,
+        or a command of more than two levels.
     """
     settings = record.settings or infer_settings(record)
     bounds = record.cycle_start or find_cycles(record)
@@ -105,6 +111,9 @@ def relay_test(method: str, record: Record) -> RelayTest:
         )
 
     u = record.input()
+    if two_levels:
+        ends = bounds[average.cycles[0]], bounds[average.cycles[-1] + 1]
+        _require_two_levels(method, settings, u, record.time[list(ends)])
 
     def stretch(first: int, last: int, cycle: LimitCycle) -> Stretch:
         # A copy that shares the columns, which are many and read-only.
@@ -122,3 +131,21 @@ def relay_test(method: str, record: Record) -> RelayTest:
         stretch(average.cycles[0], average.cycles[-1], average),
         tuple(stretch(i, i, limit_cycle(cycles[i : i + 1])) for i in average.cycles[::stride]),
     )
+
+
+def _require_two_levels(
+    method: str, settings: RelaySettings, u: PiecewiseConstant, span: FloatArray
+) -> None:
+    """Refuse a command that is on its way between the levels for some time, as of a rate limit."""
+    inside = (u.times > span[0]) & (u.times < span[1])
+    times = np.concatenate((span[:1], u.times[inside], span[1:]))
+    held = np.diff(times)
+    middle = settings.baseline + settings.bias
+    away = np.abs(np.abs(u(times[:-1]) - middle) / settings.amplitude - 1.0)
+    between = float(np.sum(held[away > _OFF_LEVEL]) / (span[1] - span[0]))
+    if between > _MOST_BETWEEN:
+        raise IdentificationError(
+            f"the command is between its two levels for {100.0 * between:.2g} % of the time, as a "
+            f"limit of its rate makes it; {method} is for a relay that switches at once: use the "
+            "method waveform, which takes the command as it was"
+        )

@@ -105,7 +105,7 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
         drown in noise, or the gain that is known has the wrong sign.
     """
     structure = _structure_asked_for(known)
-    test = relay_test(METHOD, record)
+    test = relay_test(METHOD, record, two_levels=False)
     fit = _Fit(structure, known, -1 if test.whole.settings.reverse_acting else 1)
     harmonics = measured_points(test.whole)
     points = _with_static_gain(test, record, harmonics, structure)
