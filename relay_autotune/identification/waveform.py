@@ -45,6 +45,8 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_SAMPLES = 12
 _MOST_FOR_CHOICE = 16_384
+# Beyond, what is not known of a process is not hidden in noise.
+_MOST_SAMPLES = 2_000_000
 _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
 # Noise of two records that differs by less is alike.
@@ -52,6 +54,7 @@ _ALIKE = 1.2
 _MOST_ROUNDS = 20
 _SETTLED = 1e-6
 _STEADY = 0.02
+_LEAST_NOISE = 1e-3
 
 
 def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
@@ -92,11 +95,18 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         ],
         FOPDT,
     )
+    samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
     fit = _fit(problem, known, sign, scale)
     fit = _by_noise(problem, fit, known, sign)
     fit = _spared_of_outliers(problem, fit, known, sign)
     _require_response(fit.problem, fit.state)
+    if problem.time.size < samples:
+        told = (
+            f"of {samples} samples {problem.time.size} were fitted, evenly spread: more would "
+            "take memory and tell nothing"
+        )
+        fit = replace(fit, warnings=(*fit.warnings, told))
     return report(records, fit)
 
 
@@ -154,7 +164,9 @@ def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
 
 def _noise_of_each(problem: Problem, state: State) -> FloatArray:
     residual = raw_residual(problem, state)
-    return np.sqrt([np.mean(residual[part] ** 2) for part in problem.experiments])
+    noise = np.sqrt([np.mean(residual[part] ** 2) for part in problem.experiments])
+    # One without noise counts for all, but not for more than numbers hold.
+    return np.asarray(np.maximum(noise, _LEAST_NOISE * noise.max()))
 
 
 def _weighted(problem: Problem, noise: FloatArray) -> Problem:
@@ -168,14 +180,14 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, sign: int) -> 
     """Fit again without isolated spikes, or with the loss that was asked for."""
     base = np.ones(problem.time.size)
     if fit.problem.weight is not None:
-        base[fit.problem.index] = fit.problem.weight
+        base[_places(problem, fit.problem)] = fit.problem.weight
     if known.loss != LOSSES[0]:
         # Outliers may have pulled the choice too: it is made again with the first weights.
-        first, weight = _reweighted(fit, known.loss, base), base.copy()
-        weight[first.problem.index] = first.problem.weight
+        first, weight = _reweighted(problem, fit, known.loss, base), base.copy()
+        weight[_places(problem, first.problem)] = first.problem.weight
         again = _fit(replace(problem, weight=weight), known, sign, fit.scale)
-        return _reweighted(again, known.loss, base)
-    outlying = _outliers(fit.problem, fit.state, problem.time.size)
+        return _reweighted(problem, again, known.loss, base)
+    outlying = _outliers(problem, fit.problem, fit.state)
     if not np.any(outlying):
         return fit
     # They would pull both the choice and the fit.
@@ -188,10 +200,10 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, sign: int) -> 
     return replace(again, warnings=(told,))
 
 
-def _reweighted(fit: Fit, loss: str, base: FloatArray) -> Fit:
+def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
     """Iterate the weights of a loss to convergence, beside those of the experiments."""
     problem, state = fit.problem, fit.state
-    own = base[problem.index]
+    own = base[_places(whole, problem)]
     for _ in range(_MOST_ROUNDS):
         residual = own * raw_residual(problem, state)
         scale = max(scale_of(residual), NEGLIGIBLE)
@@ -203,21 +215,26 @@ def _reweighted(fit: Fit, loss: str, base: FloatArray) -> Fit:
     return replace(fit, problem=problem, state=state, base=own, loss=loss)
 
 
-def _outliers(problem: Problem, state: State, samples: int) -> NDArray[np.bool_]:
-    """Return which samples no noise of the residual's own width explains, shape (samples,).
+def _places(whole: Problem, part: Problem) -> NDArray[np.int64]:
+    """Return where the samples of a part are among those of the whole."""
+    return np.searchsorted(whole.index, part.index)
 
-    :param problem: what was fitted.
+
+def _outliers(whole: Problem, problem: Problem, state: State) -> NDArray[np.bool_]:
+    """Return which samples no noise of the residual's own width explains, shape (n,).
+
+    :param whole: all samples.
+    :param problem: what was fitted of them.
     :param state: the fit.
-    :param samples: how many there were.
     """
-    found = np.zeros(samples, dtype=bool)
+    found = np.zeros(whole.time.size, dtype=bool)
     error = np.abs(state.residual - np.median(state.residual))
     width = scale_of(state.residual)
     far = error > max(_OUTLIER * width, NEGLIGIBLE)
     # Many of them, or several in a row, are no spikes but something that the model lacks.
     alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
-    if width > NEGLIGIBLE and np.sum(far) == np.sum(alone) <= _MOST_OUTLIERS * samples:
-        found[problem.index] = far
+    if width > NEGLIGIBLE and np.sum(far) == np.sum(alone) <= _MOST_OUTLIERS * found.size:
+        found[_places(whole, problem)] = far
     return found
 
 
