@@ -252,7 +252,10 @@ def _describing_point(found: Analysis) -> UltimatePoint | None:
 def _guarded(record: Record, method: str, known: Known) -> Identification:
     try:
         return identify(record, method, known)
-    except (ArithmeticError, np.linalg.LinAlgError) as error:
+    except RelayAutotuneError:
+        raise
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        # A search that meets a number that is not finite says so with a ValueError.
         raise IdentificationError(
             f"{method} broke down on this record ({error}): it holds no usable response"
         ) from error
