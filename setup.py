@@ -41,6 +41,7 @@ setup(
             "identifier_node = relay_autotune.nodes.identifier:main",
             "plant_node = relay_autotune.nodes.plant:main",
             "controller_node = relay_autotune.nodes.controller:main",
+            "tune_loop = relay_autotune.cli.tune_loop:main",
             "replay = relay_autotune.cli.replay:main",
             "identify = relay_autotune.cli.identify:main",
             "tune = relay_autotune.cli.tune:main",

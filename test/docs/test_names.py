@@ -15,7 +15,7 @@ from parameter_values import check_parameter_file, check_value
 
 from relay_autotune.autotune import analyse
 from relay_autotune.bag.reader import read_experiments
-from relay_autotune.cli import csv_to_bag, replay
+from relay_autotune.cli import csv_to_bag, replay, tune_loop
 from relay_autotune.document import document
 from relay_autotune.identification import METHODS
 from relay_autotune.models import STRUCTURES
@@ -102,7 +102,7 @@ def test_every_executable_is_named_in_the_guide() -> None:
 
 def test_parameters_in_commands_exist_and_may_have_these_values() -> None:
     for words in shell_commands("ros2", "run"):
-        known = {entry.name: entry for entry in TABLES[words[3]]}
+        known = {entry.name: entry for entry in TABLES.get(words[3], ())}
         for flag, assignment in pairwise(words):
             if flag != "-p" or assignment.endswith(":=..."):
                 continue
@@ -149,15 +149,20 @@ def test_remapped_names_are_those_of_the_loop() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "column"), [(replay, "flag"), (csv_to_bag, "flag of `csv_to_bag`")]
+    ("module", "page", "column"),
+    [
+        (replay, "docs/replay.md", "flag"),
+        (csv_to_bag, "docs/replay.md", "flag of `csv_to_bag`"),
+        (tune_loop, "docs/live.md", "flag of `tune_loop`"),
+    ],
 )
 def test_the_guide_has_the_flags_of_a_command(
-    module: Any, column: str, capsys: pytest.CaptureFixture[str]
+    module: Any, page: str, column: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
         module.main(["--help"])
     flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("\nExample")[0]))
-    shown = " ".join(row[0] for row in rows("docs/replay.md", column))
+    shown = " ".join(row[0] for row in rows(page, column))
     assert set(re.findall(r"--[a-z-]+", shown)) | {"--help"} == flags
 
 

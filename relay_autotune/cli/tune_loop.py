@@ -1,0 +1,213 @@
+"""tune_loop: start a tune on a running relay_node, show it, and print what came of it.
+
+Ctrl-C cancels the tune; the plant is then left at the safe command, and what was recorded is kept.
+On a terminal the progress is shown in place and in colour (NO_COLOR turns that off), else a line
+for each cycle goes to standard error. The result goes to standard output.
+
+Exit status: 0 the tune completed, with gains (of a dry run: it could start); 1 it did not, or
+there is nobody to do it; 2 the command line does not fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TextIO
+
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.tune_view import (
+    NARROWEST,
+    Paint,
+    document,
+    is_news,
+    live_lines,
+    log_line,
+    next_commands,
+    result_lines,
+    wants_colour,
+)
+from relay_autotune.errors import LoopError, ParameterError
+
+if TYPE_CHECKING:
+    from relay_autotune.nodes.tune_client import TuneClient
+
+PROGRAM = "tune_loop"
+# How often the times on a terminal advance [s].
+_TICK = 0.25
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    given = list(sys.argv[1:] if args is None else args)
+    own, ros = _apart(given)
+    parser = _parser()
+    options = parser.parse_args(own)
+    if options.amplitude < 0.0 or options.wait < 0.0:
+        parser.error("--amplitude and --wait are at least 0")
+    return guarded(PROGRAM, lambda: _tune(options, ros))
+
+
+def _apart(given: list[str]) -> tuple[list[str], list[str]]:
+    """Return the options of the command, and those that ROS understands."""
+    if "--ros-args" not in given:
+        return given, []
+    start = given.index("--ros-args")
+    rest = given[start:]
+    end = rest.index("--") if "--" in rest else len(rest)
+    return given[:start] + rest[end + 1 :], rest[:end]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5",
+    )
+    parser.add_argument(
+        "--amplitude", type=finite, default=0.0, metavar="U",
+        help="half the distance of the two commands [u]; default: the node's parameter",
+    )  # fmt: skip
+    parser.add_argument(
+        "--dry-run", action="store_true", help="only ask whether a tune could start, and how"
+    )
+    parser.add_argument("--namespace", default="", metavar="NS", help="namespace of the loop")
+    parser.add_argument(
+        "--node", default="relay_node", metavar="NAME", help="name of the relay_node (%(default)s)"
+    )
+    parser.add_argument(
+        "--record-only", action="store_true",
+        help="tune without an identifier_node: a recording, and no model",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wait", type=finite, default=5.0, metavar="S",
+        help="how long to look for the nodes [s] (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    return parser
+
+
+def _tune(options: argparse.Namespace, ros: list[str]) -> int:
+    # What a command needs is imported when it is needed: --help waits for no rclpy.
+    from relay_autotune.nodes.tune_client import TuneClient
+
+    interrupted: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: interrupted.append(n))
+    try:
+        client = TuneClient(options.namespace, options.node, ros)
+    except ParameterError as error:
+        say(PROGRAM, str(error))
+        return USAGE
+    with client:
+        client.find(options.wait, needs_identifier=not (options.dry_run or options.record_only))
+        client.ask(options.amplitude, options.dry_run)
+        shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
+        if not options.dry_run:
+            shown.say(f"tune of {client.name}; Ctrl-C cancels it")
+        _follow(client, shown, interrupted)
+        shown.clear()
+        return _conclude(client, options)
+
+
+def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
+    """Show what comes until the result is there, and cancel when asked to."""
+    asked = 0
+    while not client.done():
+        client.spin(_TICK)
+        for feedback in client.news():
+            shown.take(feedback)
+        shown.tick()
+        if interrupted and not asked:
+            asked = 1
+            client.cancel()
+            shown.say("cancelling: the safe command goes out, then the recording is closed")
+        elif len(interrupted) > 1:
+            raise LoopError(
+                f"left before the end was seen; {client.name} goes on to the safe command, and "
+                f"its log says how the tune ended"
+            )
+
+
+def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
+    result, cancelled = client.result, client.cancelled
+    if not result.experiment.experiment_id:
+        # Nothing was started: a dry run, or a refusal.
+        if options.json:
+            answer = {"node": client.name, "accepted": client.succeeded, "reason": result.reason}
+            print(json.dumps(answer))
+        elif client.succeeded:
+            print(result.reason)
+        if not client.succeeded:
+            say(PROGRAM, f"{client.name} refuses: {result.reason}")
+        return DONE if client.succeeded else NOTHING_FOUND
+    if options.json:
+        print(json.dumps(document(result, client.name, cancelled)))
+    else:
+        paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
+        print("\n".join(result_lines(result, cancelled, paint)))
+        prefix = "" if shutil.which("replay") else "ros2 run relay_autotune "
+        steps = next_commands(result, client.controllers(), prefix)
+        if steps:
+            print("\nNext:")
+        for what, command in steps:
+            print(f"  {what:<26} {command}")
+    complete = result.gains.experiment_id or options.record_only
+    return DONE if client.succeeded and complete else NOTHING_FOUND
+
+
+class Shown:
+    """What is on the screen, or in the log, of a running tune.
+
+    :param stream: where it is written.
+    :param live: whether it is a terminal, whose lines may be written again.
+    """
+
+    def __init__(self, stream: TextIO, live: bool) -> None:
+        self._stream = stream
+        self._width = shutil.get_terminal_size().columns
+        self._live = live and os.environ.get("TERM") != "dumb" and self._width >= NARROWEST
+        blocks = (stream.encoding or "").lower().replace("-", "") == "utf8"
+        self._paint = Paint(wants_colour(live, os.environ), blocks)
+        self._lines = 0
+        self._last: Any = None
+        self._came = 0.0
+
+    def take(self, feedback: Any) -> None:
+        """Show a feedback."""
+        if not self._live and is_news(self._last, feedback):
+            print(log_line(feedback), file=self._stream, flush=True)
+        self._last, self._came = feedback, time.monotonic()
+
+    def tick(self) -> None:
+        """Let the times on a terminal advance."""
+        if not self._live or self._last is None:
+            return
+        since = time.monotonic() - self._came
+        lines = live_lines(self._last, self._paint, since, self._width)
+        self.clear()
+        self._stream.write("\n".join(lines) + "\n")
+        self._stream.flush()
+        self._lines = len(lines)
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
+        self.clear()
+        print(text, file=self._stream, flush=True)
+
+    def clear(self) -> None:
+        """Take away what is shown in place."""
+        if self._lines:
+            self._stream.write(f"\x1b[{self._lines}A\x1b[J")
+            self._stream.flush()
+            self._lines = 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,270 @@
+"""What a person sees of a tune, as text: its progress, its result, and what to type next.
+
+Everything here is made from the messages of the action `Tune` alone, whichever way they came.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from relay_autotune.cli.table import gains_lines
+from relay_autotune.messages import transfer_function_from_message
+from relay_autotune.notation import digits, process_text
+
+# By the constants of Tune.Feedback and RelayExperiment.
+STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")
+OUTCOMES = ("unknown", "completed", "aborted", "failed")
+
+# Columns that a terminal must have for lines that are written again.
+NARROWEST = 80
+
+_BAR = 16
+_TEXT = 78
+_GREEN, _YELLOW, _RED, _BOLD, _DIM, _PLAIN = "32", "33", "31", "1", "2", "0"
+_WORDS = {
+    "settling": "waits for rest",
+    "kick": "finds dead time and direction",
+    "relay": "oscillates",
+    "completed": "waits for model and gains",
+    "aborted": "ended, the safe command is out",
+    "failed": "ended, the safe command is out",
+}
+
+
+@dataclass(frozen=True)
+class Paint:
+    """How text may look.
+
+    :param colour: whether escape sequences for colours may be used.
+    :param blocks: whether the terminal can show other than ASCII.
+    """
+
+    colour: bool = False
+    blocks: bool = False
+
+    def __call__(self, text: str, code: str) -> str:
+        """Return a text in a colour or weight, where that is possible."""
+        return f"\x1b[{code}m{text}\x1b[{_PLAIN}m" if self.colour and text else text
+
+
+def wants_colour(is_terminal: bool, environment: Mapping[str, str]) -> bool:
+    """Tell whether colours are wanted: on a terminal that knows them, without NO_COLOR.
+
+    :param is_terminal: whether a person looks at it.
+    :param environment: the variables of the process.
+    """
+    return is_terminal and not environment.get("NO_COLOR") and environment.get("TERM") != "dumb"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as people say it.
+
+    :param seconds: the duration [s], not negative.
+    """
+    if seconds < 90.0:
+        return f"{seconds:.{1 if seconds < 10.0 else 0}f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 90:
+        return f"{minutes} min {rest} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min"
+
+
+def estimate(feedback: Any) -> str:
+    """Return the ultimate gain with its 95 % interval; empty where none is known yet.
+
+    :param feedback: a `Tune.Feedback`.
+    """
+    value, std = feedback.ultimate_gain, feedback.ultimate_gain_std
+    if not math.isfinite(value):
+        return ""
+    if not math.isfinite(std):
+        return f"K_u {digits(value)} u/y"
+    low, high = value - 1.96 * std, value + 1.96 * std
+    return f"K_u {digits(value)} u/y (95 %: {digits(low)} to {digits(high)})"
+
+
+def oscillation(feedback: Any) -> str:
+    """Return period and amplitude of the last whole cycle; empty before the first.
+
+    :param feedback: a `Tune.Feedback`.
+    """
+    if not math.isfinite(feedback.period):
+        return ""
+    text = f"period {digits(feedback.period)} s"
+    if math.isfinite(feedback.amplitude):
+        text += f", amplitude {digits(feedback.amplitude)} y"
+    return text
+
+
+def is_news(before: Any, now: Any) -> bool:
+    """Tell whether a feedback is worth a line in a log: another state, or another cycle.
+
+    :param before: the feedback before it, None for the first.
+    :param now: a `Tune.Feedback`.
+    """
+    return before is None or (before.state, before.cycle) != (now.state, now.cycle)
+
+
+def log_line(feedback: Any) -> str:
+    """Return a feedback as one plain line, for a log.
+
+    :param feedback: a `Tune.Feedback`.
+    """
+    state = STATES[feedback.state]
+    parts = [f"cycle {feedback.cycle}" if feedback.cycle and state == "relay" else state]
+    if state in ("relay", "completed"):
+        parts += [oscillation(feedback), estimate(feedback)]
+    if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
+        parts.append(f"about {duration(feedback.remaining)} left")
+    return f"{feedback.elapsed:8.1f} s  {', '.join(filter(None, parts))}"
+
+
+def live_lines(
+    feedback: Any, paint: Paint, since: float = 0.0, width: int = NARROWEST
+) -> list[str]:
+    """Return a feedback as the lines that a terminal shows until the next one.
+
+    :param feedback: a `Tune.Feedback`.
+    :param paint: how text may look.
+    :param since: time since it came [s], not negative.
+    :param width: columns of the terminal, at least `NARROWEST`.
+    """
+    state = STATES[feedback.state]
+    done = round(_BAR * min(max(feedback.progress, 0.0), 1.0))
+    full, empty = ("█", "░") if paint.blocks else ("#", "-")
+    colour = {"completed": _GREEN, "aborted": _RED, "failed": _RED}.get(state, _YELLOW)
+    bar = paint(full * done, colour) + paint(empty * (_BAR - done), _DIM)
+    times = f"{duration(feedback.elapsed + since)} so far"
+    left = feedback.remaining - since
+    if math.isfinite(left) and left > 0.0:
+        times += f", about {duration(left)} left"
+    lines = [
+        f"  {paint(f'{state:<10}', _BOLD)} {bar} {100.0 * feedback.progress:3.0f} %  {times}",
+        f"  {'':<10} {paint(_WORDS.get(state, ''), _DIM)}",
+    ]
+    if feedback.cycle:
+        lines[1] = f"  {'':<10} cycle {feedback.cycle}: {oscillation(feedback)}"
+    lines.append(f"  {'':<10} {estimate(feedback)}".rstrip())
+    model = feedback.transfer_function
+    shown = process_text(transfer_function_from_message(model)) if model.experiment_id else ""
+    lines.append(f"  {'':<10} {paint(shown[: width - 14], _DIM)}".rstrip())
+    return lines
+
+
+def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:
+    """Return the result of a tune.
+
+    :param result: a `Tune.Result` with an experiment.
+    :param cancelled: whether it was cancelled from here.
+    :param paint: how text may look.
+    """
+    outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
+    colour = {"completed": _GREEN}.get(outcome, _RED)
+    first, *rest = textwrap.wrap(f"{outcome}: {result.reason}", _TEXT)
+    first = paint(outcome, f"{_BOLD};{colour}") + first.removeprefix(outcome)
+    lines = [f"  {'tune':<16} {first}", *_continued(rest)]
+    if outcome != "completed":
+        lines.append(f"  {'':<16} the plant is left at the safe command; no gains are given")
+    if result.transfer_function.experiment_id:
+        lines += ["", *model_lines(result.transfer_function, paint)]
+    if result.gains.experiment_id:
+        lines += ["", *gains_lines(result.gains)]
+    lines += ["", f"  {'recording':<16} {result.bag or 'none'}"]
+    return lines
+
+
+def model_lines(message: Any, paint: Paint) -> list[str]:
+    """Return an identified model with its accuracy.
+
+    :param message: a `TransferFunction`.
+    :param paint: how text may look.
+    """
+    process = process_text(transfer_function_from_message(message))
+    lines = [f"  {'process':<16} {process}   ({message.structure}, {message.method})"]
+    for name, low, high in zip(
+        message.parameters, message.ci95_low, message.ci95_high, strict=True
+    ):
+        if math.isfinite(low):
+            doubt = paint("   not determined", _YELLOW) if name in message.undetermined else ""
+            label = "  " + name.replace("_", " ")
+            lines.append(f"  {label:<16} 95 %: {digits(low)} to {digits(high)}{doubt}")
+    if math.isfinite(message.ultimate_gain):
+        label = "  ultimate point"
+        lines.append(
+            f"  {label:<16} K_u {digits(message.ultimate_gain)} u/y, "
+            f"w_u {digits(message.ultimate_frequency)} rad/s"
+        )
+    if math.isfinite(message.fit):
+        lines.append(f"  {'  fit':<16} {100.0 * message.fit:.2f} %")
+    label = paint(f"{'  warning':<16}", _YELLOW)
+    for text in message.warnings:
+        first, *rest = textwrap.wrap(text, _TEXT)
+        lines += [f"  {label} {first}", *_continued(rest)]
+    return lines
+
+
+def _continued(lines: Sequence[str]) -> list[str]:
+    return [f"  {'':<16} {line}" for line in lines]
+
+
+def next_commands(
+    result: Any, controllers: Sequence[str], prefix: str = ""
+) -> list[tuple[str, str]]:
+    """Return what to type next, each with what it is for.
+
+    :param result: a `Tune.Result`.
+    :param controllers: full names of the controller_nodes that hear these gains.
+    :param prefix: what runs the package's executables, where the shell does not find them.
+    """
+    steps = []
+    if result.gains.experiment_id:
+        for name in controllers:
+            steps += [
+                ("put the gains in force", f"ros2 service call {name}/apply std_srvs/srv/Trigger"),
+                (
+                    "prove them with a step",
+                    f"ros2 action send_goal {name}/verify relay_autotune_msgs/action/Verify {{}}",
+                ),
+            ]
+    if result.bag:
+        bag = shlex.quote(result.bag)
+        if result.transfer_function.experiment_id:
+            steps.append(("see it in figures", f"{prefix}report {bag}"))
+        steps.append(("see every method and rule", f"{prefix}replay {bag}"))
+    return steps
+
+
+def document(result: Any, node: str, cancelled: bool) -> dict[str, Any]:
+    """Return a result for a JSON document; null stands for "not estimated", and "none came".
+
+    :param result: a `Tune.Result`.
+    :param node: full name of the relay_node.
+    :param cancelled: whether it was cancelled from here.
+    """
+    model, gains = result.transfer_function, result.gains
+    return {
+        "node": node,
+        "experiment_id": result.experiment.experiment_id,
+        "outcome": "cancelled" if cancelled else OUTCOMES[result.outcome],
+        "reason": result.reason,
+        "bag": result.bag or None,
+        "transfer_function": _fields(model) if model.experiment_id else None,
+        "gains": _fields(gains) if gains.experiment_id else None,
+    }
+
+
+def _fields(value: Any) -> Any:
+    """Return a message as what JSON knows."""
+    if hasattr(value, "get_fields_and_field_types"):
+        return {name: _fields(getattr(value, name)) for name in value.get_fields_and_field_types()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, (str, int)):
+        return value
+    return [_fields(item) for item in value]

@@ -1,0 +1,178 @@
+"""A client of relay_node's action ~/tune, and what it finds around it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_namespace import validate_namespace
+from rclpy.validate_topic_name import validate_topic_name
+
+from relay_autotune.errors import LoopError, ParameterError
+from relay_autotune_msgs.action import Tune
+
+# A relay_node that is not seen for so long during a tune is taken for gone [s].
+_GONE = 3.0
+
+
+class TuneClient:
+    """Asks one relay_node for one tune.
+
+    :param namespace: namespace of the loop; empty: the root, or what the ROS arguments say.
+    :param node: name of the relay_node.
+    :param ros: arguments for ROS.
+    :raises ParameterError: if no node can have such a name.
+    """
+
+    def __init__(self, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
+        try:
+            validate_namespace(f"/{namespace.strip('/')}")
+            validate_topic_name(f"{node}/tune")
+        except (InvalidNamespaceException, InvalidTopicNameException) as error:
+            text = str(error).splitlines()[0].rstrip(":")
+            raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
+        self._context = Context()
+        rclpy.init(
+            context=self._context, args=list(ros), signal_handler_options=SignalHandlerOptions.NO
+        )
+        self._node = Node("tune_loop", namespace=namespace or None, context=self._context)
+        self._client = ActionClient(self._node, Tune, f"{node}/tune")
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.name = self._node.resolve_service_name(node)
+        self._feedback: list[Any] = []
+        self._goal: Any = None
+        self._answer: Any = None
+        self._seen = time.monotonic()
+
+    def __enter__(self) -> TuneClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._client.destroy()
+        self._executor.shutdown(timeout_sec=0.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def find(self, patience: float, *, needs_identifier: bool) -> None:
+        """Wait for the relay_node, and for the identifier_node if it is needed.
+
+        :param patience: how long [s].
+        :param needs_identifier: whether model and gains are wanted.
+        :raises LoopError: if they are not there; the sentence says who is.
+        """
+        deadline = time.monotonic() + patience
+        if not self._wait(self._client.server_is_ready, deadline):
+            others = ", ".join(self._owners("/tune")) or "none"
+            raise LoopError(
+                f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
+                f"{others}. Start it, or name another with --namespace and --node"
+            )
+        gains = self._resolved("pi_gains")
+        if needs_identifier and not self._wait(
+            lambda: self._node.count_publishers(gains) > 0, deadline
+        ):
+            raise LoopError(
+                f"no identifier_node publishes {gains}, so that no model and no gains would come; "
+                f"start one in this namespace, or ask for a recording alone with --record-only"
+            )
+
+    def ask(self, amplitude: float, dry_run: bool) -> None:
+        """Send the goal.
+
+        :param amplitude: half the distance of the two commands [u]; 0: the node's parameter.
+        :param dry_run: whether nothing shall be started.
+        :raises LoopError: if the node does not answer.
+        """
+        sent = self._client.send_goal_async(
+            Tune.Goal(amplitude=amplitude, dry_run=dry_run),
+            feedback_callback=lambda message: self._feedback.append(message.feedback),
+        )
+        if not self._wait(sent.done, time.monotonic() + 10.0):
+            raise LoopError(f"{self.name} has not answered the request within 10 s")
+        self._goal = sent.result()
+        if not self._goal.accepted:
+            raise LoopError(f"{self.name} has rejected the request; its log says why")
+        self._answer = self._goal.get_result_async()
+
+    def spin(self, seconds: float) -> None:
+        """Take what comes within a time, or until the result is there.
+
+        :param seconds: how long [s].
+        :raises LoopError: if the node has gone.
+        """
+        self._wait(self._answer.done, time.monotonic() + seconds)
+        if self._client.server_is_ready() or self._answer.done():
+            self._seen = time.monotonic()
+        elif time.monotonic() - self._seen > _GONE:
+            raise LoopError(
+                f"{self.name} has gone during the tune: nobody publishes the command any more, "
+                f"and the last one stays in force; see to the plant"
+            )
+
+    def news(self) -> list[Any]:
+        """Return the feedback that has come since the last call."""
+        news, self._feedback[:] = list(self._feedback), []
+        return news
+
+    def cancel(self) -> None:
+        """Ask for the end of the tune."""
+        self._goal.cancel_goal_async()
+
+    def done(self) -> bool:
+        """Tell whether the result is there."""
+        return bool(self._answer.done())
+
+    @property
+    def result(self) -> Any:
+        """The `Tune.Result`."""
+        return self._answer.result().result
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the goal was reached."""
+        return bool(self._answer.result().status == GoalStatus.STATUS_SUCCEEDED)
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it was cancelled."""
+        return bool(self._answer.result().status == GoalStatus.STATUS_CANCELED)
+
+    def controllers(self) -> list[str]:
+        """Return the full names of the nodes of this namespace that can apply gains."""
+        return [name for name in self._owners("/apply") if self._is_here(name)]
+
+    def _is_here(self, name: str) -> bool:
+        return name.rpartition("/")[0] == self.name.rpartition("/")[0]
+
+    def _owners(self, ending: str) -> list[str]:
+        """Return the full names of the nodes that serve what ends so."""
+        services = self._node.get_service_names_and_types()
+        goals = [name.removesuffix("/_action/send_goal") for name, _ in services]
+        return sorted({name.removesuffix(ending) for name in goals if name.endswith(ending)})
+
+    def _resolved(self, topic: str) -> str:
+        return str(self._node.resolve_topic_name(topic))
+
+    def _wait(self, condition: Callable[[], bool], deadline: float) -> bool:
+        while not condition():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+        return True

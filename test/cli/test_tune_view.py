@@ -1,0 +1,219 @@
+"""What tune_loop shows, from messages alone."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+
+from relay_autotune.cli import tune_loop
+from relay_autotune.cli.tune_view import (
+    OUTCOMES,
+    STATES,
+    Paint,
+    document,
+    duration,
+    estimate,
+    is_news,
+    live_lines,
+    log_line,
+    next_commands,
+    result_lines,
+    wants_colour,
+)
+from relay_autotune_msgs.action import Tune
+from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
+
+NAN = math.nan
+
+
+def feedback(**values: Any) -> Any:
+    """Return a feedback before the first cycle, with other values where given."""
+    unknown = dict.fromkeys(
+        ("remaining", "period", "amplitude", "ultimate_gain", "ultimate_gain_std"), NAN
+    )
+    return Tune.Feedback(**(unknown | values))
+
+
+def cycle(**values: Any) -> Any:
+    known = dict(
+        state=Tune.Feedback.STATE_RELAY,
+        cycle=2,
+        progress=0.5,
+        elapsed=61.0,
+        remaining=35.4,
+        period=38.43,
+        amplitude=0.7031,
+        ultimate_gain=2.3,
+        ultimate_gain_std=0.01,
+    )
+    return feedback(**(known | values))
+
+
+def model() -> Any:
+    return TransferFunction(
+        experiment_id="x",
+        method="waveform",
+        structure="fopdt",
+        numerator=[2.0],
+        denominator=[4.0, 1.0],
+        dead_time=1.5,
+        parameters=["gain", "time_constant"],
+        ci95_low=[1.9, 3.0],
+        ci95_high=[2.1, 5.0],
+        undetermined=["time_constant"],
+        ultimate_gain=2.5,
+        ultimate_frequency=1.2,
+        fit=0.987,
+        warnings=["look twice"],
+    )
+
+
+def result(**values: Any) -> Any:
+    return Tune.Result(**(dict(experiment=RelayExperiment(experiment_id="x")) | values))
+
+
+def completed() -> Any:
+    return result(
+        outcome=Tune.Result.COMPLETED,
+        reason="3 cycles agree",
+        transfer_function=model(),
+        gains=PidGains(
+            experiment_id="x", rule="robust", kc=0.5, ti=4.0, p=0.5, i=0.125, ms_95=NAN
+        ),
+        bag="/records/x y",
+    )
+
+
+def test_states_and_outcomes_have_the_names_of_the_constants() -> None:
+    for number, name in enumerate(STATES):
+        assert getattr(Tune.Feedback, f"STATE_{name.upper()}") == number
+    for number, name in enumerate(OUTCOMES):
+        assert getattr(Tune.Result, name.upper()) == number
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.26, "0.3 s"),
+        (9.94, "9.9 s"),
+        (35.4, "35 s"),
+        (260.0, "4 min 20 s"),
+        (6600, "1 h 50 min"),
+    ],
+)
+def test_a_duration_is_said_in_two_units_at_most(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_an_interval_is_that_of_two_standard_deviations() -> None:
+    assert estimate(cycle()) == "K_u 2.300 u/y (95 %: 2.280 to 2.320)"
+    assert estimate(cycle(ultimate_gain_std=NAN)) == "K_u 2.300 u/y"
+    assert estimate(feedback()) == ""
+
+
+def test_a_log_has_a_line_for_each_state_and_cycle() -> None:
+    first = feedback(state=1, elapsed=0.5)
+    assert log_line(first) == "     0.5 s  settling"
+    assert log_line(cycle()) == (
+        "    61.0 s  cycle 2, period 38.43 s, amplitude 0.7031 y, "
+        "K_u 2.300 u/y (95 %: 2.280 to 2.320), about 35 s left"
+    )
+    assert is_news(None, first)
+    assert not is_news(cycle(), cycle(elapsed=62.0))
+    assert is_news(cycle(), cycle(cycle=3))
+    assert is_news(first, feedback(state=2))
+
+
+def test_a_terminal_shows_the_same_number_of_lines_at_any_time() -> None:
+    """Else what is written again would leave something behind."""
+    shown = [live_lines(f, Paint()) for f in (feedback(state=1), cycle(), feedback(state=6))]
+    assert {len(lines) for lines in shown} == {4}
+    assert "[" not in "".join(shown[1]).replace("\x1b[", "")
+    assert "#" * 8 + "-" * 8 in shown[1][0]
+    assert "61 s so far, about 35 s left" in shown[1][0]
+
+
+def test_times_advance_between_feedbacks() -> None:
+    line = live_lines(cycle(), Paint(), since=5.0)[0]
+    assert "66 s so far, about 30 s left" in line
+    assert "left" not in live_lines(cycle(), Paint(), since=50.0)[0]
+
+
+def test_no_line_is_wider_than_the_terminal() -> None:
+    many = model()
+    many.denominator = [float(k + 1) for k in range(30)]
+    widest = feedback(
+        state=5, cycle=12, progress=1.0, elapsed=86399.0, remaining=86399.0, period=1.234e-5,
+        amplitude=1.234e-5, ultimate_gain=-1.234e-5, ultimate_gain_std=1e-6,
+        transfer_function=many,
+    )  # fmt: skip
+    for shown in (widest, cycle()):
+        assert max(map(len, live_lines(shown, Paint(), width=80))) <= 80
+
+
+def test_the_newest_model_is_shown() -> None:
+    assert "2.000 e^(-1.500 s)" in live_lines(cycle(transfer_function=model()), Paint())[3]
+
+
+def test_colours_are_for_a_terminal_that_wants_them() -> None:
+    assert wants_colour(True, {"TERM": "xterm"})
+    assert not wants_colour(False, {"TERM": "xterm"})
+    assert not wants_colour(True, {"NO_COLOR": "1"})
+    assert not wants_colour(True, {"TERM": "dumb"})
+    plain = live_lines(cycle(), Paint()) + result_lines(completed(), False, Paint())
+    assert "\x1b" not in "".join(plain)
+    painted = live_lines(cycle(), Paint(colour=True))
+    assert painted[0].count("\x1b[") == 2 * painted[0].count("\x1b[0m") > 0
+
+
+def test_a_result_has_model_gains_recording_and_what_to_type_next() -> None:
+    text = "\n".join(result_lines(completed(), False, Paint()))
+    for part in (
+        "completed: 3 cycles agree",
+        "2.000 e^(-1.500 s) / (1 + 4.000 s)   (fopdt, waveform)",
+        "95 %: 1.900 to 2.100",
+        "95 %: 3.000 to 5.000   not determined",
+        "look twice",
+        "kc 0.5000 u/y   ti 4.000 s",
+        "/records/x y",
+    ):
+        assert part in text
+    commands = [c for _, c in next_commands(completed(), ["/a/controller_node"])]
+    assert commands == [
+        "ros2 service call /a/controller_node/apply std_srvs/srv/Trigger",
+        "ros2 action send_goal /a/controller_node/verify relay_autotune_msgs/action/Verify {}",
+        "report '/records/x y'",
+        "replay '/records/x y'",
+    ]
+
+
+def test_a_tune_without_gains_offers_none() -> None:
+    stopped = result(outcome=Tune.Result.ABORTED, reason="cancelled", bag="/records/x")
+    text = "\n".join(result_lines(stopped, True, Paint()))
+    assert "cancelled: cancelled" in text
+    assert "safe command; no gains are given" in text
+    assert [c for _, c in next_commands(stopped, ["/c"])] == ["replay /records/x"]
+    assert document(stopped, "/relay_node", True)["gains"] is None
+
+
+def test_the_document_is_json_with_null_for_what_is_not_estimated() -> None:
+    found = json.loads(json.dumps(document(completed(), "/tank/relay_node", False)))
+    assert found["outcome"] == "completed"
+    assert found["gains"]["kc"] == 0.5
+    assert found["gains"]["ms_95"] is None
+    assert found["transfer_function"]["denominator"] == [4.0, 1.0]
+    assert found["transfer_function"]["header"]["frame_id"] == ""
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--amplitude", "-1"], ["--amplitude", "nan"], ["--wait", "-1"], ["--bogus"]]
+)
+def test_a_command_line_that_does_not_fit_ends_with_two(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        tune_loop.main(arguments)
+    assert end.value.code == 2

@@ -1,0 +1,116 @@
+"""tune_loop, as a person or a script runs it, over real DDS."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from loop_rig import RELIABLE, Rig
+from std_msgs.msg import Float64
+
+LOOP = {
+    "sample_period": 0.1,
+    "structure": "fopdt",
+    "gain": 2.0,
+    "time_constants": [2.0],
+    "dead_time": 1.0,
+    "operating_point": [5.0, 1.0],
+    "noise_std": 0.005,
+}
+NAMED = ("-r", "__ns:=/tank")
+
+
+def command(rig: Rig, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [shutil.which("tune_loop"), *arguments],
+        env=rig.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(rig: Rig, *arguments: str) -> tuple[int, str, str]:
+    process = command(rig, *arguments)
+    output, said = process.communicate(timeout=90.0)
+    assert "Traceback" not in said
+    return process.returncode, output, said
+
+
+def ready(rig: Rig) -> None:
+    """Wait until a tune could start, by asking as a person would."""
+    deadline = time.monotonic() + 30.0
+    while run(rig, "--namespace", "/tank", "--dry-run")[0]:
+        assert time.monotonic() < deadline, rig.logs()
+
+
+def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
+    rig.start("plant_node", *NAMED, mode="lockstep", seed=3, **LOOP)
+    records = str(rig.records)
+    rig.start(
+        "relay_node", *NAMED, amplitude=0.5, baseline=1.0, sample_period=0.1,
+        record_directory=records,
+    )  # fmt: skip
+    ready(rig)
+    status, output, said = run(rig, "--namespace", "tank", "--dry-run", "--amplitude", "0.25")
+    assert status == 0
+    assert output.startswith("a tune could start: relay between 0.825 and 1.325")
+    status, output, said = run(rig, "--namespace", "tank", "--wait", "0.3")
+    assert status == 1
+    assert said.startswith("tune_loop: no identifier_node publishes /tank/pi_gains")
+    assert said.count("\n") == 1
+    rig.start("identifier_node", *NAMED)
+    status, output, said = run(rig, "--ros-args", "-r", "__ns:=/tank")
+    assert status == 0, said
+    assert "\x1b" not in output + said
+    for part in ("tune of /tank/relay_node", "cycle 2, period", "left", "completed, period"):
+        assert part in said
+    (bag,) = Path(records).iterdir()
+    for part in ("completed: ", "(fopdt, waveform)", "kc ", str(bag), f"replay {bag}"):
+        assert part in output
+
+
+def test_ctrl_c_cancels_and_says_that_the_safe_command_is_out(rig: Rig) -> None:
+    commands = rig.listen("tank/command", Float64, RELIABLE)
+    rig.start("plant_node", *NAMED, **(LOOP | {"time_constants": [50.0], "sample_period": 0.02}))
+    rig.start(
+        "relay_node", *NAMED, amplitude=0.5, baseline=1.0, settle_time=0.4,
+        record_directory=str(rig.records),
+    )  # fmt: skip
+    ready(rig)
+    process = command(rig, "--namespace", "tank", "--record-only", "--json")
+    rig.until(lambda: any(m.data != 1.0 for m in commands), "a step")
+    process.send_signal(signal.SIGINT)
+    output, said = process.communicate(timeout=30.0)
+    assert process.returncode == 1
+    assert "cancelling: the safe command goes out" in said
+    found = json.loads(output)
+    assert (found["node"], found["outcome"]) == ("/tank/relay_node", "cancelled")
+    assert found["gains"] is None
+    assert Path(found["bag"]).is_dir()
+    rig.until(lambda: commands[-1].data == 1.0, "the safe command")
+
+
+def test_without_a_relay_node_it_says_so_in_one_line(rig: Rig) -> None:
+    status, output, said = run(rig, "--namespace", "tank", "--wait", "0.2")
+    assert (status, output) == (1, "")
+    assert said.startswith("tune_loop: no relay_node /tank/relay_node within 0.2 s")
+    assert said.count("\n") == 1
+    status, output, said = run(rig, "--namespace", "no name")
+    assert (status, output) == (2, "")
+    assert said.count("\n") == 1
+
+
+def test_help_needs_no_graph() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "relay_autotune.cli.tune_loop", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "--record-only" in done.stdout
