@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,8 +12,9 @@ from relay_autotune.autotune import Analysis
 from relay_autotune.cycles import LimitCycle, cycles_of, infer_settings, limit_cycle
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import FitReport, Identification
-from relay_autotune.identification.fourier import FrequencyPoint, frequency_point
+from relay_autotune.identification.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival
+from relay_autotune.identification.validation import Validation
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.tuning import Gains, ensemble
@@ -28,7 +28,6 @@ UNITS = {
     "ultimate_gain": "u/y",
     "ultimate_frequency": "rad/s",
 }
-_HARMONICS = 9
 
 
 @dataclass(frozen=True)
@@ -70,6 +69,9 @@ class ModelCase:
     :param warnings: sentences that the user must read.
     :param rivals: other structures that the data do not rule out.
     :param fitted: the model's measurement at the samples [y]; empty: not known.
+    :param validation: how its limit cycle differs from the record's; None: not compared.
+    :param integrated_error: how far it is from the model that counts [rad/s]; NaN: it is that
+        model, or not known.
     """
 
     method: str
@@ -80,6 +82,8 @@ class ModelCase:
     warnings: tuple[str, ...] = ()
     rivals: tuple[Rival, ...] = ()
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
+    validation: Validation | None = None
+    integrated_error: float = math.nan
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -167,7 +171,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         settings=record.settings or infer_settings(record),
         cycles=analysis.cycles or _cycles(record),
         models_around=around,
-        points=_points(record, analysis.cycles),
+        points=next((m.points for m in analysis.models if m.points), ()),
     )
 
 
@@ -176,21 +180,6 @@ def _cycles(record: Record) -> tuple[Cycle, ...]:
         return cycles_of(record)
     except RelayAutotuneError:
         return ()
-
-
-def _points(record: Record, cycles: Sequence[Cycle]) -> tuple[FrequencyPoint, ...]:
-    """Return the points at the harmonics of the limit cycle that the command excites."""
-    if not cycles:
-        return ()
-    first = limit_cycle(cycles).cycles[0]
-    found = []
-    for harmonic in range(1, _HARMONICS + 1):
-        try:
-            found.append(frequency_point(record, harmonic, first))
-        except RelayAutotuneError:
-            # An unbiased relay holds no even harmonics, and a short record no cycle.
-            continue
-    return tuple(found)
 
 
 def _model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
@@ -217,6 +206,8 @@ def _model_case(found: Identification, truth: TransferFunction | None) -> ModelC
         warnings=found.warnings,
         rivals=found.rivals,
         fitted=found.fitted,
+        validation=found.validation,
+        integrated_error=found.integrated_error,
     )
 
 

@@ -244,4 +244,6 @@ def rate_of(
     count = min(max(count, 5), 2 * ((grid.size - 1) // 2) - 1)
     smooth = savgol_filter(even, count, 2)
     rate = savgol_filter(even, count, 2, deriv=1, delta=step)
-    return grid, np.asarray(smooth), np.asarray(rate)
+    # At its ends a record has no neighbours to fit a parabola to.
+    whole = slice(count // 2, grid.size - count // 2)
+    return grid[whole], np.asarray(smooth)[whole], np.asarray(rate)[whole]

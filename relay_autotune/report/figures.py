@@ -11,8 +11,14 @@ import numpy as np
 from relay_autotune.report.case import Case
 from relay_autotune.report.experiment import draw_experiment, draw_fit, draw_phase_plane
 from relay_autotune.report.frequency import draw_bode, draw_nyquist
-from relay_autotune.report.loops import draw_closed_loop, draw_uncertainty, uncertainty_height
+from relay_autotune.report.loops import (
+    distinct_gains,
+    draw_closed_loop,
+    draw_rules,
+    rules_height,
+)
 from relay_autotune.report.style import NARROW, SQUARE, WIDE, new_figure
+from relay_autotune.report.uncertainty import draw_uncertainty, uncertainty_height
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -101,6 +107,13 @@ def _without_gains(case: Case) -> str:
     return "" if case.best_gains is not None else _NO_GAINS
 
 
+def _without_other_rules(case: Case) -> str:
+    missing = _without_gains(case)
+    if missing:
+        return missing
+    return "" if len(distinct_gains(case)) > 1 else "no other rule gives other gains."
+
+
 def _without_model(case: Case) -> str:
     return "" if case.model is not None else _NO_MODEL
 
@@ -176,7 +189,16 @@ PLATES = (
         "A step of the set-point, then one of the load at the process input, on the identified "
         "model. Good: one small overshoot and a quick return. Bad: ringing, or a load error "
         "that lingers.",
-        lambda _: (5.4, 6.4),
+        lambda _: (4.6, 5.0),
+    ),
+    Plate(
+        "rules",
+        "The other rules",
+        draw_rules,
+        _without_other_rules,
+        "The same two steps with the gains of each other rule (solid), beside the recommended "
+        "ones (dashed). IAE is the integral of the absolute error after a unit step of the load.",
+        rules_height,
     ),
     Plate(
         "uncertainty",
@@ -185,7 +207,8 @@ PLATES = (
         _without_intervals,
         "95 % intervals as distance from the estimate; within the shaded 20 % a quantity counts "
         "as determined. K_u and w_u decide on the gains, and are often surer than the "
-        "parameters.",
-        lambda case: (uncertainty_height(case), uncertainty_height(case)),
+        "parameters. Good: the methods agree on them. Bad: one that should suit the test is far "
+        "off. A star is the truth, where the process was a simulated one.",
+        uncertainty_height,
     ),
 )

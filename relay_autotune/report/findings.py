@@ -118,6 +118,8 @@ def warnings_of(case: Case) -> tuple[str, ...]:
     found = list(case.model.warnings) if case.model is not None else []
     if case.model is not None and case.best_gains is None and case.reason:
         found.insert(0, case.reason)
+    if case.best_gains is not None:
+        found += case.best_gains.warnings
     disturbed = [c.index + 1 for c in case.cycles if c.disturbed]
     if disturbed:
         which = ", ".join(map(str, disturbed))

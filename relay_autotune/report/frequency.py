@@ -154,9 +154,11 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
         lag = np.degrees(np.angle(value))
         # The branch of the angle that is nearest to the model's phase.
         lag += 360.0 * np.round((np.interp(at, w, phase) - lag) / 360.0)
-        style = {"ms": 6, "mfc": PAPER, "mec": INK, "mew": 1.4, "ls": ""}
-        above.plot(at, np.abs(value), "D", label="Fourier integrals over the cycles", **style)
-        below.plot(at, lag, "D", **style)
+        style = {"fmt": "D", "ms": 6, "mfc": PAPER, "mec": INK, "mew": 1.4, "ecolor": INK}
+        std = np.nan_to_num([p.std for p in points])
+        # To first order the two parts' deviations are those of magnitude and angle, too.
+        above.errorbar(at, np.abs(value), yerr=1.96 * std, label="measured, 95 %", **style)
+        below.errorbar(at, lag, yerr=np.degrees(1.96 * std / np.abs(value)), **style)
     if case.model.ultimate:
         gain, frequency = case.model.ultimate
         above.plot(

@@ -14,6 +14,7 @@ from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.identification import FitReport
 from relay_autotune.identification.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival, is_logarithmic
+from relay_autotune.identification.validation import DIFFERENCES, Validation
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome
 from relay_autotune.report.case import (
@@ -134,7 +135,16 @@ def _model_case(m: dict[str, Any], truth: TransferFunction | None) -> ModelCase:
         ),
         warnings=tuple(map(str, m["warnings"])),
         rivals=tuple(Rival(_model(r), _number(r["support"])) for r in m["rivals"]),
+        validation=_validation(m.get("validation")),
+        integrated_error=_number(m.get("integrated_error")),
     )
+
+
+def _validation(v: dict[str, Any] | None) -> Validation | None:
+    if v is None:
+        return None
+    numbers = {name: _number(v[name]) for name in DIFFERENCES}
+    return Validation(reason=str(v["reason"]), **numbers)
 
 
 def _estimate(
@@ -197,7 +207,8 @@ def _gains(g: dict[str, Any]) -> Gains:
 
 
 def _point(p: dict[str, Any]) -> FrequencyPoint:
-    return FrequencyPoint(_number(p["frequency"]), complex(p["real"], p["imaginary"]))
+    value = complex(_number(p["real"]), _number(p["imaginary"]))
+    return FrequencyPoint(_number(p["frequency"]), value, _number(p["std"]))
 
 
 def _number(value: Any) -> float:

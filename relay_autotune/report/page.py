@@ -94,6 +94,7 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
     environment.filters |= {
         "digits": digits,
         "degrees": math.degrees,
+        "signed": lambda value: f"{value:+.2f}",
         "known": math.isfinite,
         "process_text": process_text,
         "mathml": lambda model: Markup(process_mathml(model)),

@@ -38,16 +38,7 @@ COLOURS = {
 INK, MUTED, GRID, PAPER, BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY = (
     light for light, _ in COLOURS.values()
 )
-# For lines that are told apart: colour and dashes.
-LINES = (
-    (BLUE, (6.0, 2.0)),
-    (GREEN, (1.5, 1.5)),
-    (ORANGE, (6.0, 1.5, 1.5, 1.5)),
-    (PURPLE, (10.0, 3.0)),
-    (SKY, (3.0, 1.5)),
-    (MUTED, (8.0, 1.5, 1.5, 1.5, 1.5, 1.5)),
-    (INK, (1.0, 2.5)),
-)
+_VARIABLES = {light: f"var(--{name})" for name, (light, _) in COLOURS.items()}
 
 WIDE, NARROW, SQUARE = 11.2, 4.5, 5.4
 _DPI = 110
@@ -185,19 +176,24 @@ def inline(figure: Figure, prefix: str, label: str) -> str:
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r"<style[^>]*>.*?</style>", "", body, flags=re.DOTALL)
     body = re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL)
-    body = re.sub(r'\bid="', f'id="{prefix}-', body)
-    body = re.sub(r"url\(#", f"url(#{prefix}-", body)
-    body = re.sub(r'(?:xlink:)?href="#', f'href="#{prefix}-', body)
-    body = re.sub(r"-?\d+\.\d{3,}", _shorter, body)
-    body = re.sub(r"font-family: [^;\"]*", "font-family: inherit", body)
-    body = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", body)
-    for name, (light, _) in COLOURS.items():
-        body = re.sub(light, f"var(--{name})", body, flags=re.IGNORECASE)
+    # What stands between the tags is text, and stays as it is.
+    body = re.sub(r"<[^>]*>", lambda tag: _adapted(tag[0], prefix), body)
     body = re.sub(r"\n\s*", "\n", body)
     return (
         f'<svg role="img" aria-label="{label}" viewBox="{box[1]}" '
         f'style="font-family: {_FONT}">{body}'
     )
+
+
+def _adapted(tag: str, prefix: str) -> str:
+    """Return a tag with ids of its own, rounded numbers, and variables for fonts and colours."""
+    tag = re.sub(r'\bid="', f'id="{prefix}-', tag)
+    tag = re.sub(r"url\(#", f"url(#{prefix}-", tag)
+    tag = re.sub(r'(?:xlink:)?href="#', f'href="#{prefix}-', tag)
+    tag = re.sub(r"-?\d+\.\d{3,}", _shorter, tag)
+    tag = re.sub(r"font-family: [^;\"]*", "font-family: inherit", tag)
+    tag = re.sub(r"font: ([\d.]+px) [^;\"]*", r"font-size: \1", tag)
+    return re.sub("|".join(_VARIABLES), lambda colour: _VARIABLES[colour[0]], tag)
 
 
 def _shorter(number: re.Match[str]) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from report_cases import completed, fruitless
+from report_cases import completed, fruitless, only
 
 from relay_autotune.cli import report
 from relay_autotune.document import document, to_json
-from relay_autotune.report.figures import PLATES
+from relay_autotune.report import figures
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -34,20 +34,31 @@ def write_csv(path) -> None:
     path.write_text("time,measurement,command\n" + "\n".join(rows) + "\n")
 
 
-def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path) -> None:
+def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path, monkeypatch) -> None:
+    only(monkeypatch, "experiment", "fit")
+    asked = []
+
+    def analyse(record, **how):
+        # What it would take seconds to find again.
+        asked.append((len(record), how["method"], how["rule"], how["known"].structure))
+        return completed()
+
+    monkeypatch.setattr("relay_autotune.autotune.analyse", analyse)
     write_csv(tmp_path / "log.csv")
     page, folder = tmp_path / "page.html", tmp_path / "figures"
-    facts = ("--structure", "fopdt", "--title", "Tank 7")
+    facts = ("--structure", "fopdt", "--rule", "imc", "--title", "Tank 7")
     arguments = (tmp_path / "log.csv", "-o", page, "--figures", folder, "--format", "svg", *facts)
     status, out, err = run(capsys, *arguments)
     assert (status, err) == (0, "")
+    assert asked == [(len(completed().record), "waveform", "imc", "fopdt")]
     assert out.splitlines()[0] == str(page)
-    assert out.splitlines()[1:] == [str(folder / f"{plate.key}.svg") for plate in PLATES]
+    assert out.splitlines()[1:] == [str(folder / f"{plate.key}.svg") for plate in figures.PLATES]
     assert all(file.read_text().startswith("<?xml") for file in folder.iterdir())
     assert "<title>Tank 7</title>" in page.read_text()
 
 
-def test_results_of_several_recordings_share_a_page(capsys, tmp_path, result) -> None:
+def test_results_of_several_recordings_share_a_page(capsys, tmp_path, result, monkeypatch) -> None:
+    only(monkeypatch, "uncertainty")
     status, _, err = run(capsys, result, "-o", tmp_path / "page.html")
     assert status == 1
     assert err == "report: bad: nothing identified: found no response to the command\n"

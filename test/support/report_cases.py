@@ -6,15 +6,24 @@ import functools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from relay_autotune.autotune import Analysis, analyse
 from relay_autotune.identification import Known
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.report import figures, page
 from relay_autotune.sampled_relay import simulate_sampled_relay
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
+
+
+def only(monkeypatch: pytest.MonkeyPatch, *keys: str) -> None:
+    """Let reports have some of their figures, where a test is about something else."""
+    chosen = tuple(plate for plate in figures.PLATES if plate.key in keys)
+    for module in (figures, page):
+        monkeypatch.setattr(module, "PLATES", chosen)
 
 
 def relay_record(*, outcome: Outcome = Outcome.COMPLETED, reason: str = "") -> Record:
