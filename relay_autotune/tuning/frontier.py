@@ -11,11 +11,14 @@ in the plane of kp and ki,
 
     (kp + c x)^2 + (kp w td + c y - ki/w)^2 < r^2 (x^2 + y^2).
 
-So for given kp, td and tf the integral gain may grow from zero to
+So for given kp, td and tf every frequency forbids the integral gains between
 
-    ki = min over w of w (kp w td + c y - sqrt(r^2 (x^2 + y^2) - (kp + c x)^2)),
+    w (kp w td + c y -+ sqrt(r^2 (x^2 + y^2) - (kp + c x)^2)),
 
-over those frequencies at which the root is real, which is the envelope of the ellipses.
+where the root is real. A loop that is stable without integral action stays so up to the least
+``ki = w (kp w td + y)`` at a frequency with ``kp + x = 0``, where it reaches -1. The largest
+integral gain below that which no frequency forbids is sought. It need not be connected to zero:
+with derivative action a certain integral gain can be what keeps a bound.
 """
 
 from __future__ import annotations
@@ -28,10 +31,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.models import TransferFunction
+from relay_autotune.ultimate import unstable_at_small_gain
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+# Times the crossover: from where on the proportional and derivative action make the loop.
+_BEYOND = 3.0
+# Lower end of a gap over its upper end.
+_NARROW = 0.9
 _NEIGHBOURS = np.array([0.995, 1.0, 1.005])
 
 
@@ -61,12 +69,21 @@ class Responses:
 
     :param models: m of them, all with the sign of the first.
     :param grid: rad/s, shape (n,), increasing.
+    :param crossover: frequency about which loops are closed [rad/s].
     """
 
-    def __init__(self, models: Sequence[TransferFunction], grid: FloatArray) -> None:
+    def __init__(
+        self, models: Sequence[TransferFunction], grid: FloatArray, crossover: float
+    ) -> None:
         self._models = tuple(models)
         self.grid = grid
+        self.crossover = crossover
         self.inverse = self._evaluate(grid)
+        self._poles = np.array([unstable_at_small_gain(m) for m in models])
+        # Their loops pass -1 at w = 0 as the gain grows.
+        self._at_rest = np.array(
+            [m.integrators == 0 and m.gain * m.process_sign < 0.0 for m in models]
+        )
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
         sign = self._models[0].process_sign
@@ -86,40 +103,149 @@ class Responses:
 
     def largest_ki(
         self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
-    ) -> FloatArray:
-        """Return the largest integral gains that the bounds leave.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the largest integral gains that the bounds leave, and how far they may fall.
 
         :param bounds: on the sensitivities.
         :param kp: proportional gains, positive, shape (k,).
         :param td: derivative times [s], shape (k,).
         :param tf: time constants of the filter [s], shape (k,).
-        :return: shape (k, m), of the controllers in each model; not positive: none is allowed;
-            infinite: any is.
+        :return: upper and lower ends of the range, shape (k, m), for the controllers in each
+            model; an upper end not positive: none is allowed; infinite: any above the lower.
         """
-        if not np.any(tf):
-            return self._envelope(bounds, kp, td, self.inverse[None])
-        s = 1j * self.grid * tf[:, None]
-        filtered = (1.0 + s + 0.5 * s * s)[:, None, :] * self.inverse
-        return self._envelope(bounds, kp, td, filtered)
-
-    def _envelope(
-        self, bounds: Bounds, kp: FloatArray, td: FloatArray, inverse: ComplexArray
-    ) -> FloatArray:
-        w = self.grid
+        column = self._felt(bounds, kp, td, tf)
+        w, inverse = self.grid[column], self.inverse[None, :, column]
+        if np.any(tf):
+            s = 1j * w * tf[:, None]
+            inverse = (1.0 + s + 0.5 * s * s)[:, None, :] * inverse
         x, y = inverse.real, inverse.imag
-        square = x * x + y * y
-        p = kp[:, None, None]
-        lead = (kp * td)[:, None, None] * w
-        lowest = np.full((kp.size, inverse.shape[1]), math.inf)
-        for c, r in bounds.circles:
-            room = r * r * square - (p + c * x) ** 2
-            root = np.sqrt(np.maximum(room, 0.0))
-            middle = lead + c * y
-            # An ellipse that lies below ki = 0 forbids nothing.
-            forbidden = (room > 0.0) & (middle + root > 0.0)
-            limit = np.where(forbidden, w * (middle - root), math.inf)
-            lowest = np.minimum(lowest, _least(limit, np.log(w)))
-        return lowest
+        reach = kp[:, None, None] + x
+        height = (kp * td)[:, None, None] * w + y
+        count = self._poles + _gained(x, reach, height)
+        begun = np.where(reach[..., 0] > 0.0, np.where(height[..., 0] > 0.0, -1, 1), 0)
+        count = count + np.where(self._at_rest, begun, 0)
+        stable = np.where(count == 0, _first_crossing(reach, w * height), 0.0)
+        return _largest_ki(bounds, kp, td, w, inverse, stable)
+
+    def _felt(
+        self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
+    ) -> NDArray[np.bool_]:
+        """Return the frequencies at which some loop is large enough to meet a bound.
+
+        Beyond the crossover the integral adds little to the loop.
+        """
+        w = self.grid
+        largest = (kp[:, None] * np.hypot(1.0, td[:, None] * w)).max(axis=0)
+        smallest = np.abs(self.inverse).min(axis=0) * np.sqrt(1.0 + 0.25 * (w * tf.min()) ** 4)
+        room = min(c - r for c, r in bounds.circles)
+        return np.asarray((w < _BEYOND * self.crossover) | (2.0 * largest > room * smallest))
+
+
+def _gained(x: FloatArray, reach: FloatArray, height: FloatArray) -> NDArray[np.int_]:
+    """Return how many poles kp and kd bring to the right half plane, shape (k, m).
+
+    A pair for each time the loop crosses the negative real axis left of -1 with falling phase,
+    and one pair less with rising phase.
+
+    :param x: real part of 1/(F G), shape (k or 1, m, n).
+    :param reach: kp + x, positive left of -1 where x is negative, shape (k, m, n).
+    :param height: kp w td + y, positive above the axis, shape (k, m, n).
+    """
+    above = height > 0.0
+    left = (x < 0.0) & (reach > 0.0)
+    falls = (above[..., :-1] & ~above[..., 1:] & left[..., 1:]).sum(axis=-1)
+    rises = (~above[..., :-1] & above[..., 1:] & left[..., 1:]).sum(axis=-1)
+    return np.asarray(2 * (falls - rises))
+
+
+def _largest_ki(
+    bounds: Bounds,
+    kp: FloatArray,
+    td: FloatArray,
+    w: FloatArray,
+    inverse: ComplexArray,
+    stable: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the envelope of the ellipses: upper and lower ends of the range, shape (k, m).
+
+    :param inverse: 1/(F G), shape (k or 1, m, n).
+    :param stable: integral gains up to which the loop is stable, shape (k, m).
+    """
+    x, y = inverse.real, inverse.imag
+    square = x * x + y * y
+    p = kp[:, None, None]
+    lead = (kp * td)[:, None, None] * w
+    edges = []
+    for c, r in bounds.circles:
+        room = r * r * square - (p + c * x) ** 2
+        root = w * np.sqrt(np.maximum(room, 0.0))
+        middle = w * (lead + c * y)
+        low, high = middle - root, middle + root
+        # Nor does an ellipse matter that lies below ki = 0, or where no loop is stable.
+        forbids = (room > 0.0) & (high > 0.0) & (low < stable[..., None])
+        column = np.asarray(forbids.any(axis=(0, 1)))
+        # The neighbours show where the envelope bends.
+        column[1:] |= column[:-1].copy()
+        column[:-1] |= column[1:].copy()
+        forbids = forbids[..., column]
+        edges.append(
+            (
+                np.log(w[column]),
+                np.where(forbids, low[..., column], math.inf),
+                np.where(forbids, high[..., column], -math.inf),
+            )
+        )
+    limit, below = _highest_gap(edges, stable)
+    # Between the frequencies the envelope is a little lower.
+    refined = limit
+    for log_w, low, _ in edges:
+        if log_w.size > 2:
+            above = np.where(low > 0.5 * (below + limit)[..., None], low, math.inf)
+            refined = np.minimum(refined, _least(above, log_w))
+    return np.where(limit > 0.0, refined, limit), below
+
+
+def _first_crossing(distance: FloatArray, ki: FloatArray) -> FloatArray:
+    """Return the least positive integral gain at which a closed-loop pole is on the axis.
+
+    :param distance: kp + x, zero where some ki brings the loop to -1, shape (k, m, n).
+    :param ki: which one that would be, shape (k, m, n).
+    :return: shape (k, m); infinite: none.
+    """
+    before, after = distance[..., :-1], distance[..., 1:]
+    crosses = (before > 0.0) != (after > 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = before / (before - after)
+    at = ki[..., :-1] + share * (ki[..., 1:] - ki[..., :-1])
+    return np.where(crosses & (at > 0.0), at, math.inf).min(axis=-1)
+
+
+def _highest_gap(
+    edges: list[tuple[FloatArray, FloatArray, FloatArray]], start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of the highest gap below ``start`` that no interval reaches into.
+
+    Gaps that are narrow only come of the distance between frequencies.
+
+    :param edges: abscissae, lower and upper ends of intervals, the ends of shape (k, m, n).
+    :param start: shape (k, m); infinite: above all intervals.
+    :return: upper and lower ends, shape (k, m); an upper one not positive: there is none.
+    """
+    value = start
+    while True:
+        lower, below = value, np.zeros(value.shape)
+        for _, low, high in edges:
+            under = low < value[..., None]
+            inside = under & (high >= value[..., None])
+            found = np.where(inside, low, math.inf).min(axis=-1, initial=math.inf)
+            lower = np.minimum(lower, found)
+            below = np.maximum(below, np.where(under, high, 0.0).max(axis=-1, initial=0.0))
+        covered = lower < value
+        narrow = ~covered & (below > _NARROW * value)
+        moved = (covered | narrow) & (value > 0.0)
+        if not np.any(moved):
+            return value, below
+        value = np.where(moved, np.where(narrow, below, lower), value)
 
 
 def _least(values: FloatArray, x: FloatArray) -> FloatArray:

@@ -34,12 +34,14 @@ _DEPTH = 1e4
 _GAINS = {False: 64, True: 32}
 # Derivative times, in periods of the ultimate point.
 _TIMES = np.geomspace(3e-3, 1.0, 14)
-_FIRST_STEP, _LAST_STEP, _SHRINK, _GROW = 0.12, 1e-3, 0.6, 1.5
-_DIRECTIONS = 10
+_FIRST_STEP, _SECOND_STEP, _LAST_STEP, _SHRINK, _GROW = 0.12, 0.08, 1e-3, 0.65, 1.5
+_DIRECTIONS = 16
 _TRIED_AT_ONCE = 40
 # What a bound may exceed 1 by.
 _LEAST_EXCESS, _LARGEST_EXCESS, _EXCESS_TOLERANCE = 0.01, 100.0, 0.01
 _MARGIN = 1.2
+# How far above the lower end of their range integral gains have to be.
+_CLEAR = 1.02
 # Bounds are kept to this part, after so many additions to the grid.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
@@ -129,12 +131,15 @@ class Search:
     @cached_property
     def responses(self) -> Responses:
         """Response of the process, at the frequencies where bounds are tested."""
-        return Responses((self.model,), design_grid(self.model, self.frequency))
+        return Responses((self.model,), design_grid(self.model, self.frequency), self.frequency)
 
     @cached_property
     def around(self) -> Responses | None:
         """Responses of the models around the process."""
-        return Responses(self.models, self.responses.grid[::2]) if self.models else None
+        if not self.models:
+            return None
+        grid = self.responses.grid
+        return Responses(self.models, grid[grid > 0.03 * self.frequency], self.frequency)
 
     def optimum(self, bounds: Bounds, *, derivative: bool) -> Optimum | None:
         """Return the controller of least IAE, or None where none keeps the bounds.
@@ -195,20 +200,22 @@ class Search:
         zero = np.zeros(9)
         while step > 1e-5:
             kp = best * np.exp(step * np.linspace(-1.0, 1.0, 9))
-            best = float(kp[np.argmax(self._limits(bounds, kp, zero, zero))])
-            step /= 4.0
-        gains = np.array([best])
-        ki = self._limits(bounds, gains, zero[:1], zero[:1])
-        return Candidates(gains, ki, zero[:1], zero[:1]).controller(0, self.model.process_sign)
+            ki, _ = self._limits(bounds, kp, zero, zero)
+            k = int(np.argmax(ki))
+            best, step = float(kp[k]), step / 4.0
+        return Candidates(kp, ki, zero, zero).controller(k, self.model.process_sign)
 
     def _times(self, derivative: bool) -> FloatArray:
         return _TIMES * 2.0 * math.pi / self.frequency if derivative else np.zeros(1)
 
-    def scan(self, bounds: Bounds, times: FloatArray) -> Candidates | None:
+    def scan(
+        self, bounds: Bounds, times: FloatArray, gains: tuple[float, float] = (0.0, math.inf)
+    ) -> Candidates | None:
         """Return controllers all over the stable range that keep the bounds; None: none does.
 
         :param bounds: on the sensitivities.
         :param times: derivative times [s], shape (n,); one of 0: PI.
+        :param gains: least and largest proportional gain to look at.
         """
         derivative = bool(np.any(times))
         count = _GAINS[derivative]
@@ -220,13 +227,15 @@ class Search:
             low, high = span
             if math.isinf(high):
                 high = self._largest_kp
-            kp.append(np.geomspace(max(low, high / _DEPTH), high, count + 1)[:-1])
-            td.append(np.full(count, time))
+            low, high = max(low, high / _DEPTH, gains[0]), min(high, gains[1])
+            if low < high:
+                kp.append(np.geomspace(low, high, count + 2)[1:-1])
+                td.append(np.full(count, time))
         if not kp:
             return None
         points = [np.log(np.concatenate(kp))]
         if derivative:
-            points.append(np.log(np.concatenate(td)))
+            points.append(points[0] + np.log(np.concatenate(td)))
         found = self._at(bounds, np.column_stack((*points, np.zeros(points[0].size))))
         found = found[found.ki > 0.0]
         return found if found.kp.size else None
@@ -241,19 +250,20 @@ class Search:
 
     def _least_bound(self, bounds: Callable[[float], Bounds], derivative: bool) -> float:
         low, high = math.log(_LEAST_EXCESS), math.log(_LARGEST_EXCESS)
-        times = self._times(derivative)
+        times, gains = self._times(derivative), (0.0, math.inf)
         found = self.scan(bounds(1.0 + math.exp(high)), times)
         if found is None:
             return math.inf
         while high - low > _EXCESS_TOLERANCE:
             middle = 0.5 * (low + high)
-            found = self.scan(bounds(1.0 + math.exp(middle)), times)
+            found = self.scan(bounds(1.0 + math.exp(middle)), times, gains)
             if found is None:
                 low = middle
                 continue
             high = middle
+            # The tighter the bound, the narrower the range of gains and times that attain it.
+            gains = float(found.kp.min()) / _MARGIN, float(found.kp.max()) * _MARGIN
             if derivative:
-                # The tighter the bound, the narrower the range of times that attain it.
                 ends = float(found.td.min()) / _MARGIN, float(found.td.max()) * _MARGIN
                 times = np.geomspace(*ends, _TIMES.size)
         return 1.0 + math.exp(high)
@@ -272,31 +282,33 @@ class Search:
             iaes = self._iaes(scanned[rest])
             if iaes.min() < iae:
                 best, iae = int(rest[np.argmin(iaes)]), float(iaes.min())
-        td = [math.log(scanned.td[best])] if scanned.td[best] > 0.0 else []
-        return np.array([math.log(scanned.kp[best]), *td, 0.0]), iae
+        kp, kd = scanned.kp[best], scanned.kp[best] * scanned.td[best]
+        return np.log([kp, *([kd] if kd > 0.0 else []), 1.0]), iae
 
     def descend(self, bounds: Bounds, point: FloatArray, iae: float) -> tuple[FloatArray, float]:
         """Return the optimum near a point, and its IAE.
 
         :param bounds: on the sensitivities.
-        :param point: logarithms of kp, of td (PID only), and of the share of the largest integral
+        :param point: logarithms of kp, of kd (PID only), and of the share of the largest integral
             gain that is used.
         :param iae: there [y s/u].
         """
         free = point.size - 1
-        for size in (free, free + 1):
+        for size, first in ((free, _FIRST_STEP), (free + 1, _FIRST_STEP), (free, _SECOND_STEP)):
             rng = np.random.default_rng(0)
-            step = _FIRST_STEP
+            step, last = first, np.zeros((0, point.size))
             while step > _LAST_STEP:
                 moves = np.zeros((_DIRECTIONS if size > 1 else 0, point.size))
                 moves[:, :size] = rng.standard_normal((len(moves), size))
                 moves /= np.linalg.norm(moves, axis=1)[:, None]
                 axes = np.eye(point.size)[:size]
-                tried = point + step * np.concatenate((axes, -axes, moves))
+                tried = point + step * np.concatenate((axes, -axes, moves, last))
                 tried[:, -1] = np.minimum(tried[:, -1], 0.0)
                 iaes = self._worth(bounds, tried, iae)
                 best = int(np.argmin(iaes))
                 if iaes[best] < iae * (1.0 - 1e-7):
+                    # Along a ridge the way that led on once leads on again.
+                    last = (tried[best] - point)[None] / step
                     point, iae, step = tried[best], float(iaes[best]), step * _GROW
                 else:
                     step *= _SHRINK
@@ -323,22 +335,29 @@ class Search:
     def _at(self, bounds: Bounds, points: FloatArray) -> Candidates:
         """Return the controllers of points, those without a usable filter with ki = -inf."""
         kp = np.exp(points[:, 0])
-        td = np.exp(points[:, 1]) if points.shape[1] > 2 else np.zeros(kp.size)
+        td = np.exp(points[:, 1] - points[:, 0]) if points.shape[1] > 2 else np.zeros(kp.size)
         tf = self._filters(kp, td)
         usable = np.isfinite(tf)
         ki = np.full(kp.size, -math.inf)
-        ki[usable] = self._limits(bounds, kp[usable], td[usable], tf[usable])
-        return Candidates(kp, ki * np.exp(points[:, -1]), td, tf)
+        upper, lower = self._limits(bounds, kp[usable], td[usable], tf[usable])
+        chosen = upper * np.exp(points[usable, -1])
+        ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)
+        return Candidates(kp, ki, td, tf)
 
     def _limits(
         self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
-    ) -> FloatArray:
-        """Return the largest integral gains, shape (k,)."""
-        limits = self.responses.largest_ki(bounds, kp, td, tf)[:, 0]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the largest integral gains and the least, shape (k,)."""
+        found = self.responses.largest_ki(bounds, kp, td, tf)
+        upper, lower = found[0][:, 0], found[1][:, 0]
         if self.around is None or not kp.size:
-            return limits
-        others = np.sort(self.around.largest_ki(bounds, kp, td, tf), axis=1)
-        return np.minimum(limits, others[:, allowed_outside(len(self.models))])
+            return upper, lower
+        highs, lows = self.around.largest_ki(bounds, kp, td, tf)
+        outside = allowed_outside(len(self.models))
+        upper = np.minimum(upper, np.sort(highs, axis=1)[:, outside])
+        within = ((highs >= upper[:, None]) & (lows < upper[:, None])).sum(axis=1)
+        upper = np.where(within >= len(self.models) - outside, upper, -math.inf)
+        return upper, np.maximum(lower, np.sort(lows, axis=1)[:, -1 - outside])
 
     def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
         """Return the filter that each controller needs [s], shape (k,)."""
@@ -362,7 +381,10 @@ def design_grid(model: TransferFunction, frequency: float) -> FloatArray:
     :param model: the process.
     :param frequency: about which the loop is closed [rad/s].
     """
-    parts = [np.geomspace(1e-3 * frequency, 100.0 * frequency, 300)]
+    parts = [
+        frequency * np.geomspace(low, high, count)
+        for low, high, count in ((1e-3, 0.1, 70), (0.1, 10.0, 220), (10.0, 100.0, 60))
+    ]
     if model.dead_time > 0.0:
         # With derivative action a lag of first order lets every turn pass alike, up to the filter.
         flat = len(model.time_constants) + model.integrators - len(model.zeros) <= 1

@@ -42,7 +42,7 @@ def test_the_largest_integral_gain(name, inputs, exact, tol):
     assert found.i >= inputs["Kc"] / inputs["Ti"] * (1.0 - 2e-4)
     assert _ms_of(found, model) == pytest.approx(ms, abs=1e-3)
     if "ex4" not in name or ms > 1.4:
-        assert found.kc == pytest.approx(inputs["Kc"], rel=0.02)
+        assert found.kc == pytest.approx(inputs["Kc"], rel=0.05)
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), LEAST, ids=[c[0] for c in LEAST])
