@@ -92,8 +92,16 @@ class LoopEnds:
 
     @property
     def is_connected(self) -> bool:
-        """True if a present controller's commands come."""
-        return self.handover.is_connected(self._value("controller_timeout"))
+        """True if a present controller's commands come on controller_command."""
+        return not self._takeover and self.handover.is_connected(self._value("controller_timeout"))
+
+    def mean_command(self) -> float:
+        """Return the mean of the present controller's last commands [u]; NaN: there is none.
+
+        In takeover the controller has fallen silent by then, and its last commands still count.
+        """
+        known = self._takeover or self.is_connected
+        return self.handover.mean() if known else math.nan
 
     def problem(self) -> str:
         """Return what an operator must act on, "" if nothing."""
@@ -124,7 +132,7 @@ class LoopEnds:
         :param experiment: the tune.
         :param gives_back: True if the controller gets it back at once, however the tune ends.
         """
-        connected = self.is_connected and not self._takeover
+        connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
         self.commanded = math.nan
         self.handover.take_over()

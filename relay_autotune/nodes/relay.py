@@ -179,11 +179,10 @@ class RelayNode(ServedNode):
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
         parameters.validate()
-        connected = self._loop.is_connected
-        mean = self._loop.handover.mean() if connected else math.nan
+        mean = self._loop.mean_command()
         baseline = baseline_from(values["baseline"], mean, self._held)
         parameters.validate(baseline)
-        policy = policy_from(values, connected=connected)
+        policy = policy_from(values, connected=self._loop.is_connected)
         require_connections(self, self._ends, self._counter.age, values["measurement_timeout"])
         self._loop.require_alone()
         return parameters, baseline, policy

@@ -316,3 +316,33 @@ def test_stamped_sensors_steps_of_their_clock_and_arrays_of_commands(rig: Rig) -
     offset = -5.0
     ended = rig.until(lambda: len(experiments) > 1 and experiments[-1], "the record")
     assert "time went backwards" in ended.reason
+
+
+def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
+    from_relay = rig.listen("command", Float64, RELIABLE)
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    controller = rig.node.create_publisher(Float64, "command", 10)
+    sensor = rig.node.create_publisher(Float64, "measurement", 100)
+    rig.relay(path="takeover", amplitude=0.5, settle_time=0.3, controller_timeout=0.3)
+    rig.node.create_timer(PERIOD, lambda: sensor.publish(Float64(data=math.sin(len(from_relay)))))
+    rig.until(lambda: controller.get_subscription_count() == 2, "the relay")
+    controller.publish(Float64(data=BASELINE))
+    # Before the tune only the controller is heard.
+    rig.run_for(0.4)
+    assert {m.data for m in from_relay} <= {BASELINE}
+    controller.publish(Float64(data=BASELINE))
+    rig.run_for(0.05)
+    assert "is being commanded by another node" in rig.ask_for_tune(dry_run=True).reason
+    rig.run_for(0.4)
+    # Its last command is the baseline.
+    started = rig.tune()
+    assert f"about the baseline {BASELINE:g}" in started.reason
+    rig.until(lambda: any(m.data == BASELINE + 0.65 for m in from_relay), "the kick")
+    controller.publish(Float64(data=0.123))
+    ended = rig.until(lambda: experiments, "the record")[-1]
+    assert "another node commanded 0.123 on /command" in ended.reason
+    # The controller has the loop again, so the node is silent.
+    rig.run_for(0.2)
+    count = len(from_relay)
+    rig.run_for(0.3)
+    assert len(from_relay) == count
