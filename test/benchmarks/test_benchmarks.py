@@ -22,6 +22,9 @@ QUICK = {
     "structure_choice": ("--quick",),
     "coverage": ("--quick",),
     "ah_batch": ("--quick",),
+    "bag_reading": ("--quick",),
+    "fuzz_bags": ("--quick",),
+    "fleet_time": ("--quick",),
     "paper_designs": ("--quick",),
 }
 
