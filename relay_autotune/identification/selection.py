@@ -159,12 +159,19 @@ class Selection:
             *("lag_n_zero", "sopdt_zero", "ipdt", "integrator_lag", "integrator_inverse"),
             *("unstable_fopdt", "unstable_sopdt"),
         )
-        # Drift and initial state are decided with the better of two flexible structures.
+        # Drift and initial state are decided with the better of two flexible structures, and with
+        # an integrator, to which a command off its balance is a drift.
         simple = [c for name in ("fopdt", "sopdt") if (c := self.fit(name)) is not None]
+        integrator = self.fit("ipdt")
         if not simple:
             return []
         whole = self._problem
-        base = self.with_nuisances(min(simple, key=lambda c: c.criterion)).problem
+        decided = self.with_nuisances(min(simple, key=lambda c: c.criterion))
+        if integrator is not None:
+            other = self.with_nuisances(integrator)
+            decided = min(decided, other, key=lambda c: c.criterion)
+            simple.append(integrator)
+        base = decided.problem
         found = self._fit_beside(base, names, simple)
         if found and (base.drift or base.relaxation):
             # What these two leave unexplained may pass for a drift: the best one is asked again.
