@@ -11,6 +11,7 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from std_msgs.msg import Float64
 
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import Reader, command_setter
@@ -31,6 +32,7 @@ class Ends:
     :param cycles_kept: cycles that wait for who comes late.
     :param reader: how the measurement is read from its messages.
     :param command_type: message type of the command.
+    :param relay_on_setpoint: True if the relay publishes set-points.
     """
 
     def __init__(
@@ -42,12 +44,19 @@ class Ends:
         cycles_kept: int,
         reader: Reader,
         command_type: str,
+        relay_on_setpoint: bool = False,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
         # Each event that an end watches costs every turn of the executor; incompatible ends are
         # named by /diagnostics and by the answer to a start.
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
+        self.setpoint = None
+        if relay_on_setpoint:
+            self.setpoint = node.create_publisher(
+                Float64, "setpoint", quality.COMMAND, event_callbacks=quiet
+            )
+        self._setpoint_message = Float64()
         self._message, self._write = command_setter(command_type)
         self.command = node.create_publisher(
             type(self._message),
@@ -104,14 +113,27 @@ class Ends:
         self._write(self._message, command)
         self._publish(self._message)
 
-    def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
-        """Publish a command until every subscriber has acknowledged it.
+    def send_setpoint(self, setpoint: float) -> None:
+        """Publish a set-point."""
+        assert self.setpoint is not None
+        self._setpoint_message.data = setpoint
+        self.setpoint.publish(self._setpoint_message)
 
-        :param command: the command [u].
+    def relay(self, value: float) -> None:
+        """Publish what the relay answers: a command, or a set-point."""
+        if self.setpoint is None:
+            self.send(value)
+        else:
+            self.send_setpoint(value)
+
+    def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
+        """Publish what the relay answers until every subscriber has acknowledged it.
+
+        :param command: the command [u], or the set-point [y].
         :return: how often it was published, and whether it was acknowledged.
         """
         for count in range(1, REPEATS + 1):
-            self.send(command)
-            if self.command.wait_for_all_acked(REPEAT_SAFE):
+            self.relay(command)
+            if (self.setpoint or self.command).wait_for_all_acked(REPEAT_SAFE):
                 return count, True
         return REPEATS, False

@@ -88,7 +88,8 @@ class LoopEnds:
     @property
     def is_driven(self) -> bool:
         """True while somebody else's commands reach the actuator."""
-        return self._driven and self._experiment is None
+        tuning = self._experiment is not None and self._ends.setpoint is None
+        return self._driven and not tuning
 
     @property
     def is_connected(self) -> bool:
@@ -110,8 +111,13 @@ class LoopEnds:
     def require_alone(self) -> None:
         """Refuse a start while somebody else commands the actuator.
 
-        :raises NotReadyError: with who does.
+        :raises NotReadyError: with who does; or with what a relay on the set-point lacks.
         """
+        if self._ends.setpoint is not None and not self.is_connected:
+            raise NotReadyError(
+                "relay_on is setpoint, but no controller_command comes: connect the controller of "
+                "the present loop, with path passthrough"
+            )
         if self._takeover:
             if self._driven and self.handover.is_connected(self._value("controller_timeout")):
                 raise NotReadyError(
@@ -135,7 +141,8 @@ class LoopEnds:
         connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
         self.commanded = math.nan
-        self.handover.take_over()
+        if self._ends.setpoint is None:
+            self.handover.take_over()
         checks: list[Callable[[], str]] = []
         if not self._takeover:
             checks.append(
@@ -149,7 +156,8 @@ class LoopEnds:
             checks.append(Silence(f"no command on {topic}", timeout, lambda: self.handover.age))
         timeout = self._value("feedback_timeout")
         self._follow = None
-        if time.monotonic() - self._feedback_at < timeout:
+        fed_back = time.monotonic() - self._feedback_at < timeout
+        if fed_back and self._ends.setpoint is None:
             self._follow = FollowWatch(self._tolerance(experiment), timeout)
             checks.append(
                 Silence(
@@ -159,7 +167,7 @@ class LoopEnds:
                 )
             )
         self._guard.begin(checks)
-        self._hold.publish(Bool(data=True))
+        self._hold.publish(Bool(data=self._ends.setpoint is None))
 
     def _tolerance(self, experiment: RelayExperiment) -> float:
         given = float(self._value("feedback_tolerance"))
@@ -175,7 +183,7 @@ class LoopEnds:
         self._hold.publish(Bool(data=False))
         self._experiment, self._follow = None, None
         period = experiment.cycles[-1].period if experiment.cycle_count else 0.0
-        left = math.nan if self._gives_back else command
+        left = math.nan if self._gives_back or self._ends.setpoint is not None else command
         self.handover.give_back(left, self._value("return_time") or period)
         self._driven = self._driven and not self._takeover
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.levels import Levels
 from relay_autotune.nodes.ends import Ends
+from relay_autotune.nodes.parameters import merged
 from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber
+from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.relay import SafePolicy
 from relay_autotune.relay_parameters import ExperimentParameters
 
@@ -111,3 +114,27 @@ def plan_of(parameters: ExperimentParameters, baseline: float, policy: SafePolic
     if policy.give_back:
         return f"{plan}, then back to controller_command"
     return f"{plan}, then proportional control holds the process" if policy.hold else plan
+
+
+def why_not_settable(node: Node, changes: Sequence[RosParameter], running: str) -> str:
+    """Return why parameters cannot be changed now, "" if they can.
+
+    :param node: relay_node.
+    :param changes: what is about to be set.
+    :param running: id of the tune that runs; empty: none.
+    """
+    names = {entry.name for entry in TUNE_PARAMETERS}
+    if running and any(change.name in names for change in changes):
+        return (
+            f"parameters stay as they are while tune {running} runs; wait for its end or call "
+            f"{node.get_fully_qualified_name()}/abort"
+        )
+    try:
+        values = merged(node, TUNE_PARAMETERS, changes)
+        experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
+        # Without an amplitude, which a request may bring, the rest is judged at the start.
+        if experiment["amplitude"] > 0.0:
+            ExperimentParameters(**experiment).validate()
+    except ParameterError as error:
+        return str(error)
+    return ""

@@ -17,14 +17,14 @@ from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from relay_autotune.errors import ParameterError, RelayAutotuneError
+from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
-from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.nodes.quality import why_no_publisher
 from relay_autotune.nodes.readiness import (
     NotReadyError,
@@ -32,10 +32,18 @@ from relay_autotune.nodes.readiness import (
     plan_of,
     policy_from,
     require_connections,
+    why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
-from relay_autotune.nodes.reports import Counter, cycle_message, experiment_message, state_values
+from relay_autotune.nodes.reports import (
+    Counter,
+    cycle_message,
+    experiment_message,
+    state_values,
+    why_enough,
+)
 from relay_autotune.nodes.session import Session
+from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
 from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
@@ -84,8 +92,10 @@ class RelayNode(ServedNode):
             cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
             reader=self._reader,
             command_type=fixed["command_type"],
+            relay_on_setpoint=fixed["relay_on"] == "setpoint",
         )
-        self._send = self._ends.send
+        self._send, self._relay = self._ends.send, self._ends.relay
+        self._on_setpoint = fixed["relay_on"] == "setpoint"
         self._loop = LoopEnds(
             self, self._ends, takeover=fixed["path"] == "takeover", stop=self._stop_now
         )
@@ -117,7 +127,7 @@ class RelayNode(ServedNode):
             command = session.answer(value, info)
             if command is not None:
                 # Nothing comes before this: the actuator waits for it.
-                self._send(command)
+                self._relay(command)
                 session.answered()
                 self._loop.commanded = command
                 experiment = session.experiment
@@ -179,8 +189,11 @@ class RelayNode(ServedNode):
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
         parameters.validate()
-        mean = self._loop.mean_command()
-        baseline = baseline_from(values["baseline"], mean, self._held)
+        if self._on_setpoint:
+            parameters, baseline = on_setpoint(parameters)
+        else:
+            mean = self._loop.mean_command()
+            baseline = baseline_from(values["baseline"], mean, self._held)
         parameters.validate(baseline)
         policy = policy_from(values, connected=self._loop.is_connected)
         require_connections(self, self._ends, self._counter.age, values["measurement_timeout"])
@@ -190,11 +203,13 @@ class RelayNode(ServedNode):
     def _start(
         self, parameters: ExperimentParameters, baseline: float, policy: SafePolicy
     ) -> tuple[str, str]:
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        identity = f"{stamp}_{secrets.token_hex(4)}"
+        identity = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{secrets.token_hex(4)}"
         clock = self.get_clock()
         converged = self.get_parameter("stop_when").value == "converged"
-        session = Session(
+        kind: Callable[..., Session] = Session
+        if self._on_setpoint:
+            kind = partial(SetpointSession, actual=lambda: self._loop.handover.last)
+        session = kind(
             RelayExperiment(
                 parameters, baseline, identity, policy=policy, until_converged=converged
             ),
@@ -224,10 +239,13 @@ class RelayNode(ServedNode):
         session.published_cycles = session.experiment.cycle_count
 
     def _publish_cycle(self, session: Session, index: int) -> None:
+        self._action.tell(session.experiment)
+        if self._on_setpoint:
+            # What the controller commanded is known at the end.
+            return
         message = cycle_message(session, index)
         self._ends.cycles.publish(message)
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
-        self._action.tell(session.experiment)
 
     def _watch(self) -> None:
         session, watchdog = self._session, self._watchdog
@@ -250,32 +268,21 @@ class RelayNode(ServedNode):
         acknowledged = self._stop(session, "aborted on request")
         response.success = True
         response.message = (
-            f"tune {session.id} aborted; the safe command {self._held:g} is out"
+            f"tune {session.id} aborted; the safe command "
+            f"{session.experiment.after_end(math.nan):g} is out"
             f"{'' if acknowledged else ', but was not acknowledged'}"
         )
         return response
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        names = {entry.name for entry in TUNE_PARAMETERS}
-        try:
-            if self._session is not None and any(c.name in names for c in changes):
-                raise ParameterError(
-                    f"parameters stay as they are while tune {self._session.id} runs; "
-                    f"wait for its end or call {self._name}/abort"
-                )
-            values = merged(self, TUNE_PARAMETERS, changes)
-            experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
-            # Without an amplitude, which a request may bring, the rest is judged at the start.
-            if experiment["amplitude"] > 0.0:
-                ExperimentParameters(**experiment).validate()
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+        running = "" if self._session is None else self._session.id
+        problem = why_not_settable(self, changes, running)
+        return SetParametersResult(successful=not problem, reason=problem)
 
     def _on_result(self, name: str, message: Any) -> None:
         session = self._session
-        now = int(self.get_clock().now().nanoseconds)
         self._action.note(name, message)
+        now = int(self.get_clock().now().nanoseconds)
         self._recordings.message(message.experiment_id, name, now, message)
         if session is None or name != "transfer_function" or message.experiment_id != session.id:
             return
@@ -284,15 +291,10 @@ class RelayNode(ServedNode):
             self._end_if_confident(session, message)
 
     def _end_if_confident(self, session: Session, model: Any) -> None:
-        wanted = self.get_parameter("confidence").value
-        gain = abs(model.ultimate_gain)
-        found = 1.96 * model.ultimate_gain_std / gain if gain > 0.0 else math.nan
-        if not found <= wanted or not session.experiment.cycle_count:
+        reason = why_enough(session, model, self.get_parameter("confidence").value)
+        if not reason:
             return
-        command = session.experiment.conclude(
-            f"after {session.experiment.cycle_count} cycles the 95 % interval of K_u is within "
-            f"{found:.3g} of it, as narrow as asked, {wanted:g}"
-        )
+        command = session.experiment.conclude(reason)
         self._send_safe(command)
         self._leave(session, command)
 
@@ -304,8 +306,7 @@ class RelayNode(ServedNode):
 
     def _stop(self, session: Session, reason: str) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
-        command = session.experiment.abort(reason)
-        acknowledged = self._send_safe(command)
+        acknowledged = self._send_safe(command := session.experiment.abort(reason))
         self._leave(session, command)
         return acknowledged
 
@@ -318,8 +319,8 @@ class RelayNode(ServedNode):
 
     def _leave(self, session: Session, command: float) -> None:
         # The safe command is out. All that takes time waits until the callback has returned.
-        self._held = command
-        self._after = session.experiment.after_end
+        if not self._on_setpoint:
+            self._held, self._after = command, session.experiment.after_end
         self._session = None
         session.lost_samples = self._counter.lost if self._counted else 0
         if self._watchdog is not None:
@@ -390,8 +391,8 @@ class RelayNode(ServedNode):
             values |= state_values(session, self._counter.lost if self._counted else 0)
         summary = self._summary if session is None else f"tune {session.id} is running"
         now = int(self.get_clock().now().nanoseconds)
-        name = self.get_fully_qualified_name().lstrip("/")
-        self._ends.diagnostics.publish(diagnostics(name, now, problems, summary, values))
+        message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)
+        self._ends.diagnostics.publish(message)
 
 
 def main(args: list[str] | None = None) -> int:

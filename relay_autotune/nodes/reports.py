@@ -113,3 +113,21 @@ def state_values(session: Session, lost: int) -> dict[str, object]:
         "lost samples": lost,
         "clock drift [s]": session.clocks.drift,
     }
+
+
+def why_enough(session: Session, model: Any, wanted: float) -> str:
+    """Return why a tune has found out what it should, "" if it has not.
+
+    :param session: the tune.
+    :param model: the newest `TransferFunction` message of it.
+    :param wanted: half width of the 95 % interval of K_u, as a fraction of it.
+    """
+    gain = abs(model.ultimate_gain)
+    found = 1.96 * model.ultimate_gain_std / gain if gain > 0.0 else math.nan
+    count = session.experiment.cycle_count
+    if not found <= wanted or not count:
+        return ""
+    return (
+        f"after {count} cycles the 95 % interval of K_u is within {found:.3g} of it, as narrow as "
+        f"asked, {wanted:g}"
+    )

@@ -131,6 +131,14 @@ FIXED_PARAMETERS = (
         choices=("passthrough", "takeover"),
     ),
     NodeParameter(
+        "relay_on",
+        "command",
+        "",
+        "command: the relay commands the actuator; setpoint: it publishes setpoint, and the "
+        "present loop stays closed, its controller connected by controller_command.",
+        choices=("command", "setpoint"),
+    ),
+    NodeParameter(
         "measurement_type",
         FLOAT64,
         "",

@@ -187,3 +187,39 @@ rclpy.spin(node)
     assert values() == [2.0, 0.5, 0.25]
     assert trigger(rig, "revert").success
     assert values() == [1.0, 1.0, 1.0]
+
+
+def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
+    commands = rig.listen("command", Float64, RELIABLE)
+    wanted = rig.listen("controller_command", Float64, RELIABLE)
+    setpoints = rig.listen("setpoint", Float64, RELIABLE)
+    models = rig.listen("transfer_function", TransferFunction)
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    rig.plant(**PLANT)
+    rig.relay(
+        use_sim_time=True,
+        relay_on="setpoint",
+        setpoint=5.0,
+        amplitude=0.4,
+        settle_time=1.0,
+        measurement_timeout=3.0,
+        controller_timeout=3.0,
+    )
+    rig.start("controller_node", **CONTROLLER)
+    rig.identifier(use_sim_time=True)
+    rig.until(lambda: len(wanted) > 300 and len(commands) > 300, "a closed loop")
+    rig.tune()
+    rig.until(lambda: models and models[-1].final, "the model")
+    (ended,) = experiments
+    assert ended.outcome == RelayExperiment.COMPLETED, ended.reason
+    # The relay moved the set-point, within its amplitude and bias, and put it back.
+    levels = {round(m.data, 9) for m in setpoints}
+    assert levels == {4.72, 5.0, 5.52}
+    assert setpoints[-1].data == 5.0
+    # Meanwhile the controller's commands went through, and they are what was recorded.
+    assert set(ended.command) <= {m.data for m in wanted}
+    assert ended.settings.setpoint == 5.0
+    assert ended.settings.baseline == pytest.approx(1.0, abs=0.03)
+    # So the model is that of the process, not of the closed loop.
+    assert models[-1].gain == pytest.approx(2.0, rel=0.1)
+    assert models[-1].dead_time == pytest.approx(0.4, abs=0.06)
