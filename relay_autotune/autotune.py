@@ -21,6 +21,7 @@ from relay_autotune.identification import (
     method_named,
 )
 from relay_autotune.identification.assessment import assess
+from relay_autotune.identification.checks import unequal_amplitudes
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record
@@ -167,6 +168,9 @@ def analyse_jointly(
         chosen = identify_jointly(records, method, known)
     except RelayAutotuneError as error:
         return Analysis(first, cycles, reason=_with_outcome(first, str(error)))
+    told = unequal_amplitudes(records, chosen.model)
+    if told:
+        chosen = replace(chosen, warnings=(*chosen.warnings, told))
     found = Analysis(first, cycles, assess((chosen,), first), 0)
     for record in records:
         if record.outcome in _NO_GAINS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ FloatArray = NDArray[np.float64]
 
 _SURE = 4.5
 _LEAST_ASYMMETRY = 0.05
+_OTHER_AMPLITUDE = 1.2
 _LEAST_DISAGREEMENT = 0.03
 _LEAST_CYCLES = 3
 # With fewer samples in a cycle, straight lines between them miss more than a percent.
@@ -48,16 +50,9 @@ def unequal_gains(record: Record, model: TransferFunction) -> str | None:
         if not bool(np.any(values)):
             return None
         parts.append(response(model, record.time, PiecewiseConstant(u.times, values, initial)))
-    line = record.time - record.time.mean()
-    columns = np.stack((*parts, np.ones(len(record)), line))
-    size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
-    scaled = columns / np.where(size > 0.0, size, 1.0)[:, None]
-    factors, *_ = np.linalg.lstsq(scaled.T, record.measurement, rcond=None)
-    residual = record.measurement - factors @ scaled
-    above, below = factors[:2] / size[:2]
-    covariance = np.linalg.pinv(scaled @ scaled.T) * float(residual @ residual) / len(record)
-    weights = np.array((1.0 / size[0], -1.0 / size[1], 0.0, 0.0))
-    uncertainty = math.sqrt(max(float(weights @ covariance @ weights), 0.0))
+    (above, below), covariance = _factors(record, parts)
+    contrast = np.array((1.0, -1.0))
+    uncertainty = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
     difference = abs(above - below)
     if difference <= max(_SURE * uncertainty, _LEAST_ASYMMETRY):
         return None
@@ -66,6 +61,58 @@ def unequal_gains(record: Record, model: TransferFunction) -> str | None:
         f"below it {below:.2f} times: the process is not linear, and one set of gains is a "
         "compromise; the weaker direction sets how fast the loop can be"
     )
+
+
+def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:
+    """Say whether a process has another gain for larger changes of the command.
+
+    Each record's response gets a gain of its own, in the least-squares sense, beside an offset and
+    a drift; a valve that sticks, or a flow that goes with the root of a pressure, has gains that
+    hang on the amplitude.
+
+    :param records: tests of one process, at least two.
+    :param model: the model fitted to all of them, of a stable or integrating process.
+    :return: a sentence, or None where all agree, or no amplitude is a fifth larger than another.
+    """
+    if any(t.real < 0.0 for t in model.time_constants):
+        return None
+    swings, gains, deviations = [], [], []
+    for record in records:
+        u = record.input()
+        swings.append(0.5 * float(np.ptp(np.append(u.values, u.initial))))
+        factor, covariance = _factors(record, [response(model, record.time, u)])
+        gains.append(float(factor[0]))
+        deviations.append(math.sqrt(max(float(covariance[0, 0]), 0.0)))
+    least, most = int(np.argmin(swings)), int(np.argmax(swings))
+    if not swings[most] > _OTHER_AMPLITUDE * swings[least]:
+        return None
+    uncertainty = math.hypot(deviations[least], deviations[most])
+    if abs(gains[most] - gains[least]) <= max(_SURE * uncertainty, _LEAST_ASYMMETRY):
+        return None
+    return (
+        f"a command that moves by {swings[least]:.3g} to either side acts {gains[least]:.2f} "
+        f"times as strongly as in the model, one of {swings[most]:.3g} {gains[most]:.2f} times: "
+        "the process is not linear; tune with an amplitude like that of its normal operation"
+    )
+
+
+def _factors(record: Record, parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the factors of some responses in a record, and their covariance.
+
+    An offset and a drift are estimated beside them.
+
+    :param parts: each of the record's length.
+    """
+    line = record.time - record.time.mean()
+    columns = np.stack((*parts, np.ones(len(record)), line))
+    size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
+    size[size == 0.0] = 1.0
+    scaled = columns / size[:, None]
+    factors, *_ = np.linalg.lstsq(scaled.T, record.measurement, rcond=None)
+    residual = record.measurement - factors @ scaled
+    covariance = np.linalg.pinv(scaled @ scaled.T) * float(residual @ residual) / len(record)
+    count = len(parts)
+    return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]
 
 
 def disagreeing_point(record: Record, model: TransferFunction, gain_std: float) -> str | None:

@@ -7,11 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.identification.checks import disagreeing_point, unequal_gains
+from relay_autotune.identification.checks import (
+    disagreeing_point,
+    unequal_amplitudes,
+    unequal_gains,
+)
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.record import Outcome, PiecewiseConstant, Record, RelaySettings
+from relay_autotune.response import response
 from relay_autotune.simulation import Plant
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -50,6 +55,33 @@ def _record(cooling: float, noise: float = 0.02, resting: int = 30, seed: int = 
         cycle_start=tuple(starts),
         outcome=Outcome.COMPLETED,
     )
+
+
+def _steps(size: float, power: float, seed: int) -> Record:
+    """Return steps up and down, to which a process answers with a power of their size."""
+    time = np.arange(0.0, 200.0, 0.2)
+    u = np.where((time // 25.0) % 2 == 1, size, -size) * (time > 25.0)
+    held = PiecewiseConstant(*_held(time, u))
+    y = response(MODEL, time, held) * size ** (power - 1.0)
+    noise = 0.02 * np.random.default_rng(seed).standard_normal(time.size)
+    return Record(time, y + noise, u, noise_std=0.02)
+
+
+def _held(time, u):
+    at = np.flatnonzero(np.diff(u)) + 1
+    return time[at], u[at], float(u[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_amplitudes_tell_a_gain_that_hangs_on_them(seed):
+    linear = [_steps(size, 1.0, seed + 10 * k) for k, size in enumerate((0.5, 1.0))]
+    assert unequal_amplitudes(linear, MODEL) is None
+    root = [_steps(size, 0.5, seed + 10 * k) for k, size in enumerate((0.5, 1.0))]
+    told = unequal_amplitudes(root, MODEL)
+    # The gain of half the amplitude is 2**0.5 times as large.
+    assert "moves by 0.5 to either side acts 1.41 times" in told
+    alike = [_steps(size, 0.5, seed) for size in (0.95, 1.0)]
+    assert unequal_amplitudes(alike, MODEL) is None
 
 
 @pytest.mark.parametrize("seed", range(5))
