@@ -1,32 +1,87 @@
-"""Draw the pictures of the page docs/report.md from a bag of the repository.
+"""Draw the pictures of the guide that show reports: the demo's, and each figure's of a bag.
 
-. ./env.sh && python3 tools/report_images.py
+    . ./env.sh && python3 tools/report_images.py [BROWSER]
+
+With a browser that takes Chromium's options, such as `chromium`, it also takes a picture of the
+page's first screen.
 """
 
 from __future__ import annotations
 
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
-from relay_autotune.autotune import analyse
+from PIL import Image
+
+from relay_autotune.autotune import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
-from relay_autotune.report.case import case_of
+from relay_autotune.cli import demo
+from relay_autotune.relay import RelayExperiment
+from relay_autotune.relay_parameters import ExperimentParameters
+from relay_autotune.report import write_page, write_picture
+from relay_autotune.report.case import Case, case_of
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.style import save
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 ROOT = Path(__file__).resolve().parent.parent
+IMAGES = ROOT / "docs/images"
 BAG = ROOT / "bags/unbiased_relay_with_noise"
 
 
 def main() -> int:
-    """Draw each figure of the report."""
+    """Draw all pictures."""
+    found = tune_as_the_demo()
+    case = case_of(found, "demo_output/bag", truth=demo.TRUTH)
+    write_picture(case, IMAGES / "demo.png", title=demo.picture_title(found))
     (record,) = read_experiments(BAG).experiments
-    case = case_of(analyse(record), BAG.name)
+    shown = case_of(analyse(record), BAG.name)
     for plate in PLATES:
-        path = ROOT / f"docs/images/report_{plate.key}.png"
-        save(plate.figure(case), str(path))
-        print(path.relative_to(ROOT))
+        save(plate.figure(shown), str(IMAGES / f"report_{plate.key}.png"))
+    if sys.argv[1:]:
+        first_screen(sys.argv[1], case)
+    for picture in (IMAGES / "demo.png", *IMAGES.glob("report_*.png")):
+        # A palette is enough for lines, and a third of the size.
+        with Image.open(picture) as image:
+            image.convert("RGB").quantize(128).save(picture, optimize=True)
     return 0
+
+
+def tune_as_the_demo() -> Analysis:
+    """Return what the demo finds; in lockstep its samples can be had without processes."""
+    process = VirtualProcess(
+        demo.TRUTH,
+        rest_measurement=demo.REST,
+        rest_command=demo.BASELINE,
+        disturbances=Disturbances(noise_std=demo.NOISE_STD),
+        seed=demo.SEED,
+    )
+    parameters = ExperimentParameters(amplitude=demo.AMPLITUDE, sample_period=demo.PERIOD)
+    experiment = RelayExperiment(parameters, demo.BASELINE)
+    k = 0
+    while not experiment.finished:
+        process.command(experiment.step(k * demo.PERIOD, process.measure(k * demo.PERIOD)))
+        k += 1
+    return analyse(experiment.record())
+
+
+def first_screen(browser: str, case: Case) -> None:
+    """Take a picture of what a report shows first.
+
+    :param browser: that takes Chromium's options.
+    :param case: in the report.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / "report.html"
+        write_page([case], page, title=demo.PAGE_TITLE)
+        options = [
+            *("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"),
+            *(f"--user-data-dir={folder}/profile", "--window-size=1280,1180"),
+            f"--screenshot={IMAGES / 'report_page.png'}",
+        ]
+        subprocess.run([browser, *options, page.as_uri()], check=True, timeout=120)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ NOISE_STD = 0.05
 SEED = 1
 BASELINE, REST = 2.0, 40.0
 AMPLITUDE = 1.0
+PAGE_TITLE = "Relay test of a simulated process"
 
 _DEADLINE = 50.0
 
@@ -204,12 +205,20 @@ def _finish(output: Path, live: Any) -> int:
     result["truth"] = model_fields(TRUTH)
     (output / "result.json").write_text(to_json(result) + "\n")
     case = case_of(found, str(output / "bag"), truth=TRUTH)
-    title = f"Relay test: {process_text(found.model.model)}  (true: {process_text(TRUTH)})"
-    write_picture(case, output / "figure.png", title=title)
-    write_page([case], output / "report.html", title="Relay test of a simulated process")
+    write_picture(case, output / "figure.png", title=picture_title(found))
+    write_page([case], output / "report.html", title=PAGE_TITLE)
     print(f"Left in {output}/: bag/, result.json, figure.png, report.html")
     print(f"  try: . ./env.sh && replay {output}/bag")
     return 0 if same else 1
+
+
+def picture_title(found: Analysis) -> str:
+    """Return the title of the demo's picture.
+
+    :param found: with a model.
+    """
+    assert found.model is not None
+    return f"Relay test: {found.model.model}  (true: {TRUTH})"
 
 
 def _compare(found: Analysis) -> None:

@@ -12,6 +12,7 @@ from relay_autotune.autotune import Analysis
 from relay_autotune.cycles import LimitCycle, cycles_of, infer_settings, limit_cycle
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import FitReport, Identification
+from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival
 from relay_autotune.identification.validation import Validation
@@ -72,6 +73,8 @@ class ModelCase:
     :param validation: how its limit cycle differs from the record's; None: not compared.
     :param integrated_error: how far it is from the model that counts [rad/s]; NaN: it is that
         model, or not known.
+    :param combinations: what the data determine where they do not determine every parameter.
+    :param advice: then, what test would determine it, each a sentence.
     """
 
     method: str
@@ -84,6 +87,8 @@ class ModelCase:
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
     validation: Validation | None = None
     integrated_error: float = math.nan
+    combinations: tuple[Combination, ...] = ()
+    advice: tuple[str, ...] = ()
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -208,6 +213,8 @@ def _model_case(found: Identification, truth: TransferFunction | None) -> ModelC
         fitted=found.fitted,
         validation=found.validation,
         integrated_error=found.integrated_error,
+        combinations=found.combinations,
+        advice=found.advice,
     )
 
 

@@ -23,10 +23,10 @@ from relay_autotune.report.uncertainty import draw_uncertainty, uncertainty_heig
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
-_NO_SAMPLES = "it needs the samples, which a result without its recording does not hold."
+_NO_SAMPLES = "it needs the samples, which a result without its recording does not hold"
 _FEWEST = 20
-_NO_MODEL = "nothing was identified."
-_NO_GAINS = "there are no gains."
+_NO_MODEL = "nothing was identified"
+_NO_GAINS = "there are no gains"
 
 
 class Draw(Protocol):
@@ -43,7 +43,7 @@ class Plate:
     :param key: its name in files and in the page's links.
     :param title: what it shows.
     :param draw: draws it into an empty figure.
-    :param missing: why a case has no such figure, a sentence; empty: it has.
+    :param missing: why a case has no such figure; empty: it has.
     :param reading: how it is to be read, what is good and what is bad.
     :param wide: True if it fills the page, False if two stand side by side.
     :param without_relay: how it is to be read where no relay acted; empty: the same way.
@@ -89,7 +89,7 @@ def _without_fit(case: Case) -> str:
     if case.model is None:
         return _NO_MODEL
     if case.model.fitted.size != len(case.record):
-        return f"the method {case.model.method} does not fit the samples themselves."
+        return f"the method {case.model.method} does not fit the samples themselves"
     return ""
 
 
@@ -97,8 +97,8 @@ def _without_cycles(case: Case) -> str:
     if case.record is None:
         return _NO_SAMPLES
     if not case.cycles or case.limit_cycle is None:
-        return "the record has no whole cycle."
-    return "" if len(case.record) >= _FEWEST else "the record has too few samples."
+        return "the record has no whole cycle"
+    return "" if len(case.record) >= _FEWEST else "the record has too few samples"
 
 
 def _without_gains(case: Case) -> str:
@@ -111,7 +111,7 @@ def _without_other_rules(case: Case) -> str:
     missing = _without_gains(case)
     if missing:
         return missing
-    return "" if len(distinct_gains(case)) > 1 else "no other rule gives other gains."
+    return "" if len(distinct_gains(case)) > 1 else "no other rule gives other gains"
 
 
 def _without_model(case: Case) -> str:
@@ -122,7 +122,7 @@ def _without_intervals(case: Case) -> str:
     if case.model is None:
         return _NO_MODEL
     known = any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate))
-    return "" if known else f"the method {case.model.method} tells no uncertainty."
+    return "" if known else f"the method {case.model.method} tells no uncertainty"
 
 
 PLATES = (

@@ -116,8 +116,6 @@ def warnings_of(case: Case) -> tuple[str, ...]:
     :param case: the experiment.
     """
     found = list(case.model.warnings) if case.model is not None else []
-    if case.model is not None and case.best_gains is None and case.reason:
-        found.insert(0, case.reason)
     if case.best_gains is not None:
         found += case.best_gains.warnings
     disturbed = [c.index + 1 for c in case.cycles if c.disturbed]
@@ -139,7 +137,7 @@ def checks_of(case: Case) -> tuple[Check, ...]:
         found += [c for c in (_fit(case.model), _determined(case.model)) if c is not None]
     if case.limit_cycle is not None:
         cycles = len(case.limit_cycle.cycles)
-        agree = f"the last {cycles} cycles agree" if cycles > 1 else "there is one cycle only"
+        agree = f"The last {cycles} cycles agree" if cycles > 1 else "There is one cycle only"
         found.append(
             Check("Limit cycle", "settled", f"{agree}.", "good")
             if case.limit_cycle.converged

@@ -12,6 +12,7 @@ from typing import Any
 from relay_autotune.cycles import LimitCycle
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.identification import FitReport
+from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival, is_logarithmic
 from relay_autotune.identification.validation import DIFFERENCES, Validation
@@ -137,6 +138,8 @@ def _model_case(m: dict[str, Any], truth: TransferFunction | None) -> ModelCase:
         rivals=tuple(Rival(_model(r), _number(r["support"])) for r in m["rivals"]),
         validation=_validation(m.get("validation")),
         integrated_error=_number(m.get("integrated_error")),
+        combinations=tuple(_combination(c) for c in m.get("combinations", ())),
+        advice=tuple(map(str, m.get("advice", ()))),
     )
 
 
@@ -145,6 +148,12 @@ def _validation(v: dict[str, Any] | None) -> Validation | None:
         return None
     numbers = {name: _number(v[name]) for name in DIFFERENCES}
     return Validation(reason=str(v["reason"]), **numbers)
+
+
+def _combination(c: dict[str, Any]) -> Combination:
+    low, high = (_number(end) for end in c["ci95"])
+    value, std = _number(c["value"]), _number(c["std"])
+    return Combination(str(c["name"]), str(c["unit"]), value, std, low, high)
 
 
 def _estimate(

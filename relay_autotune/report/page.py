@@ -130,7 +130,7 @@ def _section(case: Case, number: int, many: bool) -> _Section:
         numbers=numbers_of(case),
         doubts=doubts_of(case),
         plates=tuple(_drawn(p, case, f"e{number}", alone=alone) for p in present),
-        left_out=tuple(f"{p.title}: {p.missing(case)}" for p in PLATES if p.missing(case)),
+        left_out=tuple(f"{p.title}: {why}" for p in PLATES if (why := p.missing(case))),
     )
 
 

@@ -11,6 +11,7 @@ import pytest
 from report_cases import MODEL, aborted, completed, fruitless, only
 
 from relay_autotune.document import document, model_fields, to_json
+from relay_autotune.identification.combinations import Combination
 from relay_autotune.report.case import Case, case_of
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.from_document import cases_of_document, read_documents
@@ -127,13 +128,19 @@ def test_names_and_reasons_from_a_bag_are_text_and_never_html() -> None:
     hostile = replace(aborted(HOSTILE), record=replace(
         aborted(HOSTILE).record, experiment_id=HOSTILE
     ))  # fmt: skip
-    model = replace(hostile.models[0], warnings=(HOSTILE,), method=HOSTILE)
+    model = replace(
+        hostile.models[0],
+        warnings=(HOSTILE,),
+        method=HOSTILE,
+        advice=(HOSTILE,),
+        combinations=(Combination(HOSTILE, HOSTILE, 1.0, 0.1, 0.8, 1.2),),
+    )
     case = case_of(replace(hostile, models=(model, *hostile.models[1:])), HOSTILE)
     text = page([replace(case, record=None, cycles=(), models_around=())], title=HOSTILE)
     found = read(text)
     assert found.elements.count("script") == 1
     assert "img" not in found.elements
-    assert found.text.count("alert(1)") >= 5
+    assert found.text.count("alert(1)") >= 8
     assert "&lt;script&gt;" in text
 
 
