@@ -10,8 +10,7 @@ from rclpy.parameter import Parameter
 
 from relay_autotune.autotune import Analysis, analyse, analyse_jointly, check_names
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import DEFAULT_METHOD, METHODS
-from relay_autotune.identification.li_method import METHOD as LI
+from relay_autotune.identification import DEFAULT_METHOD, METHODS, ONLY_JOINT
 from relay_autotune.messages import (
     fill_gains,
     fill_transfer_function,
@@ -173,7 +172,7 @@ class IdentifierNode(ServedNode):
             "options": options_from(values),
         }
         try:
-            if final and values["method"] == LI and earlier is not None:
+            if final and values["method"] in ONLY_JOINT and earlier is not None:
                 return analyse_jointly((record, earlier), **asked)
             return analyse(record, final=final, **asked)
         except Exception as error:  # noqa: BLE001  one bad record must not end the node

@@ -156,3 +156,60 @@ def test_a_known_gain_is_used(method, bias, gain):
     assert found.values == pytest.approx([gain, 20.0, 10.0], rel=1e-3)
     with pytest.raises(IdentificationError):
         method(_record(gain, bias, 2001), Known(gain=-gain))
+
+
+def test_the_mean_command_of_an_integrating_process_tells_no_gain():
+    # Biased or not, what goes in must come out again over a cycle.
+    model = TransferFunction.ipdt(0.5, 1.0)
+    relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.1)
+    run = simulate_relay(model, relay, cycles=8, time=np.arange(0.0, 40.0, 0.01))
+    with pytest.raises(IdentificationError, match=r"eq 6.*integrating process"):
+        identify_biased(run.record())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_does_not_raise_the_peaks(seed):
+    # Raw peaks made every such record fail: its noise-to-signal ratio is 0.1.
+    model = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    relay = RelaySettings(0.0, 0.0, 1.0)
+    run = simulate_relay(model, relay, cycles=8, time=np.arange(0.0, 200.0, 0.2))
+    record = run.record(noise_std=0.05, rng=np.random.default_rng(seed))
+    found = identify_unbiased(record)
+    assert found.ultimate_gain == pytest.approx(2.3072017362581048, rel=0.02)
+    assert found.ultimate_frequency == pytest.approx(0.18365972031521258, rel=0.02)
+
+
+def _rested(noise: float, seed: int) -> Record:
+    """Return a biased test after 40 samples at rest."""
+    model = TransferFunction.fopdt(1.0, 2.0, 1.0)
+    relay = RelaySettings(3.0, 1.0, 1.0, 0.3, 0.1)
+    run = simulate_relay(model, relay, cycles=8, time=np.arange(0.0, 24.0, 0.02))
+    record, rest = run.record(), 40
+    y = np.concatenate((np.full(rest, 3.0), record.measurement))
+    return replace(
+        record,
+        time=np.concatenate((-0.02 * np.arange(rest, 0, -1), record.time)),
+        measurement=y + noise * np.random.default_rng(seed).standard_normal(y.size),
+        command=np.concatenate((np.full(rest, 1.0), record.command)),
+        receive_time=np.empty(0),
+        command_time=np.empty(0),
+        noise_std=noise,
+        cycle_start=tuple(c + rest for c in record.cycle_start),
+        held_input=record.input(),
+    )
+
+
+def test_the_error_of_the_steady_state_is_one_of_the_gain():
+    # The true rest is known here, so that what is left is that of its 40 noisy samples.
+    scores, shares = [], []
+    for seed in range(16):
+        record = _rested(0.05, seed)
+        found = identify_biased(record)
+        y, u = cycle_means(record)
+        rest = record.measurement[:41].mean()
+        assert found.values[0] == pytest.approx((y - rest) / (u - 1.0), rel=0.02)
+        scores.append((found.values[0] - 1.0) / found.std[0])
+        shares.append(0.05 / np.sqrt(41.0) / (u - 1.0) / found.std[0])
+    # Nearly all of the uncertainty, and of the right size: 0.5 to 1.5 hold 99.5 % of such rms.
+    assert np.median(shares) > 0.6
+    assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
