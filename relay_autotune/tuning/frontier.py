@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,8 @@ from numpy.typing import NDArray
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import unstable_at_small_gain
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 # Times the crossover: from where on the proportional and derivative action make the loop.
 _BEYOND = 3.0
@@ -68,7 +69,7 @@ class Responses:
     """Frequency responses of models on one grid, with the sign that makes feedback negative.
 
     :param models: m of them, all with the sign of the first.
-    :param grid: rad/s, shape (n,), increasing.
+    :param grid: rad/s, shape (n,), increasing; its precision is that of all that is computed.
     :param crossover: frequency about which loops are closed [rad/s].
     """
 
@@ -87,7 +88,8 @@ class Responses:
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
         sign = self._models[0].process_sign
-        return np.array([sign / m(1j * grid) for m in self._models])
+        values = np.array([sign / m(1j * grid) for m in self._models])
+        return values.astype(np.result_type(grid, np.complex64))
 
     def add(self, frequencies: FloatArray) -> None:
         """Add frequencies to the grid, with neighbours on either side.
