@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from relay_autotune.errors import RecordError
 
 FloatArray = NDArray[np.float64]
+# Slopes that differ by less, as a share of the steepest, are rounding.
+_STRAIGHT = 1e-12
 IntArray = NDArray[np.int64]
 
 
@@ -152,6 +154,48 @@ class PiecewiseConstant:
         return np.concatenate(([self.initial], self.values))[index]
 
 
+@dataclass(frozen=True)
+class PiecewiseLinear:
+    """A signal that moves along straight lines, and rests before the first and after the last.
+
+    :param times: instants at which the slope changes, strictly increasing [s], shape (m,).
+    :param slopes: per second from each instant on, shape (m,).
+    :param initial: level before the first instant.
+    """
+
+    times: FloatArray
+    slopes: FloatArray
+    initial: float
+
+    def __post_init__(self) -> None:
+        if self.times.ndim != 1 or self.times.shape != self.slopes.shape:
+            raise RecordError(
+                f"a piecewise-linear signal needs times and slopes of one shape (m,), "
+                f"found {self.times.shape} and {self.slopes.shape}"
+            )
+        if self.times.size > 1 and not bool(np.all(np.diff(self.times) > 0.0)):
+            raise RecordError("the instants of a piecewise-linear signal must increase strictly")
+
+    @classmethod
+    def from_samples(cls, times: FloatArray, values: FloatArray) -> PiecewiseLinear:
+        """Connect all samples of a continuous signal.
+
+        :param times: instants of the samples, not decreasing [s], shape (n,), n >= 1; of equal
+            instants the last one counts.
+        :param values: the level at each instant, shape (n,).
+        """
+        last = np.append(np.diff(times) > 0.0, True)
+        times, values = times[last], values[last]
+        slopes = np.append(np.diff(values) / np.diff(times), 0.0)
+        change = np.abs(np.diff(slopes, prepend=0.0))
+        kept = change > _STRAIGHT * float(np.abs(slopes).max())
+        return cls(times[kept], slopes[kept], float(values[0]))
+
+
+# What drives a process.
+Input = PiecewiseConstant | PiecewiseLinear
+
+
 def _as_column(name: str, value: object, length: int | None) -> FloatArray:
     array = np.array(value, dtype=np.float64)
     if array.ndim != 1 or (length is not None and array.size != length):
@@ -188,6 +232,8 @@ class Record:
     :param held_input: the command at its own instants [s on the axis of ``time``], for records
         whose commands do not answer samples (a foreign recording, an ideal relay); None: as
         ``command`` and ``command_time`` say.
+    :param continuous_command: True: the command moved along straight lines from one of its
+        instants to the next, as an analogue controller's does; False: it was held.
     :raises RecordError: if shapes differ, a value is not finite, or the time goes backwards.
     """
 
@@ -205,6 +251,7 @@ class Record:
     start: float = 0.0
     lost_samples: int = 0
     held_input: PiecewiseConstant | None = None
+    continuous_command: bool = False
 
     def __post_init__(self) -> None:
         time = _as_column("time", self.time, None)
@@ -261,3 +308,18 @@ class Record:
         offset = float(np.min(self.receive_time - self.time))
         sent = np.maximum.accumulate(self.command_time - offset)
         return PiecewiseConstant.from_samples(sent, self.command)
+
+    def drive(self) -> Input:
+        """Return what the process was driven by: :meth:`input`, or the lines between its points.
+
+        A command that is published for each sample and held is exact as it is, a slow one as a
+        staircase. One that moved on between its samples is half an interval early to that.
+        """
+        if not self.continuous_command:
+            return self.input()
+        if self.held_input is not None:
+            held = self.held_input
+            return PiecewiseLinear.from_samples(held.times, held.values)
+        offset = float(np.min(self.receive_time - self.time))
+        sent = np.maximum.accumulate(self.command_time - offset)
+        return PiecewiseLinear.from_samples(sent, self.command)

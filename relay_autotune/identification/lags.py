@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.factors import Denominator, Lag
 from relay_autotune.identification.structures import RationalStructure
-from relay_autotune.record import PiecewiseConstant
+from relay_autotune.record import Input, PiecewiseLinear
 
 FloatArray = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ class Fopdt(RationalStructure):
     """``K exp(-D s)/(tau s + 1)``, theta = (log tau, D)."""
 
     def columns(
-        self, theta: FloatArray, time: FloatArray, u: PiecewiseConstant
+        self, theta: FloatArray, time: FloatArray, u: Input
     ) -> tuple[FloatArray, FloatArray]:
         """Return the unit-gain response and its derivatives.
 
@@ -33,6 +33,8 @@ class Fopdt(RationalStructure):
         :param u: the input; its deviation from ``u.initial`` acts.
         :return: shapes (1, n) and (2, 1, n).
         """
+        if isinstance(u, PiecewiseLinear):
+            return super().columns(theta, time, u)
         tau, dead_time = math.exp(float(theta[0])), float(theta[1])
         levels = (u.values - u.initial).tolist()
         gaps = np.diff(u.times) / tau

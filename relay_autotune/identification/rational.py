@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from relay_autotune.identification.factors import Denominator, Lag, UnstableLag
 from relay_autotune.identification.partial_fractions import follow, partial_fractions
 from relay_autotune.modes import Modes
-from relay_autotune.record import PiecewiseConstant
+from relay_autotune.record import Input, PiecewiseLinear
 from relay_autotune.response import coordinates_at_changes
 
 FloatArray = NDArray[np.float64]
@@ -21,7 +21,7 @@ def responses(
     powers: tuple[int, ...],
     theta: FloatArray,
     time: FloatArray,
-    u: PiecewiseConstant,
+    u: Input,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the responses of ``s^k exp(-D s)/(s^m Q)`` and their derivatives.
 
@@ -32,18 +32,27 @@ def responses(
     :param powers: k of each response, p of them.
     :param theta: the parameters of the denominator, then D [s].
     :param time: sample times, not decreasing [s], shape (n,).
-    :param u: the input; its deviation from ``u.initial`` acts.
+    :param u: the input; its deviation from ``u.initial`` acts, of ramps as exactly as of steps.
     :return: shapes (p, n) and (len(theta), p, n).
     """
     own, dead_time = theta[:-1], float(theta[-1])
-    changes, steps = u.times + dead_time, np.diff(u.values, prepend=u.initial)
+    changes = u.times + dead_time
+    ramps = isinstance(u, PiecewiseLinear)
+    # A ramp is a step that is integrated once more.
+    steps = (
+        np.diff(u.slopes, prepend=0.0)
+        if isinstance(u, PiecewiseLinear)
+        else np.diff(u.values, prepend=u.initial)
+    )
     unstable = any(f.unstable for f in denominator.factors)
     if unstable:
         first, last = min(time[0], changes[0]) - 1.0, max(time[-1], changes[-1]) + 1e-9
         changes = np.concatenate(([first], changes, [last]))
         steps = np.concatenate(([0.0], steps, [0.0]))
     numerators = denominator.numerators(own, powers)
-    values = _follow(denominator, own, numerators, time, changes, steps, backward=unstable)
+    values = _follow(
+        denominator, own, numerators, time, changes, steps, backward=unstable, ramps=ramps
+    )
     p = len(powers)
     return values[:p], values[p:].reshape(theta.size, p, time.size)
 
@@ -116,13 +125,15 @@ def _follow(
     steps: FloatArray,
     *,
     backward: bool = False,
+    ramps: bool = False,
 ) -> FloatArray:
     """Return the outputs at the samples, shape (outputs, n); zero before the first change."""
     horizon = max(float(max(time[-1], changes[-1]) - changes[0]), np.finfo(float).tiny)
     constants = denominator.extended_constants(own)
     segment = np.searchsorted(changes, time, side="right") - 1
     first = int(np.searchsorted(segment, 0))
-    poles = partial_fractions(constants, denominator.integrators, numerators, horizon)
+    integrators = denominator.integrators + ramps
+    poles = partial_fractions(constants, integrators, numerators, horizon)
     values = np.zeros((numerators.shape[0], time.size))
     # In pieces, so that a long record takes little memory beside its result.
     if poles is not None:
@@ -131,7 +142,7 @@ def _follow(
             part = slice(start, start + _CHUNK)
             values[:, part] = follow(poles, states, time[part], segment[part], changes)
         return values
-    modes = Modes(constants, denominator.integrators, numerators, horizon)
+    modes = Modes(constants, integrators, numerators, horizon)
     weights = modes.weights(coordinates_at_changes(modes, changes, steps, backward=backward))
     for start in range(first, time.size, _CHUNK):
         part = slice(start, start + _CHUNK)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.identification.structures import RationalStructure
-from relay_autotune.record import PiecewiseConstant
+from relay_autotune.record import Input
 
 FloatArray = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class Problem:
 
     time: FloatArray
     y: FloatArray
-    inputs: tuple[PiecewiseConstant, ...]
+    inputs: tuple[Input, ...]
     structure: RationalStructure
     index: NDArray[np.int64]
     bounds: tuple[int, ...] = (0,)
@@ -148,7 +148,7 @@ class Problem:
 
 
 def problem_of(
-    records: Sequence[tuple[FloatArray, FloatArray, PiecewiseConstant]],
+    records: Sequence[tuple[FloatArray, FloatArray, Input]],
     structure: RationalStructure,
 ) -> Problem:
     """Return the problem of fitting a structure to one or several experiments.

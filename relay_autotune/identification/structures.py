@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from relay_autotune.identification.factors import Denominator, Lag, Quadratic, UnstableLag
 from relay_autotune.identification.rational import free_motion, responses
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
+from relay_autotune.record import Input
 
 FloatArray = NDArray[np.float64]
 Build = Callable[[FloatArray], TransferFunction]
@@ -66,7 +66,7 @@ class RationalStructure:
         return any(f.unstable for f in self.denominator.factors)
 
     def columns(
-        self, theta: FloatArray, time: FloatArray, u: PiecewiseConstant
+        self, theta: FloatArray, time: FloatArray, u: Input
     ) -> tuple[FloatArray, FloatArray]:
         """Return the responses, shape (k, n), and their derivatives, shape (m, k, n).
 

@@ -39,7 +39,7 @@ from relay_autotune.identification.separable import (
 )
 from relay_autotune.identification.waveform_report import report
 from relay_autotune.models import STRUCTURES
-from relay_autotune.record import PiecewiseConstant, Record
+from relay_autotune.record import Input, Record
 
 FloatArray = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
             f"the waveform fit has no structure {known.structure!r}; it has "
             f"{', '.join(STRUCTURES[:-1])}"
         )
-    inputs = [record.input() for record in records]
+    inputs = [record.drive() for record in records]
     for record, u in zip(records, inputs, strict=True):
         _require_content(record.time, record.measurement, u)
     # In units of its own range, so that no unit of measurement is too large or too small.
@@ -258,7 +258,7 @@ def _choose(problem: Problem, known: Known, sign: int) -> tuple[Candidate, list[
     return found, [found]
 
 
-def _require_content(time: FloatArray, y: FloatArray, u: PiecewiseConstant) -> None:
+def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
     if y.size < _LEAST_SAMPLES:
         raise IdentificationError(
             f"the record holds {y.size} samples; a fit needs at least {_LEAST_SAMPLES}: "
