@@ -255,6 +255,7 @@ class _Scan:
                         self.layout.declared.take(opcode, _bounded(source, begin, end))
                 elif opcode in (DATA_END, FOOTER):
                     unfinished = source.read(source.size - len(MAGIC), source.size) != MAGIC
+                    self._declared_again(end)
                     break
             position = end
         self._settle(complete=not unfinished)
@@ -263,6 +264,13 @@ class _Scan:
         if unfinished:
             self._tell_tear()
         return self.layout
+
+    def _declared_again(self, position: int) -> None:
+        """Take channels from the end of the file, in case those among the data are damaged."""
+        with contextlib.suppress(DamageError):
+            for opcode, begin, end in file_records(self.source, position, self.source.size):
+                if opcode in (SCHEMA, CHANNEL):
+                    self.layout.declared.take(opcode, _bounded(self.source, begin, end))
 
     def _tell_tear(self) -> None:
         until = ""

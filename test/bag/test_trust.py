@@ -1,0 +1,201 @@
+"""Nothing that a file declares is trusted."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+import zstandard
+from made_bags import START
+from mcap.writer import CompressionType, Writer
+
+from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.topics import Topics
+from relay_autotune.bag.writer import encode_float64
+from relay_autotune.errors import BagError
+
+COUNT = 400
+
+
+def write(path, *, compression=CompressionType.NONE, other=0, times=None, **options):
+    """Write /x in chunks of 2000 bytes, each followed by one of /other where that is asked for."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=compression, **options)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        x = writer.register_channel("/x", "cdr", schema)
+        y = writer.register_channel("/other", "cdr", schema)
+        for k in range(COUNT):
+            stamp = START + k * 10**6 if times is None else times[k]
+            writer.add_message(x, stamp, encode_float64(float(k)), stamp, k)
+            if other and k % 46 == 45:
+                writer.flush()
+                writer.add_message(y, stamp, b"\0\1\0\0" + b"image" * other, stamp, k)
+                writer.flush()
+        writer.finish()
+    return path
+
+
+def read(path, **limits):
+    """Return the values of /x, and what was said."""
+    with McapFile(path, **limits) as file:
+        topics = Topics(path, [file])
+        signal = topics.signals(["/x"])["/x"].signal
+        return signal.values, file.notes
+
+
+def chunks(data):
+    """Yield where each chunk begins."""
+    at = 8
+    while at + 9 <= len(data):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        if opcode == 6:
+            yield at
+        at += 9 + length
+
+
+def records(data, wanted):
+    """Yield where each record of an opcode begins in the file."""
+    at = 8
+    while at + 9 <= len(data):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        if opcode == wanted:
+            yield at
+        at += 9 + length
+
+
+def test_chunks_without_the_topic_are_neither_read_nor_expanded(tmp_path):
+    path = write(tmp_path / "bag.mcap", compression=CompressionType.ZSTD, other=500)
+    data = bytearray(path.read_bytes())
+    ruined = 0
+    for at in chunks(data):
+        if struct.unpack_from("<Q", data, at + 9 + 16)[0] > 2200:
+            data[at + 60 : at + 70] = bytes(10)
+            ruined += 1
+    assert ruined == COUNT // 46
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert notes == []
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_chunk_that_declares_too_much_takes_no_memory(tmp_path, compression):
+    path = write(tmp_path / "bag.mcap", compression=compression)
+    data = bytearray(path.read_bytes())
+    second = list(chunks(data))[1]
+    struct.pack_into("<Q", data, second + 9 + 16, 2**40)
+    path.write_bytes(data)
+    tracemalloc.start()
+    values, notes = read(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 20e6
+    assert 300 < values.size < COUNT
+    assert "declares 1099511627776 bytes, more than the 268435456 that --max-chunk" in notes[0]
+
+
+def test_a_frame_that_holds_more_than_its_chunk_declares_is_not_expanded(tmp_path):
+    path = write(tmp_path / "bag.mcap", compression=CompressionType.ZSTD)
+    data = path.read_bytes()
+    first = next(chunks(data))
+    (length,) = struct.unpack_from("<Q", data, first + 1)
+    bomb = zstandard.ZstdCompressor().compress(bytes(200 << 20))
+    head = data[first + 9 : first + 9 + 28] + struct.pack("<I", 4) + b"zstd"
+    body = head + struct.pack("<Q", len(bomb)) + bomb
+    # Behind the first chunk nothing is where the index says, so that the file is gone through.
+    path.write_bytes(
+        data[:first] + struct.pack("<BQ", 6, len(body)) + body + data[first + 9 + length :]
+    )
+    tracemalloc.start()
+    values, notes = read(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 20e6
+    assert COUNT - 50 < values.size < COUNT
+    assert any("differ in their size" in note for note in notes)
+
+
+def test_a_message_index_that_leads_elsewhere_is_not_believed(tmp_path):
+    path = write(tmp_path / "bag.mcap")
+    data = bytearray(path.read_bytes())
+    indexes = list(records(data, 7))
+    # Out of the chunk; to the middle of a message; to another channel; twice to one message.
+    struct.pack_into("<Q", data, indexes[0] + 15 + 8, 2**50)
+    struct.pack_into("<Q", data, indexes[1] + 15 + 8, 5)
+    struct.pack_into("<H", data, indexes[2] + 9, 77)
+    struct.pack_into("<Q", data, indexes[3] + 15 + 8 + 16, 0)
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert len(notes) == 4
+    assert all("has a bad message index" in note for note in notes)
+
+
+@pytest.mark.parametrize("what", ["offset", "length", "index", "overlap"])
+def test_a_chunk_index_that_leads_elsewhere_is_not_believed(tmp_path, what):
+    path = write(tmp_path / "bag.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    index = list(records(data, 8))
+    place = index[2] + 9
+    if what == "offset":
+        struct.pack_into("<Q", data, place + 16, 2**62)
+    elif what == "length":
+        struct.pack_into("<Q", data, place + 24, 2**64 - 1)
+    elif what == "index":
+        struct.pack_into("<Q", data, place + 32 + 4 + 2, 2**60)
+    else:
+        data[place + 16 : place + 32] = data[index[1] + 25 : index[1] + 41]
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert notes == []
+
+
+def test_a_checksum_that_is_wrong_costs_its_chunk_alone(tmp_path):
+    path = write(tmp_path / "bag.mcap")
+    data = bytearray(path.read_bytes())
+    data[next(chunks(data)) + 100] ^= 1
+    path.write_bytes(data)
+    values, notes = read(path)
+    assert 300 < values.size < COUNT
+    assert "the checksum of a chunk is wrong" in notes[0]
+
+
+def test_times_beyond_every_clock(tmp_path):
+    times = [2**64 - 1 - k for k in range(COUNT)]
+    values, _ = read(write(tmp_path / "bag.mcap", times=times))
+    assert values.size == COUNT
+
+
+def test_times_that_go_backwards_are_put_in_order(tmp_path):
+    times = [START + (k ^ 1) * 10**6 for k in range(COUNT)]
+    path = write(tmp_path / "bag.mcap", times=times)
+    values, _ = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT) ^ 1)
+
+
+def test_a_file_that_shrinks_while_it_is_read(tmp_path):
+    path = write(tmp_path / "bag.mcap")
+    with McapFile(path) as file:
+        with path.open("r+b") as other:
+            other.truncate(5000)
+        found = Topics(path, [file]).signals(["/x"])["/x"].signal
+        assert 0 < len(found) < COUNT
+        assert file.notes
+
+
+def test_messages_that_are_compressed_one_by_one_are_told(tmp_path):
+    path = tmp_path / "bag.mcap"
+    squeeze = zstandard.ZstdCompressor().compress
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        x = writer.register_channel("/x", "cdr", schema)
+        writer.add_message(x, START, squeeze(encode_float64(1.0)), START)
+        writer.finish()
+    with pytest.raises(BagError, match="compressed one by one, convert the bag with: ros2 bag"):
+        read(path)
