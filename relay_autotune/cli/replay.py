@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="take all experiments for tests of one process, with one model",
     )
-    parser.add_argument("--rule", default="thyagarajan", help="how to tune (%(default)s)")
+    parser.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
     parser.add_argument(
         "--clock", choices=CLOCKS, default=CLOCKS[0],

@@ -16,8 +16,8 @@ from relay_autotune.tuning.rules import PUBLISHED, Rule
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.ultimate import UltimatePoint
 
-RULES: dict[str, Rule] = {**PUBLISHED, "robust": robust}
-DEFAULT_RULE = "thyagarajan"
+RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
+DEFAULT_RULE = "robust"
 
 __all__ = [
     "DEFAULT_RULE",

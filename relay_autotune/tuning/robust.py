@@ -75,7 +75,10 @@ def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
     if share > WORTH:
         reason = f"PID would still have {100.0 * share:.0f} % of its IAE"
     elif search.noise is None:
-        reason = f"PID would have {100.0 * share:.0f} % of its IAE, but the noise is not known"
+        reason = (
+            f"PID would have {100.0 * share:.0f} % of its IAE, but what it makes of the noise is "
+            "not known without noise, amplitude and sampling period"
+        )
     else:
         reason = f"{_promise(other, search)}; its IAE is {100.0 * share:.0f} % of that of PI"
         return other.optimum.controller, reason

@@ -313,7 +313,7 @@ def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
         (["--measurement", "/x", "--command", "/command"], "no topic '/x' for the measurement"),
         (["--command", "/nothing"], "no topic '/nothing' for the command"),
         (["--method", "guess"], "unknown method 'guess'; known: waveform"),
-        (["--rule", "thumb"], "unknown rule 'thumb'; known: thyagarajan"),
+        (["--rule", "thumb"], "unknown rule 'thumb'; known: robust"),
         (["--start", "5", "--end", "5"], "--start 5 is not before --end 5"),
         (["--start", "1e9"], "no sample lies between"),
         (["--time", "t"], "--time names a column of a CSV file"),

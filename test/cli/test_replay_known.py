@@ -81,7 +81,7 @@ def test_two_tests_give_one_model(tmp_path, capsys, one_bag):
     (model,) = experiment["models"]
     assert (model["method"], model["structure"]) == ("li", "fopdt")
     assert model["ultimate_gain"] == pytest.approx(2.3072, rel=0.03)
-    assert experiment["gains"][0]["rule"] == "thyagarajan"
+    assert experiment["gains"][0]["rule"] == "robust"
 
 
 def test_one_test_is_not_enough(tmp_path, capsys):

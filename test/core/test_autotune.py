@@ -29,7 +29,7 @@ def test_a_completed_experiment_yields_models_and_gains():
     assert found.reason == ""
     assert found.model.method == "waveform"
     assert [m.method for m in found.models] == ["waveform", "wang_biased", "fourier"]
-    assert found.best_gains.rule == "thyagarajan"
+    assert found.best_gains.rule == "robust"
     for_fopdt = {"thyagarajan", "tyreus_luyben", "itae", "imc", "simc", "amigo"}
     assert for_fopdt <= {g.rule for g in found.gains} <= set(RULES)
     assert not {"luyben2003", "unstable"} & {g.rule for g in found.gains}

@@ -62,7 +62,7 @@ def test_the_commands_for_a_tune_in_lockstep_give_the_same_gains_every_time(rig:
     gains = rig.listen("pi_gains", PidGains)
     rig.tune(**start_as_shown(rig, page, note))
     rig.until(lambda: gains, "gains", timeout=60.0)
-    wanted, _ = RULES["thyagarajan"](DesignTask(model=model_from(plant_shown(page, note))))
+    wanted, _ = RULES["robust"](DesignTask(model=model_from(plant_shown(page, note))))
     assert gains[0].kc == pytest.approx(wanted.kc, rel=0.05)
     assert gains[0].ti == pytest.approx(wanted.ti, rel=0.05)
 
