@@ -79,7 +79,9 @@ def _frequency(model: TransferFunction) -> float:
     return point.frequency if point else 1.0 / min(abs(t) for t in model.time_constants)
 
 
-def best_on_a_grid(judge: Judge, near: Controller, iae: float, *, spread: float) -> Controller | None:
+def best_on_a_grid(
+    judge: Judge, near: Controller, iae: float, *, spread: float
+) -> Controller | None:
     """Return the best controller on grids over all gains, or None where none may beat ``near``.
 
     A controller whose integrated error, ``1/ki``, is larger than ``iae`` cannot have a smaller
@@ -97,7 +99,10 @@ def best_on_a_grid(judge: Judge, near: Controller, iae: float, *, spread: float)
     best: FloatArray | None = None
     least = 1.02 * iae
     for _ in range(ROUNDS):
-        axes = [c + r * np.linspace(-1.0, 1.0, n) for c, r, n in zip(centre, reach, counts, strict=True)]
+        axes = [
+            c + r * np.linspace(-1.0, 1.0, n)
+            for c, r, n in zip(centre, reach, counts, strict=True)
+        ]
         points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
         kp, ti = np.exp(points[:, 0]), np.exp(points[:, 1])
         td = np.exp(points[:, 2]) if derivative else np.zeros(kp.size)

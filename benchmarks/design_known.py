@@ -10,7 +10,7 @@ import argparse
 import math
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import reference  # noqa: F401  before numpy
 from ah_processes import FAMILIES
@@ -106,11 +106,8 @@ class Tally:
 
     refused: int = 0
     unstable: int = 0
-    ms: list[float] = None  # type: ignore[assignment]
-    ratios: list[float] = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        self.ms, self.ratios = [], []
+    ms: list[float] = field(default_factory=list)
+    ratios: list[float] = field(default_factory=list)
 
 
 def judged(model: TransferFunction, best: float, tallies: dict[str, Tally]) -> None:
@@ -120,9 +117,7 @@ def judged(model: TransferFunction, best: float, tallies: dict[str, Tally]) -> N
     :param best: IAE of the robust PI controller [y s/u].
     :param tallies: by rule, added to.
     """
-    task = DesignTask(
-        model=model, simple=fopdt_of(model), describing=describing_point_of(model)
-    )
+    task = DesignTask(model=model, simple=fopdt_of(model), describing=describing_point_of(model))
     for name, rule in RULES.items():
         tally = tallies.setdefault(name, Tally())
         try:
@@ -154,7 +149,7 @@ def rule_rows(tallies: dict[str, Tally]) -> Iterable[tuple[object, ...]]:
             name,
             tally.refused,
             tally.unstable,
-            f"{np.median(tally.ms):.2f}",
+            "unstable" if math.isinf(np.median(tally.ms)) else f"{np.median(tally.ms):.2f}",
             "unstable" if math.isinf(ninth) else f"{ninth:.2f}",
             three(float(np.median(tally.ratios))) if tally.ratios else "",
         )

@@ -37,6 +37,10 @@ _GAINS = {False: 64, True: 32}
 _TIMES = np.geomspace(3e-3, 1.0, 14)
 _FIRST_STEP, _SECOND_STEP, _LAST_STEP, _SHRINK, _GROW = 0.12, 0.08, 1e-3, 0.65, 1.5
 _DIRECTIONS = 16
+# Steps of kp, of the share of the largest ki, and of kd, that show whether less of it is better.
+_INWARD = np.array(
+    [(p, f, d) for p in (-0.03, 0.0, 0.03) for f in (-0.02, -0.1) for d in (0.0, 0.03)]
+)
 _TRIED_AT_ONCE = 40
 # What a bound may exceed 1 by.
 _LEAST_EXCESS, _LARGEST_EXCESS, _EXCESS_TOLERANCE = 0.01, 100.0, 0.01
@@ -297,28 +301,38 @@ class Search:
         :param iae: there [y s/u].
         """
         free = point.size - 1
-        stages = [(free, _FIRST_STEP), (free + 1, _FIRST_STEP), (free, _SECOND_STEP)]
+        point, iae = self._pattern(bounds, point, iae, free, _FIRST_STEP)
         if self.models and point[-1] == 0.0:
             # On the process itself a smaller integral gain was no better.
-            stages = stages[:1]
-        for size, first in stages:
-            rng = np.random.default_rng(0)
-            step, last = first, np.zeros((0, point.size))
-            while step > _LAST_STEP:
-                moves = np.zeros((_DIRECTIONS if size > 1 else 0, point.size))
-                moves[:, :size] = rng.standard_normal((len(moves), size))
-                moves /= np.linalg.norm(moves, axis=1)[:, None]
-                axes = np.eye(point.size)[:size]
-                tried = point + step * np.concatenate((axes, -axes, moves, last))
-                tried[:, -1] = np.minimum(tried[:, -1], 0.0)
-                iaes = self._worth(bounds, tried, iae)
-                best = int(np.argmin(iaes))
-                if iaes[best] < iae * (1.0 - 1e-7):
-                    # Along a ridge the way that led on once leads on again.
-                    last = (tried[best] - point)[None] / step
-                    point, iae, step = tried[best], float(iaes[best]), step * _GROW
-                else:
-                    step *= _SHRINK
+            return point, iae
+        inward = point + _INWARD[:, [0, *[2] * (free - 1), 1]]
+        if self._worth(bounds, inward, iae).min() < iae:
+            point, iae = self._pattern(bounds, point, iae, free + 1, _FIRST_STEP)
+        if free > 1:
+            point, iae = self._pattern(bounds, point, iae, free, _SECOND_STEP)
+        return point, iae
+
+    def _pattern(
+        self, bounds: Bounds, point: FloatArray, iae: float, size: int, first: float
+    ) -> tuple[FloatArray, float]:
+        """Move in the first ``size`` coordinates, by steps of ``first`` and less."""
+        rng = np.random.default_rng(0)
+        step, last = first, np.zeros((0, point.size))
+        while step > _LAST_STEP:
+            moves = np.zeros((_DIRECTIONS if size > 1 else 0, point.size))
+            moves[:, :size] = rng.standard_normal((len(moves), size))
+            moves /= np.linalg.norm(moves, axis=1)[:, None]
+            axes = np.eye(point.size)[:size]
+            tried = point + step * np.concatenate((axes, -axes, moves, last))
+            tried[:, -1] = np.minimum(tried[:, -1], 0.0)
+            iaes = self._worth(bounds, tried, iae)
+            best = int(np.argmin(iaes))
+            if iaes[best] < iae * (1.0 - 1e-7):
+                # Along a ridge the way that led on once leads on again.
+                last = (tried[best] - point)[None] / step
+                point, iae, step = tried[best], float(iaes[best]), step * _GROW
+            else:
+                step *= _SHRINK
         return point, iae
 
     def _nearby(self, bounds: Bounds, point: FloatArray) -> tuple[FloatArray, float] | None:
