@@ -122,17 +122,21 @@ def test_the_parameter_file_is_one_for_relay_node() -> None:
 
 
 def test_services_and_topics_in_commands_exist() -> None:
-    services = {name.removeprefix("~/") for name in names_of("service")}
+    served = {
+        (node.strip("`"), name.strip("`")): kind.strip("`")
+        for node, what, name, kind in rows("docs/messages.md", "node")
+        if what == "serves"
+    }
+    services = {name.removeprefix("~/") for _, name in served}
     calls = shell_commands("ros2", "service", "call")
     assert len(calls) >= 3
     for words in calls:
-        node, _, service = words[3].rpartition("/")
-        assert service in services
-        assert node.rpartition("/")[2] == "relay_node"
-        assert is_interface(words[4])
-        kind = getattr(importlib.import_module("relay_autotune_msgs.srv"), words[4][-9:])
-        fields = kind.Request.get_fields_and_field_types()
-        assert set(yaml.safe_load(words[5]) or {}) <= set(fields)
+        address, _, service = words[3].rpartition("/")
+        assert served[address.rpartition("/")[2], f"~/{service}"] == words[4]
+        package, _, kind = words[4].split("/")
+        request = getattr(importlib.import_module(f"{package}.srv"), kind).Request
+        given = yaml.safe_load(words[5]) if len(words) > 5 else {}
+        assert set(given or {}) <= set(request.get_fields_and_field_types())
     topics = {name.removeprefix("/") for name in names_of("topic")}
     for words in shell_commands("ros2", "topic", "echo"):
         (topic,) = (word for word in words[3:] if word.startswith("/"))
@@ -140,6 +144,28 @@ def test_services_and_topics_in_commands_exist() -> None:
     for page in GUIDE:
         for service in re.findall(r"`~/(\w+)`", page.read_text()):
             assert service in services, f"{page.name} names ~/{service}"
+
+
+def test_actions_in_commands_exist() -> None:
+    sent = shell_commands("ros2", "action", "send_goal")
+    assert sent
+    for words in sent:
+        assert words[3].rpartition("/")[2] in (ROOT / "docs/messages.md").read_text()
+        package, _, kind = words[4].split("/")
+        goal = getattr(importlib.import_module(f"{package}.action"), kind).Goal
+        assert set(yaml.safe_load(words[5]) or {}) <= set(goal.get_fields_and_field_types())
+
+
+def test_launch_files_in_commands_exist_and_take_these_arguments() -> None:
+    launched = shell_commands("ros2", "launch")
+    assert len(launched) >= 4
+    for words in launched:
+        assert words[2] == "relay_autotune"
+        file = ROOT / "launch" / words[3]
+        for word in words[4:]:
+            name, assigned, _ = word.partition(":=")
+            known = re.search(rf"""(<arg name=|name: |DeclareLaunchArgument\(\s*)"?{name}\b""", file.read_text())
+            assert known or not assigned, f"{file.name} has no argument {name}"
 
 
 def test_remapped_names_are_those_of_the_loop() -> None:
