@@ -236,11 +236,20 @@ def true_value(parameter: str, model: TransferFunction, truth: TransferFunction 
     :param model: the identified transfer function.
     :param truth: the process, of the same kind as the model.
     """
-    if truth is None or len(truth.time_constants) != len(model.time_constants):
+    if truth is None or _kind(truth) != _kind(model):
         return math.nan
-    if parameter == "time_constant" and len(truth.time_constants) == 1:
-        return truth.time_constants[0].real
-    return {"gain": truth.gain, "dead_time": truth.dead_time}.get(parameter, math.nan)
+    # An unstable process is written with K and tau > 0, and held with both turned around.
+    sign = -1.0 if model.structure.startswith("unstable") else 1.0
+    if parameter == "time_constant" and len(set(truth.time_constants)) == 1:
+        return sign * truth.time_constants[0].real
+    return {"gain": sign * truth.gain, "dead_time": truth.dead_time}.get(parameter, math.nan)
+
+
+def _kind(model: TransferFunction) -> tuple[int, int, int, bool]:
+    """Return what two models of one structure share; a document's truth has no name for it."""
+    poles = model.time_constants
+    unstable = any(t.real < 0.0 for t in poles)
+    return len(poles), len(model.zeros), model.integrators, unstable
 
 
 def ultimate_estimates(

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _FEW = 400
+_NUMBERED = 15
 _ROUNDING = 1e-6
 _WINDOW = 12
 
@@ -122,9 +123,9 @@ def _shade_cycles(axes: Axes, case: Case) -> None:
                 alpha=0.6, label=None if named else "disturbed cycle",
             )  # fmt: skip
             named = True
-        axes.axvline(cycle.start, color=GRID, lw=1.2, zorder=0.5)
-        axes.axvline(end, color=GRID, lw=1.2, zorder=0.5)
-        if len(case.cycles) <= 12:
+        if len(case.cycles) <= _NUMBERED:
+            axes.axvline(cycle.start, color=GRID, lw=1.2, zorder=0.5)
+            axes.axvline(end, color=GRID, lw=1.2, zorder=0.5)
             axes.annotate(
                 f"{cycle.index + 1}", (cycle.start + 0.5 * cycle.period, 0.0), (0, 4),
                 xycoords=("data", "axes fraction"), textcoords="offset points", ha="center",

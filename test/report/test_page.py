@@ -7,12 +7,14 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 from report_cases import MODEL, aborted, completed, fruitless, only
 
 from relay_autotune.document import document, model_fields, to_json
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.report.case import Case, case_of
+from relay_autotune.models import TransferFunction
+from relay_autotune.report.case import Case, case_of, true_value
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.from_document import cases_of_document, read_documents
 from relay_autotune.report.page import page
@@ -194,3 +196,12 @@ def test_a_simulated_process_is_compared_with_the_truth(tmp_path) -> None:
     assert truths["time_constant"] == 20.0
     assert truths["dead_time"] == 10.0
     assert truths["ultimate_frequency"] == pytest.approx(0.1837, abs=1e-4)
+
+
+def test_the_truth_is_in_the_terms_of_the_structure() -> None:
+    unstable = TransferFunction.unstable_fopdt(2.0, 5.0, 0.5)
+    names = ("gain", "time_constant", "dead_time", "damping")
+    found = [true_value(name, unstable, unstable) for name in names]
+    assert found[:3] == [2.0, 5.0, 0.5]
+    assert np.isnan(found[3])
+    assert np.isnan(true_value("gain", unstable, MODEL))
