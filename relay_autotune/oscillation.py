@@ -95,6 +95,8 @@ class Oscillation:
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
         self._limit = first_limit
         self._share = math.nan
+        self.switches = 0
+        """Number of switches so far."""
         self._shifts = 0
         self._begin()
 
@@ -111,6 +113,7 @@ class Oscillation:
         """
         relay = self._relay
         if relay.update(t, y):
+            self.switches += 1
             self._learn(relay.last_stay)
             self._shifts = 0
             begins = relay.is_high and not self._is_noise()

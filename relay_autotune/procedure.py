@@ -119,6 +119,11 @@ class Procedure:
         return self._oscillation.cycles if self._oscillation else []
 
     @property
+    def switches(self) -> int:
+        """Number of switches of the relay so far."""
+        return self._oscillation.switches if self._oscillation else 0
+
+    @property
     def cycle_start(self) -> list[int]:
         """Index of the first sample of each cycle, the unfinished one included."""
         return self._oscillation.cycle_start if self._oscillation else []

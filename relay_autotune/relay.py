@@ -145,6 +145,11 @@ class RelayExperiment:
         return len(self._procedure.cycles)
 
     @property
+    def switches(self) -> int:
+        """Number of switches of the relay so far; two of them are a half cycle."""
+        return self._procedure.switches
+
+    @property
     def cycle_start(self) -> tuple[int, ...]:
         """Index of the first sample of each cycle, see :class:`~relay_autotune.record.Record`."""
         return tuple(self._procedure.cycle_start)
@@ -261,16 +266,16 @@ class RelayExperiment:
         return self.safe_command
 
     def conclude(self, reason: str) -> float:
-        """Complete the experiment now, with the cycles there are; do nothing if it has ended.
+        """Complete the experiment now, with what there is; do nothing if it has ended.
 
         :param reason: why, for people.
         :returns: the command of :meth:`after_end` [u], to be sent now.
-        :raises ParameterError: if there is no whole cycle, from which nothing could be identified.
+        :raises ParameterError: if there is no half cycle, without which little is known.
         """
         if not self.finished:
-            if not self.cycle_count:
+            if self.switches < 2:
                 raise ParameterError(
-                    "an experiment cannot be completed before its first whole cycle; abort it"
+                    "an experiment cannot be completed before its first half cycle; abort it"
                 )
             self._procedure.end(State.COMPLETED, reason)
             self._ended(math.nan)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 
 # Where less than this part of the samples at rest equals the one before, the sensor's noise makes
 # every sample another one; so many equal ones in a row are then not by chance.
@@ -12,10 +11,12 @@ _FROZEN_SAMPLES = 20
 # Elsewhere a run of equal samples is compared with the longest one of the cycles before.
 _FROZEN_RATIO = 3.0
 
-# A step between two clocks shows in the least of so many differences, since a late sample is no
-# step; it counts from this size on [s].
+# A difference of clocks is known from so many samples; a step counts from this size on [s], and
+# where it could be a delay, if it lasts so long [s]. Of a drift this part is followed at a time.
 _STEP_SAMPLES = 10
 _STEP_LEAST = 0.05
+_STEP_LASTS = 1.0
+_FOLLOWED = 1e-3
 
 
 class FrozenWatch:
@@ -67,21 +68,22 @@ class FrozenWatch:
 class ClockWatch:
     """Recognise a step between the clock that stamps samples and the clock that receives them.
 
-    What a sample takes on its way varies, but not its least: the smallest difference of receive
-    and source time over 10 samples is compared with that over the first 10. A step forward of the
-    source's clock shows at once, since nothing arrives before it was sent.
+    What a sample takes on its way varies, and a busy machine may hold many of them back; but
+    nothing arrives before it was sent, and what was held back is soon caught up with. So receive
+    minus source time that is lower than before is a step at once, and a higher one if it stays so
+    for a second and 10 samples.
     """
 
     def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=_STEP_SAMPLES)
-        self._reference = math.nan
+        self._first: list[float] = []
+        self._begin = self._reference = math.nan
+        self._late_since = math.nan
+        self._late = 0
 
     @property
     def drift(self) -> float:
         """How far the clocks have moved against each other since the start [s]."""
-        if len(self._recent) < _STEP_SAMPLES:
-            return 0.0
-        return min(self._recent) - self._reference
+        return 0.0 if math.isnan(self._begin) else self._reference - self._begin
 
     def add(self, source: float, receive: float) -> str:
         """Take the two times of a sample; return a sentence if a clock has stepped, else "".
@@ -90,18 +92,26 @@ class ClockWatch:
         :param receive: when it arrived, on ours [s].
         """
         difference = receive - source
-        self._recent.append(difference)
-        if len(self._recent) < _STEP_SAMPLES:
+        if len(self._first) < _STEP_SAMPLES:
+            self._first.append(difference)
+            self._begin = self._reference = min(self._first)
             return ""
-        if math.isnan(self._reference):
-            self._reference = min(self._recent)
-        least = min(self._recent)
-        moved = least - self._reference
-        if abs(moved) <= _STEP_LEAST:
-            # A drift is followed, a step is not.
-            self._reference += 0.01 * moved
-            return ""
+        moved = difference - self._reference
+        if moved > _STEP_LEAST:
+            if self._late == 0:
+                self._late_since = receive
+            self._late += 1
+            lasting = receive - self._late_since > _STEP_LASTS and self._late >= _STEP_SAMPLES
+            return self._said(difference) if lasting else ""
+        self._late = 0
+        if moved < -_STEP_LEAST:
+            return self._said(difference)
+        # A drift is followed, a step is not.
+        self._reference += moved if moved < 0.0 else _FOLLOWED * moved
+        return ""
+
+    def _said(self, difference: float) -> str:
         return (
             f"a clock has stepped: receive minus source time went from {self._reference:.4g} s to "
-            f"{least:.4g} s; stop what sets the clocks, or give sample_period"
+            f"{difference:.4g} s; stop what sets the clocks, or give sample_period"
         )

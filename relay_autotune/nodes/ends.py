@@ -68,6 +68,9 @@ class Ends:
         self.cycles = node.create_publisher(
             RelayCycle, "relay_cycle", quality.latched(cycles_kept), event_callbacks=quiet
         )
+        self.progress = node.create_publisher(
+            RelayExperiment, "relay_progress", quality.RESULT, event_callbacks=quiet
+        )
         self.experiments = node.create_publisher(
             RelayExperiment, "relay_experiment", quality.RESULT, event_callbacks=quiet
         )

@@ -63,6 +63,7 @@ class IdentifierNode(ServedNode):
         # The method li takes the last two experiments together.
         self._earlier: Record | None = None
         self._fit_asked_for = False
+        self._progress: Any = None
         self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
         self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
         self.create_subscription(
@@ -70,6 +71,9 @@ class IdentifierNode(ServedNode):
         )
         self.create_subscription(
             RelayExperiment, "relay_experiment", self._on_experiment, quality.latched(10)
+        )
+        self.create_subscription(
+            RelayExperiment, "relay_progress", self._on_progress, quality.RESULT
         )
         self.create_service(Identify, "~/identify", self._on_identify)
         self.add_on_set_parameters_callback(self._on_set)
@@ -88,6 +92,27 @@ class IdentifierNode(ServedNode):
         if not self._fit_asked_for:
             self._fit_asked_for = True
             self.defer_until_idle(self._fit_cycles)
+
+    def _on_progress(self, message: Any) -> None:
+        """Take an experiment that is under way, to be fitted once nothing else waits."""
+        if message.experiment_id == self._ended:
+            return
+        waiting, self._progress = self._progress, message
+        if waiting is None:
+            self.defer_until_idle(self._fit_progress)
+
+    def _fit_progress(self) -> None:
+        message, self._progress = self._progress, None
+        if message is None or message.experiment_id == self._ended:
+            return
+        try:
+            record = record_from_message(message)
+        except RelayAutotuneError as error:
+            self.get_logger().warning(f"progress of {message.experiment_id}: {error}")
+            return
+        analysis = self._analyse(record, final=False)
+        if analysis is not None and analysis.model is not None:
+            self._publish_model(analysis, final=False)
 
     def _fit_cycles(self) -> None:
         self._fit_asked_for = False

@@ -55,7 +55,7 @@ from relay_autotune.relay import RelayExperiment, SafePolicy
 from relay_autotune.relay_parameters import ExperimentParameters
 from relay_autotune_msgs.srv import StartTune
 
-# How long the end of the process waits for the record to be acknowledged.
+# How long the end of the process waits for the record to be acknowledged
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Cycles that wait for who comes late, or max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
@@ -130,10 +130,9 @@ class RelayNode(ServedNode):
                 self._relay(command)
                 session.answered()
                 self._loop.commanded = command
-                experiment = session.experiment
-                if experiment.cycle_count != session.published_cycles:
-                    self._defer_cycles(session)
-                if experiment.finished:
+                if session.has_news:
+                    self._defer_news(session)
+                if session.experiment.finished:
                     self._leave(session, command)
             elif session.may_be_no_repeat:
                 self._answer_later(session)
@@ -221,6 +220,7 @@ class RelayNode(ServedNode):
             identity, self.get_parameter("record_directory").value
         )
         session.record_with(sample)
+        session.tells_switches = not converged and not self._on_setpoint
         # Numbers of several publishers cannot be told apart.
         self._counted = self._ends.measurement.get_publisher_count() == 1
         self._counter.begin()
@@ -233,10 +233,13 @@ class RelayNode(ServedNode):
 
     # While a tune runs.
 
-    def _defer_cycles(self, session: Session) -> None:
+    def _defer_news(self, session: Session) -> None:
         for index in range(session.published_cycles, session.experiment.cycle_count):
             self.defer(partial(self._publish_cycle, session, index))
         session.published_cycles = session.experiment.cycle_count
+        session.published_switches = session.experiment.switches
+        if session.tells_switches:
+            self.defer(lambda: self._ends.progress.publish(experiment_message(session)))
 
     def _publish_cycle(self, session: Session, index: int) -> None:
         self._action.tell(session.experiment)
@@ -248,8 +251,7 @@ class RelayNode(ServedNode):
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
 
     def _watch(self) -> None:
-        session, watchdog = self._session, self._watchdog
-        if session is None or watchdog is None:
+        if (session := self._session) is None or (watchdog := self._watchdog) is None:
             return
         timeout, silent = self.get_parameter("measurement_timeout").value, self._counter.age
         if silent < timeout:
@@ -292,11 +294,9 @@ class RelayNode(ServedNode):
 
     def _end_if_confident(self, session: Session, model: Any) -> None:
         reason = why_enough(session, model, self.get_parameter("confidence").value)
-        if not reason:
-            return
-        command = session.experiment.conclude(reason)
-        self._send_safe(command)
-        self._leave(session, command)
+        if reason:
+            self._send_safe(command := session.experiment.conclude(reason))
+            self._leave(session, command)
 
     # Ending.
 

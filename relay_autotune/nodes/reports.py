@@ -124,10 +124,10 @@ def why_enough(session: Session, model: Any, wanted: float) -> str:
     """
     gain = abs(model.ultimate_gain)
     found = 1.96 * model.ultimate_gain_std / gain if gain > 0.0 else math.nan
-    count = session.experiment.cycle_count
-    if not found <= wanted or not count:
+    experiment = session.experiment
+    if not found <= wanted or experiment.switches < 2:
         return ""
     return (
-        f"after {count} cycles the 95 % interval of K_u is within {found:.3g} of it, as narrow as "
-        f"asked, {wanted:g}"
+        f"after {experiment.switches} switches, {experiment.cycle_count} whole cycles, the 95 % "
+        f"interval of K_u is within {found:.3g} of it, as narrow as asked, {wanted:g}"
     )

@@ -43,7 +43,9 @@ class Session:
         self.experiment = experiment
         self.id = experiment_id
         self.start_ns = 0
-        self.published_cycles = 0
+        self.published_cycles = self.published_switches = 0
+        self.tells_switches = False
+        """True if each switch is news, too."""
         self.lost_samples = 0
         self._step = experiment.step
         self._period = sample_period
@@ -74,6 +76,14 @@ class Session:
     def sample_count(self) -> int:
         """Number of samples answered."""
         return self._count
+
+    @property
+    def has_news(self) -> bool:
+        """True if there is a cycle, or a switch where these are told, that was not published."""
+        experiment = self.experiment
+        if experiment.cycle_count != self.published_cycles:
+            return True
+        return self.tells_switches and experiment.switches != self.published_switches
 
     def now_ns(self) -> int:
         """Return the present time on the clock of the experiment [ns]."""

@@ -175,25 +175,28 @@ def test_a_coarse_sensor_that_freezes_is_recognised_after_a_cycle():
     assert 20 < frozen.index(True) < 120
 
 
-def test_a_step_of_a_clock_is_told_from_a_late_sample():
+def test_a_step_of_a_clock_is_told_from_late_samples():
     rng = np.random.default_rng(2)
     watch = ClockWatch()
-    latency = 1e-4 + rng.exponential(1e-3, 2000)
-    latency[500] = 0.7  # one late sample
+    latency = 1e-4 + rng.exponential(1e-3, 1000)
+    latency[500] = 0.7
+    # A machine that was busy for 0.6 s, and then takes all at once.
+    latency[700:760] = 0.6 - 0.01 * np.arange(60)
     for k in range(1000):
         assert not watch.add(0.01 * k, 0.01 * k + latency[k] + 1e-5 * k)
-    assert watch.drift == pytest.approx(0.0, abs=0.02)
+    # The drift of 10 ms is followed, slowly.
+    assert 0.002 < watch.drift < 0.012
     # The source's clock goes forward: nothing arrives before it was sent.
-    said = watch.add(10.0 + 0.3, 10.0 + 0.001)
+    said = watch.add(10.0 + 0.3, 10.0 + 0.011)
     assert "a clock has stepped" in said
 
 
-def test_a_step_of_the_receiving_clock_shows_within_ten_samples():
+def test_a_step_of_the_receiving_clock_shows_when_it_lasts():
     watch = ClockWatch()
     for k in range(50):
         assert not watch.add(0.01 * k, 0.01 * k + 0.001)
-    said = [watch.add(0.01 * k, 0.01 * k + 0.2) for k in range(50, 70)]
-    assert [bool(s) for s in said].index(True) == 9
+    said = [watch.add(0.01 * k, 0.01 * k + 0.2) for k in range(50, 200)]
+    assert [bool(s) for s in said].index(True) == pytest.approx(101, abs=1)
 
 
 def test_a_sensor_out_of_order_is_no_runaway_but_an_instability_is():
@@ -259,7 +262,7 @@ def test_an_integrating_process_is_held_after_the_end():
 def test_a_tune_can_be_concluded_before_its_cycles_agree():
     tune = experiment(until_converged=False, max_cycles=50)
     plant, command = FopdtPlant(1.0, 1.0, 1.0), 0.0
-    with pytest.raises(ParameterError, match="before its first whole cycle"):
+    with pytest.raises(ParameterError, match="before its first half cycle"):
         tune.conclude("K_u is known")
     for k in range(1000):
         command = tune.step(0.05 * k, plant.advance(0.05 * k, command))

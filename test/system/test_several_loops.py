@@ -72,8 +72,8 @@ def test_two_loops_tune_at_once(rig: Rig) -> None:
         # A busy machine steps the plant late, which is part of what is measured.
         assert loop.models[-1].ultimate_gain == pytest.approx(loop.truth, rel=0.25)
     confident = loops[0].experiments[0]
-    assert "the 95 % interval of K_u is within" in confident.reason
-    assert 1 <= len(confident.cycle_start) - 1 < 40
+    assert "interval of K_u is within" in confident.reason
+    assert len(confident.cycle_start) < 40
     # Relay and identifier have agreed on it by topic: the last model before the end was enough.
     early = [m for m in loops[0].models if not m.final][-1]
     assert 1.96 * early.ultimate_gain_std / early.ultimate_gain <= 0.05
