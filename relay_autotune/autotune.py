@@ -75,6 +75,13 @@ class Analysis:
         """The gains that count."""
         return None if self.recommended is None else self.gains[self.recommended]
 
+    def _repr_html_(self) -> str:
+        """Return model and gains as a table, as notebooks show it."""
+        # Imported here, since nothing else needs it.
+        from relay_autotune.notebook import analysis_html
+
+        return analysis_html(self)
+
 
 def check_names(method: str, rule: str) -> None:
     """Refuse unknown names before any work is done.
