@@ -164,7 +164,9 @@ def test_launch_files_in_commands_exist_and_take_these_arguments() -> None:
         file = ROOT / "launch" / words[3]
         for word in words[4:]:
             name, assigned, _ = word.partition(":=")
-            known = re.search(rf"""(<arg name=|name: |DeclareLaunchArgument\(\s*)"?{name}\b""", file.read_text())
+            known = re.search(
+                rf"""(<arg name=|name: |DeclareLaunchArgument\(\s*)"?{name}\b""", file.read_text()
+            )
             assert known or not assigned, f"{file.name} has no argument {name}"
 
 
@@ -225,3 +227,21 @@ def test_the_guide_has_the_fields_of_the_document() -> None:
         "field of gains": experiment["gains"][0],
     }.items():
         assert [row[0] for row in rows("docs/replay.md", column)] == [f"`{f}`" for f in fields]
+
+
+@pytest.mark.parametrize(
+    ("page", "known"),
+    [("docs/methods.md", METHODS), ("docs/rules.md", RULES)],
+    ids=["methods", "rules"],
+)
+def test_each_method_and_rule_has_a_source_and_says_when_it_fails(page: str, known: Any) -> None:
+    text = (ROOT / page).read_text()
+    for name in known:
+        section = re.search(rf"^## {name}\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)[1]
+        sourced = r"\b(18|19|20)\d\d\b|the same paper|the paper's|Thyagarajan and Yu's"
+        same_as = r"[Tt]he same with|as for `"
+        assert re.search(f"{sourced}|{same_as}", section, re.IGNORECASE), f"{name} has no source"
+        equations = r"```|^\| |" + same_as + r"|kc of \+2 dB"
+        assert re.search(equations, section, re.MULTILINE), f"{name} has no equation"
+        limits = r"fails|misleads|is refused|It is for|for a stable|needs|is slow|matters"
+        assert re.search(limits, section), f"{name} does not say when it fails"
