@@ -82,6 +82,8 @@ class NodeParameter:
             return f"one of {', '.join(filter(None, self.choices))}"
         if isinstance(self.default, str):
             return "a text"
+        if isinstance(self.default, bool):
+            return "true or false"
         unit = f" {self.unit}" if self.unit else ""
         text = "finite numbers" if isinstance(self.default, tuple) else "a finite number"
         if math.isfinite(self.lower) and math.isfinite(self.upper):
