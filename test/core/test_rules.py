@@ -347,7 +347,7 @@ def test_an_unstable_process_beyond_reach_is_refused():
     with pytest.raises(TuningError, match="1 is the limit"):
         unstable(task(_T.unstable_fopdt(1.0, 1.0, 1.2), controller="pi"))
     with pytest.raises(TuningError, match="2 is the limit"):
-        unstable(task(_T.unstable_fopdt(1.0, 1.0, 2.5)))
+        unstable(task(_T.unstable_fopdt(1.0, 1.0, 2.5), controller="pid"))
     assert unstable(task(_T.unstable_fopdt(1.0, 1.0, 0.05)))[0].td == 0.0
     assert unstable(task(_T.unstable_fopdt(1.0, 1.0, 0.3)))[0].td > 0.0
 
@@ -418,7 +418,7 @@ ANY = {
 }
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=15)
 @given(
     gain=st.floats(0.05, 50.0) | st.floats(-50.0, -0.05),
     tau=st.floats(1e-3, 1e4),

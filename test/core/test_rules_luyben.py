@@ -90,15 +90,16 @@ def test_an_integral_time_may_be_too_short_for_the_resonance():
 
 
 @pytest.mark.parametrize(
-    "model",
+    ("model", "kind"),
     [
-        DRUM,
-        TransferFunction.integrator_inverse(-0.547, 0.418, 1.06, 0.1),
-        TransferFunction.ipdt(0.5, 2.0),
-        TransferFunction.integrator_lag(3.0, 2.0, 0.5),
+        (DRUM, "pi"),
+        (DRUM, "pid"),
+        (TransferFunction.integrator_inverse(-0.547, 0.418, 1.06, 0.1), "pi"),
+        (TransferFunction.ipdt(0.5, 2.0), "pi"),
+        (TransferFunction.integrator_lag(3.0, 2.0, 0.5), "pi"),
+        (TransferFunction.integrator_lag(-3.0, 2.0, 0.5), "pid"),
     ],
 )
-@pytest.mark.parametrize("kind", ["pi", "pid"])
 def test_the_loop_has_the_resonance_that_was_asked_for(model, kind):
     found, reason = luyben2003(task(model, controller=kind))
     loop = analyse_loop(found, model)
