@@ -55,6 +55,8 @@ class Analysis:
     :param gains: every rule's gains that apply to the selected model, the chosen rule's first.
     :param recommended: index of the gains that count; None: there are none.
     :param reason: why there is no model or no gains; empty where there are both.
+    :param added_delay: dead time beside the process's own with which the gains were judged [s]:
+        half a sampling period of the controller, and what else its loop adds.
     """
 
     record: Record
@@ -64,6 +66,7 @@ class Analysis:
     gains: tuple[Gains, ...] = ()
     recommended: int | None = None
     reason: str = ""
+    added_delay: float = 0.0
 
     @property
     def model(self) -> Identification | None:
@@ -228,17 +231,21 @@ def _tuned(
         except TuningError:
             # A rule that does not apply has nothing to compare.
             continue
-    return replace(found, gains=tuple(gains), recommended=0)
+    delay = task.options.added_delay
+    return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
 
 def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
-    """Take noise and amplitude from the record where they are not given."""
+    """Take noise, amplitude and sampling period from the record where they are not given."""
     record, chosen = found.record, found.models[0]
     if math.isnan(options.noise_std):
         measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
         options = replace(options, noise_std=measured)
     if math.isnan(options.amplitude) and record.settings is not None:
         options = replace(options, amplitude=abs(record.settings.amplitude))
+    if options.sample_period == 0.0 and len(record) > 1:
+        # The controller will see the same measurement.
+        options = replace(options, sample_period=float(np.median(np.diff(record.time))))
     return options
 
 

@@ -8,7 +8,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
 from relay_autotune.models import TransferFunction
 from relay_autotune.registry import look_up
-from relay_autotune.tuning.analysis import analyse_loop, is_stable
+from relay_autotune.tuning.analysis import analyse_loop, cautions, is_stable
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
 from relay_autotune.tuning.gains import Controller, Gains, Performance
 from relay_autotune.tuning.robust import robust
@@ -86,10 +86,13 @@ def design(task: DesignTask, rule: str) -> Gains:
     :raises TuningError: as :func:`tune`.
     """
     controller, reason = rule_named(rule)(task)
-    performance = analyse_loop(controller, task.in_loop(task.model))
+    performance = analyse_loop(controller, task.in_loop(task.model), task.options.sample_period)
+    warnings = cautions(performance, task)
     if not task.models:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
-        return Gains.of(rule, controller, performance, ms_95=performance.ms, reason=reason)
+        return Gains.of(
+            rule, controller, performance, ms_95=performance.ms, reason=reason, warnings=warnings
+        )
     around = [task.in_loop(model) for model in task.models]
     ms_95 = max(ensemble_ms(controller, around), performance.ms)
-    return Gains.of(rule, controller, performance, ms_95=ms_95, reason=reason)
+    return Gains.of(rule, controller, performance, ms_95=ms_95, reason=reason, warnings=warnings)

@@ -10,8 +10,12 @@ from relay_autotune.tuning.margins import frequencies, margins, sensitivity_peak
 from relay_autotune.tuning.noise import noise_gain
 from relay_autotune.tuning.responses import step_figures
 from relay_autotune.tuning.stability import closed_loop_unstable_poles
+from relay_autotune.tuning.task import DesignTask
 
-__all__ = ["analyse_loop", "frequencies", "is_stable", "sensitivity_peaks"]
+# What was asked for may be missed by so little without a word.
+_HELD = 1.01
+
+__all__ = ["analyse_loop", "cautions", "frequencies", "is_stable", "sensitivity_peaks"]
 
 
 def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
@@ -53,6 +57,30 @@ def analyse_loop(
         effort_load=figures.effort_load,
         noise_gain=noise_gain(controller, model, sample_period),
     )
+
+
+def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
+    """Return what the user must know before using gains, a sentence each.
+
+    :param performance: of the gains on the model.
+    :param task: what was asked for.
+    """
+    options, found = task.options, []
+    bounds = {
+        "Ms": (performance.ms, options.ms),
+        "Mt": (performance.mt, options.largest_mt(task.model)),
+    }
+    for name, (value, asked) in bounds.items():
+        if value > _HELD * asked:
+            found.append(f"{name} is {value:.3g}, above the {asked:g} that was asked for")
+    noise = performance.noise_gain * options.noise_std
+    known = options.sample_period > 0.0 and options.amplitude > 0.0
+    if known and noise > _HELD * options.noise_share * options.amplitude:
+        found.append(
+            f"the noise alone moves the command by {noise:.3g} (standard deviation), "
+            f"{100.0 * noise / options.amplitude:.0f} % of the relay's amplitude"
+        )
+    return tuple(found)
 
 
 def _at_rest(terms: tuple[TransferFunction, ...]) -> float | None:

@@ -10,6 +10,7 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.models import TransferFunction
+from relay_autotune.tuning import design
 from relay_autotune.tuning.analysis import analyse_loop, is_stable
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.robust import robust
@@ -158,3 +159,15 @@ def test_a_pi_controller_cannot_hold_what_only_pid_can():
     )
     with pytest.raises(TuningError, match="no PI controller"):
         robust(task)
+
+
+def test_gains_carry_what_the_user_must_know():
+    model = TransferFunction.fopdt(1.0, 1.0, 0.5)
+    loud = DesignOptions(noise_std=0.5, amplitude=1.0, sample_period=0.02)
+    gains = design(DesignTask(model=model, options=loud), "ziegler_nichols")
+    assert any("Ms is" in w and "above the 1.4" in w for w in gains.warnings)
+    assert any("of the relay's amplitude" in w for w in gains.warnings)
+    gains = design(DesignTask(model=model), "robust")
+    assert gains.warnings == ()
+    # The noise of a controller whose sampling period is not known cannot be told.
+    assert gains.noise_gain >= gains.kc
