@@ -76,6 +76,7 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "selected": analysis.selected,
         "gains": [gains_fields(gains) for gains in analysis.gains],
         "recommended": analysis.recommended,
+        "added_delay": _number(analysis.added_delay),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +117,7 @@ class Case:
     :param cycles: the whole cycles; empty where there are no samples.
     :param models_around: models within the uncertainty of the one that counts.
     :param points: of the frequency response, by Fourier integrals over the cycles.
+    :param added_delay: dead time that the controller's loop adds to the process [s].
     """
 
     source: str
@@ -136,6 +137,7 @@ class Case:
     cycles: tuple[Cycle, ...] = ()
     models_around: tuple[TransferFunction, ...] = ()
     points: tuple[FrequencyPoint, ...] = ()
+    added_delay: float = 0.0
 
     @property
     def model(self) -> ModelCase | None:
@@ -146,6 +148,15 @@ class Case:
     def best_gains(self) -> Gains | None:
         """The gains that count."""
         return None if self.recommended is None else self.gains[self.recommended]
+
+
+def in_loop(case: Case, model: TransferFunction) -> TransferFunction:
+    """Return a process with the dead time that the controller's loop adds to it.
+
+    :param case: the experiment.
+    :param model: the process.
+    """
+    return replace(model, dead_time=model.dead_time + case.added_delay)
 
 
 def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None = None) -> Case:
@@ -176,6 +187,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         settings=record.settings or infer_settings(record),
         cycles=analysis.cycles or _cycles(record),
         models_around=around,
+        added_delay=analysis.added_delay,
         points=next((m.points for m in analysis.models if m.points), ()),
     )
 

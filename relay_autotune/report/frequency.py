@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.models import TransferFunction
-from relay_autotune.report.case import Case
+from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import (
     BLUE,
     INK,
@@ -48,7 +48,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     assert gains is not None
     assert found is not None
     axes = figure.subplots()
-    loop = gains.loop(found.model)
+    loop = gains.loop(in_loop(case, found.model))
     w = _loop_frequencies(loop)
     circle = Circle((-1.0, 0.0), 1.0 / gains.ms, fill=False, ec=VERMILLION, lw=1.5, ls=(0, (5, 2)))
     circle.set_label(f"Ms = {gains.ms:.2f}")
@@ -59,7 +59,8 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     limits = (-2.3, 1.3), (-2.3, 1.3)
     if case.models_around:
         grid = w[:: max(1, w.size // 140)]
-        values = np.array([gains.loop(m)(1j * grid) for m in case.models_around])
+        around = [gains.loop(in_loop(case, m)) for m in case.models_around]
+        values = np.array([each(1j * grid) for each in around])
         near = np.all(np.abs(values) < 6.0, axis=0)
         area = swept_area(values[:, near])
         axes.add_patch(PathPatch(area, fc=SKY, ec="none", alpha=0.45, label="95 % band"))
@@ -67,7 +68,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     axes.plot(values.real, values.imag, color=BLUE, lw=1.8, label="loop")
     if case.points:
         measured = np.array([p.frequency for p in case.points])
-        controller = gains.transfer_function()(1j * measured)
+        controller = gains(1j * measured) * np.exp(-1j * measured * case.added_delay)
         at = controller * np.array([p.value for p in case.points])
         axes.plot(at.real, at.imag, "D", ms=5, mfc=PAPER, mec=INK, mew=1.3, label="measured")
     axes.plot([-1.0], [0.0], "+", ms=11, mew=2.0, color=INK)

@@ -96,6 +96,7 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         gains=gains,
         recommended=_index(e["recommended"], gains),
         limit_cycle=None if cycle is None else _limit_cycle(cycle),
+        added_delay=_number(e.get("added_delay", 0.0)),
         points=tuple(_point(p) for m in e["models"] for p in m.get("points", ())),
     )
 

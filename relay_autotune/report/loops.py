@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.models import TransferFunction
-from relay_autotune.report.case import Case
+from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import BLUE, INK, MUTED, VERMILLION, finish, in_steps
 from relay_autotune.tuning import Gains
 from relay_autotune.tuning.closed_loop import ClosedLoop, simulate_closed_loop
@@ -30,8 +30,9 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     assert case.best_gains is not None
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
-    half = _half(case.best_gains, case.model.model)
-    run = _run(case.best_gains, case.model.model, half)
+    model = in_loop(case, case.model.model)
+    half = _half(case.best_gains, model)
+    run = _run(case.best_gains, model, half)
     if run is not None:
         above.plot(run.time, run.measurement, color=VERMILLION, lw=2.0)
         below.plot(*in_steps(run.time, run.command), color=BLUE, lw=1.5)
@@ -58,7 +59,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     """
     assert case.best_gains is not None
     assert case.model is not None
-    model = case.model.model
+    model = in_loop(case, case.model.model)
     half = _half(case.best_gains, model)
     best = _run(case.best_gains, model, half)
     others = distinct_gains(case)[1:]
