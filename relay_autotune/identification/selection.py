@@ -103,7 +103,13 @@ class Selection:
         if first.cost <= _MUCH_BETTER * self._floor:
             return
         second = refine_best(later, start_fopdt(later, self._sign), tolerance=_TRIAL)
-        if _MUCH_BETTER * second.cost / later.time.size < first.cost / whole.time.size:
+        enough = _MUCH_BETTER * second.cost / later.time.size
+        if enough >= first.cost / whole.time.size:
+            return
+        # A long first swing from rest shows small lags, which a FOPDT lacks.
+        third = replace(self._problem, structure=known_structures.THREE_LAGS)
+        flexible = refine_best(third, Starts(third, self._fopdt).third(), tolerance=_TRIAL)
+        if flexible.cost / third.time.size > enough:
             self._problem, self._fopdt = later, second
 
     def candidate(self, problem: Problem, state: State) -> Candidate | None:

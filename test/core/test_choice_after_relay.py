@@ -52,3 +52,15 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     assert found.model.gain == pytest.approx(1.0, rel=0.03)
     assert found.ultimate_frequency == pytest.approx(_point(model).frequency, rel=0.01)
     assert not any("drift" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
+    model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)
+    record = _record(model, 0.0018, seed)
+    found = identify_waveform(record)
+    assert found.fit.residual_rms < 3.0 * 0.0018
+    # All of it is explained but the first samples, if those.
+    assert np.mean(np.isfinite(found.fitted)) > 0.9
+    assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=0.03)
+    assert found.model.gain == pytest.approx(1.0, rel=0.02)
