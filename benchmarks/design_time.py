@@ -81,7 +81,9 @@ def main() -> int:
     options = parser.parse_args()
     rows, beside = [], []
     for title, model in list(PROCESSES.items())[: 1 if options.quick else None]:
-        timings = take_turns(works(model), 1 if options.quick else TURNS)
+        timings = take_turns(
+            works(model), 1 if options.quick else TURNS, warm_up=not options.quick
+        )
         beside.append(timings.pop("reference").seconds)
         rows += [
             (
