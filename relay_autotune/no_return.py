@@ -40,9 +40,15 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
     away = way_back <= max(_BACK * whole, level, 6.0 * noise_std)
     if away and third - float(towards[0]) < -level:
         faster = " faster and faster" if second - third > first - second > 0.0 else ""
+        rests = abs(third - second) <= level
+        other = (
+            "a load has come that the relay cannot bear"
+            if rests
+            else "the process is unstable and the amplitude too small to hold it"
+        )
         return (
             f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, or "
-            f"the process is unstable and the amplitude too small to hold it"
+            f"{other}"
         )
     if abs(third - second) <= level:
         return (

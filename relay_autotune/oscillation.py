@@ -94,6 +94,7 @@ class Oscillation:
         self._until_converged = until_converged
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
         self._limit = first_limit
+        self._patient_from = -math.inf
         self._share = math.nan
         self.switches = 0
         """Number of switches so far."""
@@ -119,7 +120,7 @@ class Oscillation:
             begins = relay.is_high and not self._is_noise()
             due = t + self._parameters.extra_delay
             self._on_the_way.append((due, relay.is_high, begins))
-        elif t - relay.since > self._limit:
+        elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
         waiting = self._on_the_way
         while waiting and waiting[0][0] <= t + _ROUNDING * self._samples.interval:
@@ -277,7 +278,8 @@ class Oscillation:
             self._shift((0.5 if self._is_high else -0.5) * self._levels.amplitude)
             if self.command != before:
                 self._shifts += 1
-                self._relay.since = t
+                # What it needs now is half of the patience that is used up.
+                self._patient_from = t - 0.5 * self._limit
                 return
         stay = [k for k, s in enumerate(self._samples.time) if s >= self._relay.since]
         time, measurement, _ = self._samples.columns(stay[0], len(self._samples))

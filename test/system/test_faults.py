@@ -25,6 +25,18 @@ from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment
 BASELINE = 1.0
 SAFE = 0.75
 PERIOD = 0.005
+RELAY = {
+    "amplitude": 0.5,
+    "baseline": BASELINE,
+    "safe_command": SAFE,
+    "settle_time": 0.15,
+    "measurement_timeout": 0.8,
+    "controller_timeout": 0.6,
+    "feedback_timeout": 0.3,
+    "max_cycles": 100,
+    "min_cycles": 100,
+    "process_gain_sign": 1,
+}
 
 
 class Loop:
@@ -105,18 +117,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
         rig = Rig(domain, tmp_path_factory.mktemp("faults"))
         try:
             made = Loop(rig)
-            rig.relay(
-                amplitude=0.5,
-                baseline=BASELINE,
-                safe_command=SAFE,
-                settle_time=0.15,
-                measurement_timeout=0.8,
-                controller_timeout=0.6,
-                feedback_timeout=0.3,
-                max_cycles=100,
-                min_cycles=100,
-                process_gain_sign=1,
-            )
+            rig.relay(**RELAY)
             rig.identifier()
             yield made
         finally:
