@@ -31,11 +31,11 @@ from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.topics import Topics
 
 TOPICS = ("/measurement", "/command")
-MESSAGES, QUICK_MESSAGES = 2_000_000, 20_000
+MESSAGES, QUICK_MESSAGES = 2_000_000, 4_000
 GROWTH = (100_000, 1_000_000, 10_000_000, 30_000_000)
 QUICK_GROWTH = (10_000, 100_000)
 # 27 MB a second.
-IMAGE_SECONDS, QUICK_IMAGE_SECONDS = 150, 2
+IMAGE_SECONDS, QUICK_IMAGE_SECONDS = 150, 1
 LARGE, QUICK_LARGE = 68_000_000, 100_000
 TURNS = 7
 
@@ -221,6 +221,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small files: does it run?")
     parser.add_argument("--folder", type=Path, help="where to make the files, 5 GB")
+    parser.add_argument(
+        "--messages", type=int, default=MESSAGES, help="of the comparison (%(default)s)"
+    )
     parser.add_argument("--part", choices=PARTS, help="one of the tables alone")
     parser.add_argument("--memory-of", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -229,21 +232,21 @@ def main() -> int:
         return 0
     with tempfile.TemporaryDirectory(dir=options.folder, prefix="bag_reading_") as name:
         for part in [options.part] if options.part else PARTS:
-            print(PARTS[part](Path(name), options.quick), flush=True)
+            print(PARTS[part](Path(name), options), flush=True)
     return 0
 
 
-def comparison_table(folder: Path, quick: bool) -> str:
+def comparison_table(folder: Path, options: argparse.Namespace) -> str:
     """Return the table of (a) and (g)."""
-    count, turns = (QUICK_MESSAGES, 1) if quick else (MESSAGES, TURNS)
+    count, turns = (QUICK_MESSAGES, 1) if options.quick else (options.messages, TURNS)
     headings = ("pair", "this", *LIBRARIES, "faster", "target", "x zstd alone", "target")
     said = f"Million messages a second, of {count:,} on two topics; least time of {turns}:"
     return f"{said}\n\n{table(headings, comparison(folder, count, turns))}\n"
 
 
-def images_table(folder: Path, quick: bool) -> str:
+def images_table(folder: Path, options: argparse.Namespace) -> str:
     """Return the table of (b) and (c)."""
-    length, turns = (QUICK_IMAGE_SECONDS, 1) if quick else (IMAGE_SECONDS, 3)
+    length, turns = (QUICK_IMAGE_SECONDS, 1) if options.quick else (IMAGE_SECONDS, 3)
     headings = (
         *("images and numbers", "[GB]", "this [ms]", "bytes alone [ms]", "x", "target"),
         *("memory beyond the signals [MB]", "target"),
@@ -252,10 +255,10 @@ def images_table(folder: Path, quick: bool) -> str:
     return f"{said}\n\n{table(headings, images(folder, length, turns))}\n"
 
 
-def large_table(folder: Path, quick: bool) -> str:
+def large_table(folder: Path, options: argparse.Namespace) -> str:
     """Return the table of (c)."""
     path = folder / "large.mcap"
-    write_recording(path, pair_of_numbers(QUICK_LARGE if quick else LARGE))
+    write_recording(path, pair_of_numbers(QUICK_LARGE if options.quick else LARGE))
     peak, signals = memory(path)
     row = (*map(three, (path.stat().st_size / 1e9, peak, signals, peak - signals)), "<= 300")
     path.unlink()
@@ -264,14 +267,14 @@ def large_table(folder: Path, quick: bool) -> str:
     return f"{said}\n\n{table(headings, [row])}\n"
 
 
-def growth_table(folder: Path, quick: bool) -> str:
+def growth_table(folder: Path, options: argparse.Namespace) -> str:
     """Return the table of (d)."""
-    rows = growth(folder, QUICK_GROWTH if quick else GROWTH, 1 if quick else TURNS)
+    rows = growth(folder, QUICK_GROWTH if options.quick else GROWTH, 1 if options.quick else TURNS)
     said = "Time and number of messages, uncompressed:"
     return f"{said}\n\n{table(('messages', '[ms]', 'ns/message'), rows)}\n"
 
 
-PARTS: dict[str, Callable[[Path, bool], str]] = {
+PARTS: dict[str, Callable[[Path, argparse.Namespace], str]] = {
     "comparison": comparison_table,
     "images": images_table,
     "large": large_table,

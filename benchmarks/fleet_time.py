@@ -23,7 +23,7 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant
 from relay_autotune.response import response
 
-BAGS, QUICK_BAGS = 1000, 2
+BAGS, QUICK_BAGS = 1000, 1
 START = 1_790_000_000_000_000_000
 
 
@@ -50,7 +50,7 @@ def make(folder: Path, count: int) -> list[str]:
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two bags: does it run?")
+    parser.add_argument("--quick", action="store_true", help="one bag: does it run?")
     parser.add_argument("--count", type=int, default=BAGS, help="bags (%(default)s)")
     options = parser.parse_args()
     replay = shutil.which("replay")

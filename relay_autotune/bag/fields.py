@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 
 from relay_autotune.bag.cdr import Path, Step
+from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Number, Repeated, Struct, Type, numeric_paths
 from relay_autotune.errors import SelectionError
 
@@ -21,6 +22,8 @@ _MEANT = {
 }
 
 _STEP = re.compile(r"\.?([A-Za-z]\w*)|\[(\d{1,9})\]")
+
+_FIELDS_OF_SINGLE = 2
 
 # Fields that a message of an error lists at most.
 _LISTED = 12
@@ -80,6 +83,19 @@ def only_field(root: Struct) -> str | None:
         return _MEANT[root.name]
     found = list(itertools.islice(_listed(root), 2))
     return found[0] if len(found) == 1 and "[" not in found[0] else None
+
+
+def may_be_single(channel: Channel) -> bool:
+    """Tell by a look at its definition whether a topic's messages may be there for one number.
+
+    A robot's bag holds hundreds of types; to parse all of them takes seconds.
+    """
+    if channel.type in _MEANT or channel.schema_encoding != "ros2msg":
+        return True
+    own = channel.definition.split(b"\n===", 1)[0]
+    lines = (line.split(b"#", 1)[0].strip() for line in own.splitlines())
+    # A header, and the field; a line with a value is that of a constant.
+    return sum(bool(line) and b"=" not in line for line in lines) <= _FIELDS_OF_SINGLE
 
 
 def stamp_of(root: Struct) -> tuple[Path, Path] | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.bag.cdr import Path
 from relay_autotune.bag.decode import decode_messages
-from relay_autotune.bag.fields import named_field, only_field, split_name, stamp_of
+from relay_autotune.bag.fields import may_be_single, named_field, only_field, split_name, stamp_of
 from relay_autotune.bag.limits import MOST_EXPECTED
 from relay_autotune.bag.locate import Messages
 from relay_autotune.bag.mcap_file import McapFile
@@ -110,7 +110,7 @@ class Topics:
         for file in self.files:
             for channel in file.channels.values():
                 try:
-                    alone = only_field(self._type(channel)) is not None
+                    alone = may_be_single(channel) and only_field(self._type(channel)) is not None
                 except BagError:
                     alone = False
                 found[channel.topic] = alone and found.get(channel.topic, True)
