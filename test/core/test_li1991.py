@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,11 +83,13 @@ def test_a_point_of_a_pure_delay_has_the_phase_of_what_was_added():
     assert abs(value) == pytest.approx(math.pi / 4.0)
 
 
-def _records(process: TransferFunction, epsilon: float, noise: float) -> list[Record]:
+def _records(
+    process: TransferFunction, epsilon: float, noise: float, bias: float = 0.0
+) -> list[Record]:
     found = []
     for number, added in enumerate((0.0, 1.5)):
         reverse = process.gain < 0.0
-        relay = RelaySettings(5.0, 1.0, 0.7, 0.0, epsilon, added, reverse_acting=reverse)
+        relay = RelaySettings(5.0, 1.0, 0.7, bias, epsilon, added, reverse_acting=reverse)
         end = simulate_relay(process, relay, cycles=8).command.times[-1]
         run = simulate_relay(process, relay, cycles=8, time=np.linspace(0.0, end, 3200))
         rng = np.random.default_rng(number)
@@ -146,11 +147,11 @@ def test_one_record_is_refused_with_what_to_do():
 
 def test_records_that_do_not_belong_together_are_refused():
     process = TransferFunction.fopdt(2.0, 3.0, 1.0)
-    first, second = _records(process, 0.0, 0.0)
+    first = _records(process, 0.0, 0.0)[0]
     turned = _records(TransferFunction.fopdt(-2.0, 3.0, 1.0), 0.0, 0.0)[1]
     with pytest.raises(IdentificationError, match="not of one process"):
         identify_jointly((first, turned), "li")
-    biased = replace(second, settings=replace(second.settings, bias=0.2))
+    biased = _records(process, 0.0, 0.0, bias=0.2)[1]
     with pytest.raises(IdentificationError, match="bias"):
         identify_jointly((first, biased), "li")
 
