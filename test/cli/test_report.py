@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from report_cases import completed, fruitless, only
 
-from relay_autotune.cli import report
+from relay_autotune.cli import replay, report
 from relay_autotune.document import document, to_json
 from relay_autotune.report import figures
 
@@ -110,3 +110,14 @@ def test_what_does_not_fit_is_said_in_a_line(
     assert (found, out) == (status, "")
     assert complaint in err
     assert err.count("\n") == 1
+
+
+def test_replay_writes_the_report_beside_its_table(capsys, tmp_path, monkeypatch) -> None:
+    only(monkeypatch, "uncertainty")
+    monkeypatch.setattr("relay_autotune.autotune.analyse", lambda record, **_: completed())
+    write_csv(tmp_path / "log.csv")
+    page = tmp_path / "page.html"
+    assert replay.main([str(tmp_path / "log.csv"), "--report", str(page)]) == 0
+    assert "Gains to type in" in page.read_text()
+    assert replay.main([str(tmp_path / "log.csv"), "--report", str(tmp_path / "page.doc")]) == 2
+    assert "does not say what the report is to be" in capsys.readouterr().err

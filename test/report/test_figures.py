@@ -11,7 +11,7 @@ from report_cases import SETTINGS, completed, fruitless
 
 from relay_autotune.record import Record
 from relay_autotune.report import draw
-from relay_autotune.report.case import case_of
+from relay_autotune.report.case import case_of, in_loop
 from relay_autotune.report.experiment import rate_of, switches_of
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.frequency import swept_area
@@ -84,6 +84,14 @@ def test_the_band_of_the_nyquist_curve_holds_95_percent_of_its_models() -> None:
     # Its neighbours' part adds to what each ellipse holds.
     assert min(inside) > 0.94
     assert inside[0] < 0.985
+
+
+def test_the_circle_of_ms_touches_the_loop_that_is_drawn() -> None:
+    case = case_of(completed(), "tank")
+    assert case.added_delay > 0.0
+    loop = case.best_gains.loop(in_loop(case, case.model.model))
+    nearest = np.abs(1.0 + loop(1j * np.geomspace(1e-3, 1.0, 20_000))).min()
+    assert 1.0 / nearest == pytest.approx(case.best_gains.ms, rel=1e-6)
 
 
 def test_rules_that_give_the_same_gains_are_drawn_once() -> None:
