@@ -54,7 +54,7 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     assert not any("drift" in w for w in found.warnings)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [3, 15])
 def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
     model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)
     record = _record(model, 0.0018, seed)
