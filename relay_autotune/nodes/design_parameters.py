@@ -31,7 +31,7 @@ DESIGN_PARAMETERS = (
         "sample_period",
         _DEFAULT.sample_period,
         "s",
-        "Period of the controller to be, half of which counts as dead time; 0: continuous.",
+        "Period of the controller to be, half of which counts as dead time; 0: the recording's.",
         0.0,
     ),
     NodeParameter(

@@ -153,8 +153,8 @@ def test_replay_exports_the_gains_of_a_recording(capsys):
     asked = ["--rule", "imc", "--loop-delay", "0.5", "--export", "pid_controller", "--dof", "oven"]
     assert replay.main([*asked, bag]) == 0
     found = as_loaded(capsys.readouterr().out)
-    # 1.65 e^(-10 s)/(20 s + 1) with half a second more.
-    assert found["gains.oven.p"] == pytest.approx(25.25 / (1.65 * 1.7 * 10.5), rel=1e-6)
+    # 1.65 e^(-10 s)/(20 s + 1) with half a second more, and half of the recording's 0.2 s.
+    assert found["gains.oven.p"] == pytest.approx(25.3 / (1.65 * 1.7 * 10.6), rel=1e-6)
     for more in (["bags/step_test"], ["--json"]):
         assert replay.main([*asked, bag, *more]) == 2
         assert "one bag alone" in capsys.readouterr().err

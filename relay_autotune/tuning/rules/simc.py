@@ -78,9 +78,9 @@ def simc(task: DesignTask) -> tuple[Controller, str]:
         kc = process.lag / (process.gain * total)
         ti = min(process.lag, 4.0 * total)
     ideal = SeriesForm(kc, ti, process.second, 0.0).isa()
+    chosen = "" if given is None else ", as given,"
     reason = (
-        f"SIMC with tau_c = {closed:.4g} s{'' if given is None else ', as given,'} and an effective "
-        f"delay of {process.delay:.4g} s"
+        f"SIMC with tau_c = {closed:.4g} s{chosen} and an effective delay of {process.delay:.4g} s"
     )
     return controller(task, ideal.kc, ideal.ti, ideal.td), reason
 
