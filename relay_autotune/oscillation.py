@@ -26,10 +26,14 @@ _ROUNDING = 1e-6
 
 # The part of a period at the high level is known when two cycles agree in it this far; a load has
 # come when it then differs by more than the other. A load that stops the oscillation altogether
-# is borne by shifts of half the amplitude, so many at a time.
+# is borne by shifts of this part of the amplitude, so many at a time.
 _SAME_SHARE = 0.03
 _OTHER_SHARE = 0.08
-_MOST_SHIFTS = 4
+_MOST_SHIFTS = 2
+_SHIFT = 0.7
+
+# Once a whole cycle was seen, this part of the patience is enough.
+_PATIENCE_IN_CYCLES = 0.4
 
 _SIGNS = {1: "positive", -1: "negative"}
 
@@ -145,7 +149,11 @@ class Oscillation:
     def _learn(self, stay: float) -> None:
         self._patience.learn(stay, self._samples.interval)
         p = self._parameters
-        self._limit = p.max_half_cycle or self._patience.limit + 2.0 * p.extra_delay
+        limit = self._patience.limit
+        if self.cycles:
+            least = Patience.LEAST_SAMPLES * self._samples.interval
+            limit = max(_PATIENCE_IN_CYCLES * limit, least)
+        self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
 
     def _is_noise(self) -> bool:
         amplitude, bias = self._levels.amplitude, abs(self._levels.bias)
@@ -275,7 +283,7 @@ class Oscillation:
         if self.cycles and self._shifts < _MOST_SHIFTS:
             # It did oscillate: a load may have come that one of the levels cannot bear.
             before = self.command
-            self._shift((0.5 if self._is_high else -0.5) * self._levels.amplitude)
+            self._shift((_SHIFT if self._is_high else -_SHIFT) * self._levels.amplitude)
             if self.command != before:
                 self._shifts += 1
                 # What it needs now is half of the patience that is used up.
