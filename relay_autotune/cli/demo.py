@@ -250,9 +250,10 @@ def _compare(found: Analysis) -> None:
         error = 100.0 * (estimate / value - 1.0)
         found_text = f"{digits(estimate):>10}     {interval:<20} {error:+.2f} %"
         print(f"  {name:<16} {value:>7.4g}   {found_text}")
-    print(f"PI gains ({gains.reason}):")
+    kind, derivative = ("PID", f", td {digits(gains.td)} s") if gains.td else ("PI", "")
+    print(f"{kind} gains ({gains.reason}):")
     print(
-        f"  kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s   "
+        f"  kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s{derivative}   "
         f"(parallel: p {digits(gains.p)}, i {digits(gains.i)})   "
         f"Ms {gains.ms:.2f}, for 95 % of the models below {gains.ms_95:.2f}"
     )
