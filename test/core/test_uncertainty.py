@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relay_autotune.errors import ParameterError
+from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification import Known, estimate, identify
 from relay_autotune.identification.lags import FOPDT
 from relay_autotune.identification.profiles import profile_ends
@@ -204,3 +204,20 @@ def test_steps_of_the_sensor_larger_than_its_noise_are_told_and_widen_the_interv
     dithered = replace(noisy, measurement=np.round(noisy.measurement / 0.1) * 0.1)
     found = identify(dithered, "waveform", GIVEN)
     assert not any("steps of" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_limit_cycle_that_no_structure_explains_gives_a_warning_or_a_reason(seed):
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 100.0, 400)
+    command = np.where(np.mod(time, 20.0) < 10.0, 1.0, -1.0)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 7)
+    shape = sum(np.sin(k * np.pi * time / 10.0 + p) / k for k, p in enumerate(phases, start=1))
+    record = Record(time, shape + 0.01 * rng.standard_normal(400), command, noise_std=0.01)
+    try:
+        found = identify(record)
+    except IdentificationError as reason:
+        assert str(reason)
+        return
+    assert np.all(np.isfinite(found.values))
+    assert any("not white" in w or "larger than the noise" in w for w in found.warnings)
