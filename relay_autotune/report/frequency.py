@@ -33,6 +33,7 @@ ComplexArray = NDArray[np.complex128]
 # 95 % of a normal distribution in the plane lie within so many standard deviations.
 _ELLIPSE = math.sqrt(-2.0 * math.log(0.05))
 _CORNERS = 24
+_TURNS = -2.5
 
 
 def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
@@ -80,12 +81,16 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
 
 
 def _loop_frequencies(loop: TransferFunction) -> FloatArray:
-    """Return frequencies from where the loop is large to where it has died away."""
+    """Return frequencies from where the loop is large to where it has died away.
+
+    A dead time turns what is left about the origin for ever, which says no more after a few turns.
+    """
     from relay_autotune.tuning.analysis import frequencies
 
     grid = frequencies(loop)
     size = np.abs(loop(1j * grid))
-    return np.asarray(grid[(size < 20.0) & (size > 0.01)])
+    shown = (size < 20.0) & (size > 0.01) & (loop.phase(grid) > _TURNS * 2.0 * math.pi)
+    return np.asarray(grid[shown])
 
 
 def swept_area(values: ComplexArray) -> Path:
