@@ -102,6 +102,16 @@ def seconds(work: Callable[..., object], *arguments: object) -> float:
     return time.process_time() - begin
 
 
+def from_disk(path: Path, work: Callable[..., object], *arguments: object) -> float:
+    """Return the time by the clock that a work takes with a file that is not in memory."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+    begin = time.perf_counter()
+    work(*arguments)
+    return time.perf_counter() - begin
+
+
 def compressed_chunks(chunks: Iterable[Chunk]) -> list[tuple[bytes, int]]:
     """Return the chunks as the file holds them, with their sizes."""
     compressor = zstandard.ZstdCompressor()
@@ -165,8 +175,8 @@ def images(folder: Path, length: int, turns: int) -> list[tuple[str, ...]]:
         plain = needed_bytes(path)
         mine, base = [], []
         for _ in range(turns):
-            mine.append(seconds(ours, path))
-            base.append(seconds(plain))
+            mine.append(from_disk(path, ours, path))
+            base.append(from_disk(path, plain))
         name = f"{'apart' if apart else 'mixed'}, {compression or 'uncompressed'}"
         size = path.stat().st_size / 1e9
         peak, signals = memory(path)
@@ -251,7 +261,7 @@ def images_table(folder: Path, options: argparse.Namespace) -> str:
         *("images and numbers", "[GB]", "this [ms]", "bytes alone [ms]", "x", "target"),
         *("memory beyond the signals [MB]", "target"),
     )
-    said = "The pair, 100 messages a second, in a bag of camera images:"
+    said = "The pair, 6,000 messages a second, in a bag of camera images that is on the disk:"
     return f"{said}\n\n{table(headings, images(folder, length, turns))}\n"
 
 

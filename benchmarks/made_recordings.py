@@ -193,7 +193,7 @@ def among_others(count: int) -> Iterator[Chunk]:
 
 
 def among_images(seconds: int, *, apart: bool) -> Iterator[Chunk]:
-    """Yield chunks of 30 camera images a second, and 100 messages a second of the pair.
+    """Yield chunks of 30 camera images a second, and 6,000 messages a second of the pair.
 
     :param seconds: length of the recording.
     :param apart: whether images and numbers lie in different chunks.

@@ -19,7 +19,14 @@ from relay_autotune.bag.locate import (
     messages_by_channel,
     record_offsets,
 )
-from relay_autotune.bag.mcap_index import Segment, damage_note, read_layout, segment_content
+from relay_autotune.bag.mcap_index import (
+    Segment,
+    damage_note,
+    is_chunk_there,
+    read_layout,
+    scan,
+    segment_content,
+)
 from relay_autotune.bag.mcap_records import Channel, DamageError
 from relay_autotune.bag.source import Source
 
@@ -48,6 +55,7 @@ class McapFile:
         self.metadata = layout.declared.metadata
         self.notes = [*self._source.notes, *layout.notes]
         self.segments = layout.segments
+        self._unseen = layout.by_index
         self._counts = layout.declared.message_counts
 
     def __enter__(self) -> Self:
@@ -84,9 +92,7 @@ class McapFile:
             different channels can be put into the order of the file; the messages.
         """
         wanted, before = frozenset(channels), 0
-        for segment in self.segments:
-            if segment.channels is not None and segment.channels.isdisjoint(wanted):
-                continue
+        for segment in self._with(wanted):
             try:
                 content = segment_content(self._source, segment, self._largest)
                 found = self._found(segment, content, wanted)
@@ -96,6 +102,19 @@ class McapFile:
             for channel, messages in found.items():
                 yield channel, before, messages
             before += len(content) + _SMALLEST_RECORD
+
+    def _with(self, wanted: frozenset[int]) -> list[Segment]:
+        """Return the segments that may hold messages of some channels."""
+
+        def chosen() -> list[Segment]:
+            return [s for s in self.segments if s.channels is None or s.channels & wanted]
+
+        # Only the chunks that are read are looked at before: on a disk each look takes its time.
+        if self._unseen and not all(is_chunk_there(self._source, s) for s in chosen()):
+            layout = scan(self._source, self._largest)
+            self.segments, self._unseen = layout.segments, False
+            self.notes += [note for note in layout.notes if note not in self.notes]
+        return chosen()
 
     def _found(
         self, segment: Segment, content: Content, wanted: frozenset[int]

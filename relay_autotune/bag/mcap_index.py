@@ -77,11 +77,13 @@ class Layout:
     :param declared: channels and metadata.
     :param segments: in the order of the file.
     :param notes: what was found amiss, each a sentence.
+    :param by_index: whether the index says so, whose places are yet to be looked at.
     """
 
     declared: Declarations = field(default_factory=Declarations)
     segments: list[Segment] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    by_index: bool = False
 
 
 def segment_content(source: Source, segment: Segment, largest: int) -> Content:
@@ -108,7 +110,13 @@ def read_layout(source: Source, largest: int) -> Layout:
     :param largest: size that a chunk may have [bytes].
     """
     layout = _by_summary(source)
-    return _by_scan(source, largest) if layout is None else layout
+    return scan(source, largest) if layout is None else layout
+
+
+def is_chunk_there(source: Source, segment: Segment) -> bool:
+    """Return whether a chunk of the index begins where that says."""
+    head = source.read(segment.start, segment.start + RECORD.size)
+    return head == RECORD.pack(CHUNK, segment.end - segment.start - RECORD.size)
 
 
 # --- by the index at the end
@@ -131,7 +139,7 @@ def _by_summary(source: Source) -> Layout | None:
     # The checksum covers the summary and the footer up to the checksum itself.
     if crc and crc != zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(summary)):
         return None
-    layout = Layout()
+    layout = Layout(by_index=True)
     try:
         for opcode, begin, end in records(summary):
             if opcode == CHUNK_INDEX:
@@ -177,11 +185,6 @@ def _check_chunks(source: Source, layout: Layout, data_end: int) -> None:
                 raise DamageError("data that the index does not know")
             if opcode == METADATA:
                 layout.declared.take(opcode, _bounded(source, begin, end))
-        if chunk.is_chunk:
-            length = chunk.end - chunk.start - RECORD.size
-            head = source.read(chunk.start, chunk.start + RECORD.size)
-            if head != RECORD.pack(CHUNK, length):
-                raise DamageError("the index does not lead to a chunk")
         position = max(chunk.end, chunk.index_end)
 
 
@@ -286,8 +289,8 @@ class _Scan:
         if self._chunk is None or end - begin < 6:
             return
         ends = self.source.read(begin, begin + 14) + self.source.read(end - 16, end - 8)
-        if end - begin < 22:
-            # A channel without messages in the chunk.
+        if end - begin < 22 or len(ends) < 22:
+            # A channel without messages in the chunk, or a file that shrank.
             return
         channel, _, first, last = struct.unpack("<HIQQ", ends)
         self._chunk.index[channel] = position
@@ -352,6 +355,8 @@ class _Scan:
         stop = min(position + _PIECE, self.source.size)
         piece = self.source.read(position, stop)
         offsets, end = record_offsets(piece)
+        if len(piece) < RECORD.size:
+            return position
         if end == 0:
             # A record larger than a piece, or one that is cut.
             length = unsigned(piece, 1, "<Q")
@@ -378,7 +383,12 @@ class _Scan:
         self.last = max(self.last, last)
 
 
-def _by_scan(source: Source, largest: int) -> Layout:
+def scan(source: Source, largest: int) -> Layout:
+    """Return what a file holds by going through it, without its index.
+
+    :param largest: size that a chunk may have [bytes].
+    """
+    source.look_again()
     return _Scan(source, largest).run()
 
 

@@ -49,11 +49,15 @@ class Source:
         try:
             if self.read(0, len(_ZSTD_MAGIC)) == _ZSTD_MAGIC:
                 self._expand()
-            self.size = os.fstat(self._file.fileno()).st_size
+            self.look_again()
             self._check_start()
         except BaseException:
             self.close()
             raise
+
+    def look_again(self) -> None:
+        """Take the size that the file has now; it may have grown or shrunk."""
+        self.size = os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
         """Let go of the file."""
