@@ -37,12 +37,15 @@ def unequal_gains(record: Record, model: TransferFunction) -> str | None:
 
     :param record: the record, with the relay's settings.
     :param model: the model fitted to it, with a stable or integrating process.
-    :return: a sentence, or None where the two agree.
+    :return: a sentence, or None where the two agree, or cannot be told apart.
     """
     settings = record.settings
     if settings is None or any(t.real < 0.0 for t in model.time_constants):
         return None
     u = record.input()
+    if u.initial != settings.baseline:
+        # Between two levels alone, either part is the other one scaled and moved.
+        return None
     parts = []
     for keep in (np.maximum, np.minimum):
         values = keep(u.values - settings.baseline, 0.0)

@@ -17,6 +17,7 @@ from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome, PiecewiseConstant, Record, RelaySettings
 from relay_autotune.response import response
+from relay_autotune.sampled_relay import simulate_sampled_relay
 from relay_autotune.simulation import Plant
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -89,6 +90,14 @@ def test_a_linear_process_raises_no_alarm(seed):
     record = _record(1.0, seed=seed)
     assert unequal_gains(record, MODEL) is None
     assert disagreeing_point(record, MODEL, 0.002) is None
+    assert identify_waveform(record, Known(structure="fopdt")).warnings == ()
+
+
+def test_a_record_that_begins_within_the_relay_raises_no_alarm():
+    settings = RelaySettings(setpoint=0.0, baseline=0.0, amplitude=1.0, bias=0.2, hysteresis=0.05)
+    noise = 0.01 * np.random.default_rng(0).standard_normal(1000)
+    record = simulate_sampled_relay(MODEL, settings, period=0.2, noise=noise)
+    assert record.input().initial != settings.baseline
     assert identify_waveform(record, Known(structure="fopdt")).warnings == ()
 
 
