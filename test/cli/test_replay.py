@@ -106,6 +106,8 @@ def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, ca
         "fit",
         "whiteness_p",
         "prediction",
+        "noise_to_signal",
+        "noise_to_signal_power",
     }
     best = experiment["gains"][experiment["recommended"]]
     for name in ("kc", "ti", "td", "tf", "b", "p", "i", "d", "ms", "mt", "iae_load"):

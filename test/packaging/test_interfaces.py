@@ -154,8 +154,11 @@ def test_every_field_says_what_it_is(file: str):
 def test_floats_have_a_unit(file: str):
     """Each float's comment names its unit in brackets, unless it is a mere number."""
     mere = {"b", "fit", "gain_margin", "ms", "ms_95", "mt", "progress", "whiteness_p"}
-    mere |= {"gain_margin_low", "effort_load"}
+    mere |= {"gain_margin_low", "effort_load", "support"}
     in_the_parameters_unit = {"std", "covariance", "ci95_low", "ci95_high"}
+    in_the_parameters_unit |= {
+        f"combination_{n}" for n in ("value", "std", "ci95_low", "ci95_high")
+    }
     polynomials = {"numerator", "denominator"}
     compared = {"overshoot", "overshoot_predicted", "gain_ratio", "ms_predicted"}
     exempt = mere | compared | in_the_parameters_unit | polynomials
