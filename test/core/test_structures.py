@@ -178,3 +178,19 @@ def test_a_structure_that_is_not_in_the_data_can_be_forced():
     found = identify_waveform(_record(PROCESSES["lag_n"], 0.02), Known(structure="fopdt"))
     assert found.structure == "fopdt"
     assert any("not white" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_rival_rings_faster_than_the_samples_show(seed):
+    """In noise, a resonance between two samples fits as well as none, and has any height."""
+    period, noise = 0.005, 0.01
+    time = np.arange(327) * period
+    u = PiecewiseConstant(np.array((0.6, 0.95, 1.25)), np.array((0.65, -0.35, 0.65)), 0.0)
+    model = TransferFunction.fopdt(2.0, 0.2, 0.1)
+    y = response(model, time, u) + noise * np.random.default_rng(seed).standard_normal(time.size)
+    command = u(time)
+    found = identify_waveform(Record(time, y, command))
+    for candidate in (found.model, *(rival.model for rival in found.rivals)):
+        for constant in candidate.time_constants:
+            assert constant.imag == 0.0 or 2.0 * np.pi * abs(constant) >= 4.0 * period
+    assert found.ultimate_gain_std < 0.03 * found.ultimate_gain
