@@ -209,6 +209,8 @@ def build(packages: list[str], ros: str | None) -> None:
     environment["PATH"] = f"{VENV / 'bin'}{os.pathsep}{environment['PATH']}"
     if not ros:
         environment["AMENT_PREFIX_PATH"] = environment["CMAKE_PREFIX_PATH"] = str(VENV)
+    # By itself colcon compiles one file at a time on a machine that is busy with something else.
+    environment["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
     python = str(VENV / "bin/python")
     cmake = ["-Wno-dev", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"]
     colcon = [python, "-m", "colcon", "--log-level", "error", "build", "--symlink-install"]
