@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.errors import ModelError
+from relay_autotune.model_parameters import at_least_one, exactly, oscillating_pair, positive
 from relay_autotune.notation import process_latex, process_text
 
 ComplexArray = NDArray[np.complex128]
@@ -190,21 +191,21 @@ class TransferFunction:
     @classmethod
     def fopdt(cls, gain: float, time_constant: float, dead_time: float) -> TransferFunction:
         """Return ``K exp(-D s)/(tau s + 1)`` (model 1 of Chang et al., eq 1 of Wang et al.)."""
-        return cls(gain, (), (_positive(time_constant),), 0, dead_time, "fopdt")
+        return cls(gain, (), (positive(time_constant),), 0, dead_time, "fopdt")
 
     @classmethod
     def lag_n(
         cls, gain: float, time_constant: float, order: int, dead_time: float
     ) -> TransferFunction:
         """Return ``K exp(-D s)/(tau s + 1)^n`` (models 2 and 3 of Chang et al.)."""
-        return cls(gain, (), (_positive(time_constant),) * order, 0, dead_time, "lag_n")
+        return cls(gain, (), (positive(time_constant),) * order, 0, dead_time, "lag_n")
 
     @classmethod
     def lag_n_zero(
         cls, gain: float, time_constant: float, order: int, zero: float, dead_time: float
     ) -> TransferFunction:
         """Return ``K (z s + 1) exp(-D s)/(tau s + 1)^n``; z < 0 is an inverse response."""
-        tau = (_positive(time_constant),) * order
+        tau = (positive(time_constant),) * order
         return cls(gain, (zero,), tau, 0, dead_time, "lag_n_zero")
 
     @classmethod
@@ -216,7 +217,7 @@ class TransferFunction:
         Underdamped: give the two conjugate time constants, or use :meth:`oscillator`.
         """
         name = "sopdt_zero" if zero else "sopdt"
-        return cls(gain, (zero,), _exactly(2, time_constants), 0, dead_time, name)
+        return cls(gain, (zero,), exactly(2, time_constants), 0, dead_time, name)
 
     @classmethod
     def oscillator(
@@ -228,7 +229,7 @@ class TransferFunction:
         zero: float = 0.0,
     ) -> TransferFunction:
         """Return ``K (z s + 1) exp(-D s)/(s^2/w0^2 + 2 zeta s/w0 + 1)``, any damping."""
-        pair = _pair(natural_frequency, damping)
+        pair = oscillating_pair(natural_frequency, damping)
         return cls.sopdt(gain, pair, dead_time, zero)
 
     @classmethod
@@ -236,7 +237,7 @@ class TransferFunction:
         cls, gain: float, repeated: float, single: float, dead_time: float
     ) -> TransferFunction:
         """Return ``K exp(-D s)/((tau1 s + 1)^2 (tau2 s + 1))`` (model 5 of Chang et al.)."""
-        constants = (_positive(repeated), _positive(repeated), _positive(single))
+        constants = (positive(repeated), positive(repeated), positive(single))
         return cls(gain, (), constants, 0, dead_time, "two_equal_one")
 
     @classmethod
@@ -244,7 +245,7 @@ class TransferFunction:
         cls, gain: float, time_constants: Sequence[float], dead_time: float
     ) -> TransferFunction:
         """Return ``K exp(-D s)/((tau1 s + 1)(tau2 s + 1)(tau3 s + 1))``."""
-        return cls(gain, (), _exactly(3, time_constants), 0, dead_time, "three_lags")
+        return cls(gain, (), exactly(3, time_constants), 0, dead_time, "three_lags")
 
     @classmethod
     def lag_complex(
@@ -256,7 +257,7 @@ class TransferFunction:
         dead_time: float,
     ) -> TransferFunction:
         """Return ``K exp(-D s)/((tau s + 1)(s^2/w0^2 + 2 zeta s/w0 + 1))``."""
-        constants = (_positive(time_constant), *_pair(natural_frequency, damping))
+        constants = (positive(time_constant), *oscillating_pair(natural_frequency, damping))
         return cls(gain, (), constants, 0, dead_time, "lag_complex")
 
     @classmethod
@@ -269,7 +270,7 @@ class TransferFunction:
         cls, gain: float, time_constant: float, dead_time: float
     ) -> TransferFunction:
         """Return ``K exp(-D s)/(s (tau s + 1))``."""
-        return cls(gain, (), (_positive(time_constant),), 1, dead_time, "integrator_lag")
+        return cls(gain, (), (positive(time_constant),), 1, dead_time, "integrator_lag")
 
     @classmethod
     def integrator_inverse(
@@ -280,22 +281,22 @@ class TransferFunction:
         :param zero: tau1 > 0 [s].
         :param time_constant: tau2 > 0 [s].
         """
-        tau = (_positive(time_constant),)
-        return cls(gain, (-_positive(zero),), tau, 1, dead_time, "integrator_inverse")
+        tau = (positive(time_constant),)
+        return cls(gain, (-positive(zero),), tau, 1, dead_time, "integrator_inverse")
 
     @classmethod
     def unstable_fopdt(
         cls, gain: float, time_constant: float, dead_time: float
     ) -> TransferFunction:
         """Return ``K exp(-D s)/(tau s - 1)`` with tau > 0 (Thyagarajan and Yu, eq 13)."""
-        return cls(-gain, (), (-_positive(time_constant),), 0, dead_time, "unstable_fopdt")
+        return cls(-gain, (), (-positive(time_constant),), 0, dead_time, "unstable_fopdt")
 
     @classmethod
     def unstable_sopdt(
         cls, gain: float, unstable: float, stable: float, dead_time: float
     ) -> TransferFunction:
         """Return ``K exp(-D s)/((tau1 s - 1)(tau2 s + 1))`` with tau1, tau2 > 0."""
-        constants = (-_positive(unstable), _positive(stable))
+        constants = (-positive(unstable), positive(stable))
         return cls(-gain, (), constants, 0, dead_time, "unstable_sopdt")
 
     @classmethod
@@ -323,24 +324,24 @@ class TransferFunction:
         tau, d = tuple(time_constants), dead_time
 
         def one() -> float:
-            return float(_exactly(1, tau)[0].real)
+            return float(exactly(1, tau)[0].real)
 
         def zero() -> float:
-            return float(_exactly(1, zeros, "zeros")[0].real)
+            return float(exactly(1, zeros, "zeros")[0].real)
 
         match structure:
             case "fopdt":
                 return cls.fopdt(gain, one(), d)
             case "lag_n":
-                return cls.lag_n(gain, one(), _at_least_one(order), d)
+                return cls.lag_n(gain, one(), at_least_one(order), d)
             case "lag_n_zero":
-                return cls.lag_n_zero(gain, one(), _at_least_one(order), zero(), d)
+                return cls.lag_n_zero(gain, one(), at_least_one(order), zero(), d)
             case "sopdt" | "sopdt_zero":
                 z = zero() if structure == "sopdt_zero" else 0.0
-                pair = tau or _pair(natural_frequency, damping)
+                pair = tau or oscillating_pair(natural_frequency, damping)
                 return cls.sopdt(gain, pair, d, z)
             case "two_equal_one":
-                repeated, single = (c.real for c in _exactly(2, tau))
+                repeated, single = (c.real for c in exactly(2, tau))
                 return cls.two_equal_one(gain, repeated, single, d)
             case "three_lags":
                 return cls.three_lags(gain, tau, d)
@@ -355,7 +356,7 @@ class TransferFunction:
             case "unstable_fopdt":
                 return cls.unstable_fopdt(gain, one(), d)
             case "unstable_sopdt":
-                unstable, stable = (c.real for c in _exactly(2, tau))
+                unstable, stable = (c.real for c in exactly(2, tau))
                 return cls.unstable_sopdt(gain, unstable, stable, d)
         raise ModelError(f"unknown structure {structure!r}; known: {', '.join(STRUCTURES[:-1])}")
 
@@ -376,34 +377,3 @@ STRUCTURES = (
     "unstable_sopdt",
     "general",
 )
-
-
-def _positive(time_constant: float) -> float:
-    if not time_constant > 0.0:
-        raise ModelError(f"a time constant here must be > 0 s, found {time_constant:g} s")
-    return float(time_constant)
-
-
-def _at_least_one(order: int) -> int:
-    if order < 1:
-        raise ModelError(f"the order of equal lags must be at least 1, found {order}")
-    return order
-
-
-def _exactly(
-    count: int, constants: Sequence[complex], name: str = "time_constants"
-) -> tuple[complex, ...]:
-    if len(constants) != count:
-        raise ModelError(f"the structure needs {name} of length {count}, found {len(constants)}")
-    return tuple(complex(c) for c in constants)
-
-
-def _pair(natural_frequency: float, damping: float) -> tuple[complex, complex]:
-    """Time constants of ``s^2/w0^2 + 2 zeta s/w0 + 1``."""
-    if not natural_frequency > 0.0:
-        raise ModelError(f"a natural frequency must be > 0 rad/s, found {natural_frequency:g}")
-    root = np.emath.sqrt(complex(damping * damping - 1.0))
-    return (
-        complex((damping + root) / natural_frequency),
-        complex((damping - root) / natural_frequency),
-    )

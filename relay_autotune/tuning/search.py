@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.candidates import Candidates, NoiseLimit
+from relay_autotune.tuning.design_grid import design_grid
 from relay_autotune.tuning.frontier import Bounds, Responses
 from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.gains import Controller
@@ -54,42 +56,6 @@ _NO_LIMIT = (
     "nothing limits the gain of a controller on this model, which has no dead time: give the "
     "controller's sampling period or the loop's delay"
 )
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Controllers to compare, the sign of their process left out.
-
-    :param kp: proportional gains, shape (k,).
-    :param ki: integral gains, shape (k,).
-    :param td: derivative times [s], shape (k,).
-    :param tf: time constants of the filter [s], shape (k,).
-    """
-
-    kp: FloatArray
-    ki: FloatArray
-    td: FloatArray
-    tf: FloatArray
-
-    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
-        return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
-
-    def controller(self, k: int, sign: int) -> Controller:
-        """Return one of them for a process of a sign."""
-        kp, ki = float(self.kp[k]), float(self.ki[k])
-        return Controller(sign * kp, kp / ki, float(self.td[k]), float(self.tf[k]))
-
-
-@dataclass(frozen=True)
-class NoiseLimit:
-    """How much of the measurement noise may reach the command.
-
-    :param gain: largest standard deviation of the command over that of the noise [u/y].
-    :param period: of the samples [s].
-    """
-
-    gain: float
-    period: float
 
 
 @dataclass(frozen=True)
@@ -420,26 +386,3 @@ class Search:
 def allowed_outside(count: int) -> int:
     """Return how many of so many models may exceed a bound."""
     return int((1.0 - _SHARE) * count + 1e-9)
-
-
-def design_grid(model: TransferFunction, frequency: float) -> FloatArray:
-    """Return the frequencies at which bounds are tested [rad/s].
-
-    :param model: the process.
-    :param frequency: about which the loop is closed [rad/s].
-    """
-    parts = [
-        frequency * np.geomspace(low, high, count)
-        for low, high, count in ((1e-3, 0.1, 70), (0.1, 10.0, 220), (10.0, 100.0, 60))
-    ]
-    if model.dead_time > 0.0:
-        # With derivative action a lag of first order lets every turn pass alike, up to the filter.
-        flat = len(model.time_constants) + model.integrators - len(model.zeros) <= 1
-        turns = np.arange(0.1, (24.0 if flat else 8.0) * math.pi, 0.2) / model.dead_time
-        parts.append(turns[turns < 300.0 * frequency])
-    for c in (*model.zeros, *model.time_constants):
-        if c.imag > 0.0 and abs(c.real) < 0.5 * abs(c):
-            width = abs(c.real) / abs(c)
-            around = (1.0 + width * np.linspace(-6.0, 6.0, 49)) / abs(c)
-            parts.append(around[around > 0.0])
-    return np.unique(np.concatenate(parts))

@@ -1,0 +1,49 @@
+"""Controllers that a search compares, and what limits what they make of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.tuning.gains import Controller
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Controllers to compare, the sign of their process left out.
+
+    :param kp: proportional gains, shape (k,).
+    :param ki: integral gains, shape (k,).
+    :param td: derivative times [s], shape (k,).
+    :param tf: time constants of the filter [s], shape (k,).
+    """
+
+    kp: FloatArray
+    ki: FloatArray
+    td: FloatArray
+    tf: FloatArray
+
+    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
+        return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
+
+    def controller(self, k: int, sign: int) -> Controller:
+        """Return one of them for a process of a sign."""
+        kp, ki = float(self.kp[k]), float(self.ki[k])
+        return Controller(sign * kp, kp / ki, float(self.td[k]), float(self.tf[k]))
+
+
+@dataclass(frozen=True)
+class NoiseLimit:
+    """How much of the measurement noise may reach the command.
+
+    :param gain: largest standard deviation of the command over that of the noise [u/y].
+    :param period: of the samples [s].
+    """
+
+    gain: float
+    period: float
