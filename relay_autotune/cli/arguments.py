@@ -57,6 +57,17 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     return status
 
 
+def add_known(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say what is known of the process, which :func:`known_facts` reads.
+
+    :param parser: of the command.
+    """
+    parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
+    parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
+    parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
+    parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
+
+
 def known_facts(options: argparse.Namespace) -> Known:
     """Return what the options say to be known of the process.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.reader import Selection
 from relay_autotune.bag.timing import CLOCKS
-from relay_autotune.cli.arguments import DONE, finite, guarded, known_facts, say
+from relay_autotune.cli.arguments import DONE, add_known, finite, guarded, known_facts, say
 from relay_autotune.cli.design_arguments import (
     add_design,
     add_export,
@@ -82,10 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
     )
     parser.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
-    parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
-    parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
-    parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
-    parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
+    add_known(parser)
     parser.add_argument(
         "--loss", metavar="NAME", help="huber or tukey: for a sensor with many outliers"
     )

@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, known_facts, say
+from relay_autotune.cli.arguments import (
+    DONE,
+    NOTHING_FOUND,
+    add_known,
+    guarded,
+    known_facts,
+    say,
+)
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.report import PICTURES, write_figures, write_page, write_picture
 
@@ -68,10 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
     parser.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
-    parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
-    parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
-    parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
-    parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
+    add_known(parser)
     parser.add_argument("--rule", help="how to tune")
     return parser
 
