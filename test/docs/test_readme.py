@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, sessions
 
-from relay_autotune.autotune import analyse
 from relay_autotune.cli import demo
 from relay_autotune.models import TransferFunction
-from relay_autotune.relay import RelayExperiment
-from relay_autotune.relay_parameters import ExperimentParameters
 from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from tools.report_images import tune_as_the_demo
 
 
 def run(words: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[str, int]:
@@ -102,21 +100,7 @@ def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
 
 
 def test_the_demo_shown_is_the_one_computed(capsys: pytest.CaptureFixture[str]) -> None:
-    """The demo runs in lockstep, so that the same samples can be had without processes."""
-    process = VirtualProcess(
-        demo.TRUTH,
-        rest_measurement=demo.REST,
-        rest_command=demo.BASELINE,
-        disturbances=Disturbances(noise_std=demo.NOISE_STD),
-        seed=demo.SEED,
-    )
-    parameters = ExperimentParameters(amplitude=demo.AMPLITUDE, sample_period=demo.PERIOD)
-    experiment = RelayExperiment(parameters, demo.BASELINE)
-    k = 0
-    while not experiment.finished:
-        process.command(experiment.step(k * demo.PERIOD, process.measure(k * demo.PERIOD)))
-        k += 1
-    demo._compare(analyse(experiment.record()))
+    demo._compare(tune_as_the_demo())
     assert capsys.readouterr().out == block_noted("README.md", "made by the demo").text
 
 
