@@ -67,28 +67,6 @@ def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
     return None
 
 
-def unstable_poles(loop: TransferFunction) -> int:
-    """Return how many poles of ``1/(1 + loop)`` lie in the right half plane.
-
-    The count at zero gain is carried through every crossing of the negative real axis that the
-    loop passes as its gain grows to its own value, so no frequency grid can miss one.
-
-    :param loop: controller times process, with the sign that makes its feedback negative.
-    """
-    count = unstable_at_small_gain(loop)
-    return count + sum(c.roots_to_the_right for c in _crossings(loop, 1.0) if c.gain < 1.0)
-
-
-def phase_crossings(loop: TransferFunction) -> list[UltimatePoint]:
-    """Return the points at which the loop crosses the negative real axis.
-
-    :param loop: controller times process.
-    :return: every crossing up to the first one, and every later one of magnitude 1 or more; the
-        gain is the factor that would bring it to -1.
-    """
-    return [UltimatePoint(c.gain, c.frequency) for c in _crossings(loop, 1.0)]
-
-
 def unstable_at_small_gain(model: TransferFunction) -> int:
     """Return how many closed-loop poles lie in the right half plane as the gain leaves zero.
 
@@ -109,8 +87,8 @@ def unstable_at_small_gain(model: TransferFunction) -> int:
     return unstable
 
 
-def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[_Crossing]:
-    """Crossings up to the first, and later ones of at least ``magnitude`` (the first one's)."""
+def _crossings(model: TransferFunction) -> list[_Crossing]:
+    """Crossings up to the first, and later ones of at least its magnitude."""
     found = []
     if model.integrators == 0 and model.gain * model.process_sign < 0.0:
         slope = (
@@ -127,11 +105,11 @@ def _crossings(model: TransferFunction, magnitude: float | None = None) -> list[
     if not first or not polar.delayed:
         return found
     # Later turns of the dead time matter only where the magnitude is larger again.
-    least = -math.log(min(c.gain for c in first)) if magnitude is None else math.log(magnitude)
+    least = -math.log(min(c.gain for c in first))
     last = math.log(first[-1].frequency)
     beyond = np.append(last, logarithms[logarithms > last])
     sizes = polar.size(beyond)
-    if magnitude is None and bool(np.all(np.diff(sizes) <= 0.0)):
+    if bool(np.all(np.diff(sizes) <= 0.0)):
         return found
     # Between two points of the grid it may be a little larger than at either.
     higher = beyond[1:][sizes[1:] > least - 1e-3]

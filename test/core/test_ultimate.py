@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.models import TransferFunction
-from relay_autotune.ultimate import ultimate_point, unstable_poles
+from relay_autotune.tuning.stability import closed_loop_unstable_poles
+from relay_autotune.ultimate import ultimate_point
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T1"))
@@ -92,7 +93,7 @@ def test_at_the_ultimate_point_the_loop_is_minus_one_and_stability_ends(
     assert abs(complex(point.gain * model(1j * point.frequency)) + 1.0) < 1e-9
     for factor, stable in ((0.999, True), (1.001, False)):
         loop = TransferFunction.lag_n(gain * point.gain * factor, tau, order, dead_time)
-        assert (unstable_poles(loop) == 0) is stable
+        assert (closed_loop_unstable_poles([loop]) == 0) is stable
 
 
 def _pade(dead_time: float, order: int) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +128,7 @@ def test_unstable_poles_are_counted_like_the_roots_of_a_pade_approximation(
     assume(np.abs(roots.real).min() > 0.02)
     fast = np.abs(roots) * dead_time > 6.0
     assume(not np.any(fast & (roots.real > -1.0)))
-    assert unstable_poles(loop) == int(np.sum(roots.real > 0.0))
+    assert closed_loop_unstable_poles([loop]) == int(np.sum(roots.real > 0.0))
 
 
 @given(
