@@ -10,6 +10,7 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.node import Node
 
+from relay_autotune.nodes.goals import conclude
 from relay_autotune.relay import RelayExperiment, State
 from relay_autotune_msgs.action import Tune
 
@@ -61,7 +62,6 @@ class TuneAction:
         self._goal: Any = None
         self._id = ""
         self._result = Tune.Result()
-        self._succeeded = False
         self._newest: Any = None
         self._server = ActionServer(
             node,
@@ -80,13 +80,7 @@ class TuneAction:
             self._result = Tune.Result()
             self._newest = None
             return
-        # A goal that comes while another runs must not disturb its result.
-        kept = self._result, self._succeeded
-        self._result = Tune.Result(reason=started.reason)
-        self._succeeded = started.accepted
-        self._conclude(goal)
-        if self._goal is not None:
-            self._result, self._succeeded = kept
+        conclude(goal, Tune.Result(reason=started.reason), succeeded=started.accepted)
 
     def _on_cancel(self, goal: Any) -> CancelResponse:
         if self._goal is not None and goal.goal_id == self._goal.goal_id:
@@ -152,23 +146,8 @@ class TuneAction:
         result.bag = bag
         result.outcome = summary.outcome
         result.reason = "; ".join(filter(None, (summary.reason, missing)))
-        self._succeeded = summary.outcome == Tune.Result.COMPLETED
         self._goal = None
-        self._conclude(goal)
-
-    def _conclude(self, goal: Any) -> None:
-        result, succeeded = self._result, self._succeeded
-
-        def finish(handle: Any) -> Any:
-            if handle.is_cancel_requested:
-                handle.canceled()
-            elif succeeded:
-                handle.succeed()
-            else:
-                handle.abort()
-            return result
-
-        goal.execute(finish)
+        conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
 
     def _set_state(self, goal: Any) -> Any:
         # Each goal brings its own callback; this one is asked for by the constructor alone.

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.messages import float64_array, set_stamp
 from relay_autotune.models import TransferFunction
+from relay_autotune.nodes.goals import conclude
 from relay_autotune.pid import Limits
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.verification import Plan, Step, compare, plan
@@ -91,7 +92,7 @@ class Verifier:
                 for step in self._steps
             ]
         except RelayAutotuneError as error:
-            self._finish(goal, Verify.Result(passed=False, reason=str(error)), succeeded=False)
+            conclude(goal, Verify.Result(passed=False, reason=str(error)), succeeded=False)
             return
         self._goal, self._found, self._number = goal, [], 0
         self._begun = self._recent[-1][0]
@@ -227,19 +228,7 @@ class Verifier:
         if passed or revert:
             reason = self._ended(passed, reason)
         result = Verify.Result(passed=passed, reason=reason, steps=self._found)
-        self._finish(goal, result, succeeded=True)
-
-    def _finish(self, goal: Any, result: Any, *, succeeded: bool) -> None:
-        def finish(handle: Any) -> Any:
-            if handle.is_cancel_requested:
-                handle.canceled()
-            elif succeeded:
-                handle.succeed()
-            else:
-                handle.abort()
-            return result
-
-        goal.execute(finish)
+        conclude(goal, result, succeeded=True)
 
     def _unused(self, goal: Any) -> Any:
         goal.abort()
