@@ -13,46 +13,21 @@ command goes on from where it was.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import FloatArray
 from relay_autotune.simulation import Plant
+from relay_autotune.tuning.closed_loop import ClosedLoop
 from relay_autotune.tuning.gains import Controller
-from relay_autotune.tuning.sampled import filter_matrices
+from relay_autotune.tuning.sampled import UNLIMITED, Limits, filter_matrices
 
 # A sample interval within this part of the nominal one uses the filter of that one.
 _JITTER = 0.2
 # An interval longer than so many nominal ones is a gap: the integral does not run on through it.
 _LONGEST_INTERVAL = 5.0
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Range of the command.
-
-    :param low: least command [u].
-    :param high: largest command [u].
-    """
-
-    low: float = -math.inf
-    high: float = math.inf
-
-    def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise TuningError(
-                f"the command's limits leave no range, found {self.low:g} to {self.high:g}"
-            )
-
-    def clip(self, command: float) -> float:
-        """Return the command within the limits [u]."""
-        return min(max(command, self.low), self.high)
-
-
-UNLIMITED = Limits()
 
 
 class PidController:
@@ -173,20 +148,6 @@ class PidController:
         self._last = measurement
 
 
-@dataclass(frozen=True)
-class LoopRun:
-    """A closed loop at its samples, as deviations from rest.
-
-    :param time: s, shape (n,).
-    :param measurement: y, shape (n,).
-    :param command: the controller's, u, shape (n,), held from each sample to the next.
-    """
-
-    time: FloatArray
-    measurement: FloatArray
-    command: FloatArray
-
-
 def run_loop(
     gains: Controller,
     model: TransferFunction,
@@ -195,7 +156,7 @@ def run_loop(
     setpoint: float = 0.0,
     load: float = 0.0,
     limits: Limits = UNLIMITED,
-) -> LoopRun:
+) -> ClosedLoop:
     """Run the controller on the exact process, which rests, from a step of set-point and load on.
 
     :param gains: the controller.
@@ -216,7 +177,7 @@ def run_loop(
         u = controller.step(float(t), setpoint, y)
         applied = u + load
         measurement[k], command[k] = y, u
-    return LoopRun(time, measurement, command)
+    return ClosedLoop(time, measurement, command)
 
 
 def scaled(model: TransferFunction, factor: float) -> TransferFunction:

@@ -10,10 +10,11 @@ from scipy.optimize import minimize_scalar
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
-from relay_autotune.pid import UNLIMITED, Limits, run_loop, scaled
+from relay_autotune.pid import run_loop, scaled
 from relay_autotune.record import FloatArray
 from relay_autotune.tuning.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.sampled import UNLIMITED, Limits
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05

@@ -22,8 +22,9 @@ from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.verifier import NotVerifiable, Verifier
-from relay_autotune.pid import Limits, PidController
+from relay_autotune.pid import PidController
 from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.sampled import Limits
 from relay_autotune.verification import Step
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains

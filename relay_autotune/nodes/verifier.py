@@ -15,8 +15,8 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.messages import float64_array, set_stamp
 from relay_autotune.models import TransferFunction
 from relay_autotune.nodes.goals import conclude
-from relay_autotune.pid import Limits
 from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.sampled import Limits
 from relay_autotune.verification import Plan, Step, compare, plan
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import Verification

@@ -27,6 +27,7 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.simulation import Plant
 from relay_autotune.tuning.control_law import InternalModelLaw
 from relay_autotune.tuning.rules.applicability import fopdt_of, named, process_of
+from relay_autotune.tuning.sampled import Limits, require_period
 from relay_autotune.tuning.task import DesignTask
 
 DEAD_TIME_LAMBDA = 2.0
@@ -120,12 +121,9 @@ class SampledCompensator:
         high: float = math.inf,
         offset: float = 0.0,
     ) -> None:
-        if not 0.0 < period < math.inf:
-            raise TuningError(f"the sampling period must be > 0 s and finite, found {period:g} s")
-        if not low < high:
-            raise TuningError(f"the command's limits leave no range, found {low:g} to {high:g}")
+        require_period(period)
         self.period = period
-        self._low, self._high, self._offset = low, high, offset
+        self._limits, self._offset = Limits(low, high), offset
         self._gain = compensator.model.gain
         slow = compensator.closed_loop_time
         self._sections = [
@@ -145,7 +143,7 @@ class SampledCompensator:
         for section in self._sections:
             signal = section.step(signal)
         wanted = self._offset + signal / self._gain
-        given = min(max(wanted, self._low), self._high)
+        given = self._limits.clip(wanted)
         self._command = given - self._offset
         self._count += 1
         return given

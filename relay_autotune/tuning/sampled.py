@@ -9,6 +9,7 @@ limits cut off (Astrom and Hagglund's back-calculation), so that it does not win
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +20,41 @@ from relay_autotune.errors import TuningError
 from relay_autotune.tuning.gains import Controller
 
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Range of the command.
+
+    :param low: least command [u].
+    :param high: largest command [u].
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise TuningError(
+                f"the command's limits leave no range, found {self.low:g} to {self.high:g}"
+            )
+
+    def clip(self, command: float) -> float:
+        """Return the command within the limits [u]."""
+        return min(max(command, self.low), self.high)
+
+
+UNLIMITED = Limits()
+
+
+def require_period(period: float) -> None:
+    """Refuse what cannot be a sampling period.
+
+    :param period: s.
+    :raises TuningError: if it is not positive and finite.
+    """
+    if not 0.0 < period < math.inf:
+        raise TuningError(f"the sampling period must be > 0 s and finite, found {period:g} s")
 
 
 class SampledController(Protocol):
@@ -74,12 +110,9 @@ class SampledPid:
         offset: float = 0.0,
         measurement: float = 0.0,
     ) -> None:
-        if not 0.0 < period < math.inf:
-            raise TuningError(f"the sampling period must be > 0 s and finite, found {period:g} s")
-        if not low < high:
-            raise TuningError(f"the command's limits leave no range, found {low:g} to {high:g}")
+        require_period(period)
         self.period = period
-        self._gains, self._low, self._high = controller, low, high
+        self._gains, self._limits = controller, Limits(low, high)
         self._motion = filter_matrices(controller.tf, period)
         self._filter = np.array([measurement, 0.0])
         self._last = measurement
@@ -99,6 +132,6 @@ class SampledPid:
         value, slope = self._filter
         self._integral += c.i * self.period * (setpoint - value)
         wanted = c.kc * (c.b * setpoint - value - c.td * slope) + self._integral
-        given = min(max(wanted, self._low), self._high)
+        given = self._limits.clip(wanted)
         self._integral += self._draw * (given - wanted)
         return float(given)

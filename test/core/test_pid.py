@@ -12,8 +12,9 @@ from scipy.integrate import solve_ivp
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
-from relay_autotune.pid import Limits, PidController, run_loop
+from relay_autotune.pid import PidController, run_loop
 from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.sampled import Limits
 from relay_autotune.verification import Step, compare, describe, plan
 
 GAINS = Controller(kc=1.2, ti=2.0)
