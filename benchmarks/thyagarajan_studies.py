@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.half_cycle import HalfCycle
 from relay_autotune.identification import Known, identify
-from relay_autotune.identification.shape import Shape, shape_of_half_cycle, shape_of_record
+from relay_autotune.identification.cycle.shape import Shape, shape_of_half_cycle, shape_of_record
 from relay_autotune.identification.thyagarajan2003 import (
     flat_fopdt,
     fopdt,

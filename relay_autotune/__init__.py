@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis, analyse
     from relay_autotune.bag.records import read_records
     from relay_autotune.errors import RelayAutotuneError
+    from relay_autotune.experiment.relay_parameters import ExperimentParameters
     from relay_autotune.identification import METHODS, Identification, Known, identify
     from relay_autotune.models import STRUCTURES, TransferFunction
     from relay_autotune.python_control import to_control
     from relay_autotune.record import Outcome, PiecewiseConstant, Record, RelaySettings
     from relay_autotune.relay import RelayExperiment
-    from relay_autotune.relay_parameters import ExperimentParameters
     from relay_autotune.report import draw, write_report
     from relay_autotune.tuning import RULES, Controller, Gains, tune
     from relay_autotune.tuning.closed_loop import simulate_closed_loop
@@ -42,7 +42,7 @@ _HOMES = {
     "python_control": ("to_control",),
     "record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
     "relay": ("RelayExperiment",),
-    "relay_parameters": ("ExperimentParameters",),
+    "experiment.relay_parameters": ("ExperimentParameters",),
     "report": ("draw", "write_report"),
     "tuning": ("RULES", "Controller", "Gains", "tune"),
     "tuning.closed_loop": ("simulate_closed_loop",),

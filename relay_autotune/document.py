@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification.shape import shape_of_record
+from relay_autotune.identification.cycle.shape import shape_of_record
 from relay_autotune.identification.validation import DIFFERENCES
 from relay_autotune.record import Outcome, Record
 from relay_autotune.tuning.gains import NUMBERS

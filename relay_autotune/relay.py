@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.procedure import Procedure, State
+from relay_autotune.experiment.procedure import Procedure, State
+from relay_autotune.experiment.relay_parameters import PARAMETERS, ExperimentParameters, Parameter
+from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy
+from relay_autotune.experiment.samples import Samples
+from relay_autotune.experiment.sensor_watch import FrozenWatch
 from relay_autotune.record import Cycle, FloatArray, Outcome, Record, RelaySettings
-from relay_autotune.relay_parameters import PARAMETERS, ExperimentParameters, Parameter
-from relay_autotune.safe_command import ProportionalHold, SafePolicy
-from relay_autotune.samples import Samples
-from relay_autotune.sensor_watch import FrozenWatch
 
 __all__ = [
     "PARAMETERS",
@@ -42,9 +42,9 @@ _BASELINE = SafePolicy()
 class RelayExperiment:
     """Run one relay experiment: call :meth:`step` for each measurement, send what it returns.
 
-    :mod:`relay_autotune.procedure` has the states. Whatever the state, :meth:`abort` and a
-    measurement outside its limits end the experiment as ABORTED; a sample that cannot be used, a
-    frozen sensor and max_duration end it as FAILED. It does not raise on bad data:
+    :mod:`relay_autotune.experiment.procedure` has the states. Whatever the state, :meth:`abort`
+    and a measurement outside its limits end the experiment as ABORTED; a sample that cannot be
+    used, a frozen sensor and max_duration end it as FAILED. It does not raise on bad data:
     :attr:`reason` says why it ended. It has no clock: time comes in with the samples, on any
     origin.
 

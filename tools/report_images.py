@@ -18,8 +18,8 @@ from PIL import Image
 from relay_autotune.autotune import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import demo
+from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.relay import RelayExperiment
-from relay_autotune.relay_parameters import ExperimentParameters
 from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import Case, case_of
 from relay_autotune.report.figures import PLATES

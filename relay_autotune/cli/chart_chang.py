@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 from relay_autotune.identification.atv import atv_from_numbers
 from relay_autotune.identification.chang_method import chang_from_numbers
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.li_method import li_from_numbers
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 
 
 def identify_chang_chart(numbers: Mapping[str, float], known: Known) -> Identification:

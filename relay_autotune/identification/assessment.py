@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError, RecordError
-from relay_autotune.identification.fold import Fold, fold
-from relay_autotune.identification.residuals import ljung_box, noise_to_signal
+from relay_autotune.identification.cycle.fold import Fold, fold
+from relay_autotune.identification.cycle.steady_state import steady_state
+from relay_autotune.identification.fit.residuals import ljung_box, noise_to_signal
 from relay_autotune.identification.result import FitReport, Identification
-from relay_autotune.identification.steady_state import steady_state
 from relay_autotune.identification.validation import Validation, integrated_error, validate_fold
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record

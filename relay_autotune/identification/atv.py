@@ -21,10 +21,10 @@ from dataclasses import replace
 from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.lag_models import MODEL_4, LagModel, Solution
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.symmetric_method import (
     Found,
     SymmetricMethod,

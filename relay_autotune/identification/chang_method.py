@@ -13,10 +13,10 @@ from relay_autotune.identification.chang1992 import (
     two_equal_and_one,
     two_time_constants,
 )
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.lag_models import MODEL_4, MODEL_5, LagModel, Solution
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.symmetric_method import (
     SymmetricMethod,
     from_numbers,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.cycles import cycles_of
 from relay_autotune.errors import IdentificationError, RecordError
-from relay_autotune.identification.fourier import frequency_point
+from relay_autotune.identification.cycle.fourier import frequency_point
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant, Record
 from relay_autotune.response import response

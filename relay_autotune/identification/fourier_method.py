@@ -18,13 +18,13 @@ from scipy.optimize import least_squares
 from scipy.special import fdtrc
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
-from relay_autotune.identification.fourier import FrequencyPoint
-from relay_autotune.identification.harmonics import measured_points, with_noise_about
+from relay_autotune.identification.cycle.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
+from relay_autotune.identification.cycle.fourier import FrequencyPoint
+from relay_autotune.identification.cycle.harmonics import measured_points, with_noise_about
+from relay_autotune.identification.cycle.steady_state import static_gain, steady_state
 from relay_autotune.identification.interpolation import Interpolation, interpolated, smooth
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.identification.steady_state import static_gain, steady_state
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record
 

@@ -25,6 +25,7 @@ from scipy.optimize import least_squares
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.chang1992 import gain_and_time_constant
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.lag_models import (
     MODEL_1,
     MODEL_4,
@@ -34,7 +35,6 @@ from relay_autotune.identification.lag_models import (
     equal_lags,
 )
 from relay_autotune.identification.square_wave import level, peak
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
+from relay_autotune.identification.cycle.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
+from relay_autotune.identification.cycle.symmetric_cycle import (
+    CycleReader,
+    SymmetricCycle,
+    features,
+    require_unbiased,
+    skew_warning,
+)
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.lag_models import LagModel, model_asked_for
 from relay_autotune.identification.li1991 import (
@@ -22,13 +29,6 @@ from relay_autotune.identification.li1991 import (
     require_difference,
 )
 from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.identification.symmetric_cycle import (
-    CycleReader,
-    SymmetricCycle,
-    features,
-    require_unbiased,
-    skew_warning,
-)
 from relay_autotune.identification.symmetric_method import alike, shape_misfit
 from relay_autotune.record import Record
 

@@ -18,7 +18,7 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
 
 if TYPE_CHECKING:
-    from relay_autotune.identification.fourier import FrequencyPoint
+    from relay_autotune.identification.cycle.fourier import FrequencyPoint
     from relay_autotune.identification.validation import Validation
 
 FloatArray = NDArray[np.float64]

@@ -15,13 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import (
+from relay_autotune.identification.cycle.cycle_scatter import (
     NOT_SETTLED,
     RelayTest,
     Stretch,
     relay_test,
 )
-from relay_autotune.identification.dead_time import DeadTime, read_dead_time
+from relay_autotune.identification.cycle.dead_time import DeadTime, read_dead_time
+from relay_autotune.identification.cycle.symmetric_cycle import (
+    CycleReader,
+    SymmetricCycle,
+    features,
+    half_cycles,
+    known_gain,
+    require_unbiased,
+    skew_warning,
+)
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.lag_models import (
     MODEL_1,
@@ -35,15 +44,6 @@ from relay_autotune.identification.lag_models import (
 )
 from relay_autotune.identification.result import Identification, with_uncertainty
 from relay_autotune.identification.square_wave import level
-from relay_autotune.identification.symmetric_cycle import (
-    CycleReader,
-    SymmetricCycle,
-    features,
-    half_cycles,
-    known_gain,
-    require_unbiased,
-    skew_warning,
-)
 from relay_autotune.record import Record
 
 FloatArray = NDArray[np.float64]

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import NOT_SETTLED, relay_test
-from relay_autotune.identification.envelope import curvature_time, envelope
+from relay_autotune.identification.cycle.cycle_scatter import NOT_SETTLED, relay_test
+from relay_autotune.identification.cycle.envelope import curvature_time, envelope
+from relay_autotune.identification.cycle.shape import Reading, Shape, read_shape
+from relay_autotune.identification.cycle.symmetric_cycle import require_unbiased, skew_warning
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.identification.shape import Reading, Shape, read_shape
-from relay_autotune.identification.symmetric_cycle import require_unbiased, skew_warning
 from relay_autotune.identification.thyagarajan2003 import (
     HIGHER_ORDER,
     SMALL_DEAD_TIME,

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError
-from relay_autotune.identification.fold import Fold, as_switched, fold
-from relay_autotune.identification.steady_state import steady_state
+from relay_autotune.identification.cycle.fold import Fold, as_switched, fold
+from relay_autotune.identification.cycle.steady_state import steady_state
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Record, RelaySettings
 from relay_autotune.response import response

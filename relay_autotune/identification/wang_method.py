@@ -16,17 +16,17 @@ from scipy.special import stdtrit
 
 from relay_autotune.cycles import find_cycles
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
-from relay_autotune.identification.fold import Fold, as_switched, fold
-from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.identification.steady_state import (
+from relay_autotune.identification.cycle.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
+from relay_autotune.identification.cycle.fold import Fold, as_switched, fold
+from relay_autotune.identification.cycle.steady_state import (
     UNKNOWN_REST,
     StaticGain,
     static_gain,
     steady_state,
 )
-from relay_autotune.identification.symmetric_cycle import require_unbiased
+from relay_autotune.identification.cycle.symmetric_cycle import require_unbiased
+from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.result import Identification, with_uncertainty
 from relay_autotune.identification.wang1997 import (
     PARAMETERS,
     FopdtCycle,

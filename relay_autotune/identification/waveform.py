@@ -19,25 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.fit_covariance import NEGLIGIBLE, Fit, raw_residual
-from relay_autotune.identification.known import LOSSES, NOTHING, Known
-from relay_autotune.identification.lags import FOPDT
-from relay_autotune.identification.result import Identification
-from relay_autotune.identification.robust import scale_of, weights
-from relay_autotune.identification.selection import (
+from relay_autotune.identification.fit.fit_covariance import NEGLIGIBLE, Fit, raw_residual
+from relay_autotune.identification.fit.lags import FOPDT
+from relay_autotune.identification.fit.robust import scale_of, weights
+from relay_autotune.identification.fit.selection import (
     Candidate,
     Selection,
     after_the_unknown,
     choose,
 )
-from relay_autotune.identification.separable import (
+from relay_autotune.identification.fit.separable import (
     Problem,
     State,
     information_criterion,
     problem_of,
     refine,
 )
-from relay_autotune.identification.waveform_report import report
+from relay_autotune.identification.fit.waveform_report import report
+from relay_autotune.identification.known import LOSSES, NOTHING, Known
+from relay_autotune.identification.result import Identification
 from relay_autotune.models import STRUCTURES
 from relay_autotune.record import Input, Record
 

@@ -18,6 +18,7 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -52,7 +53,6 @@ from relay_autotune.nodes.tune_parameters import (
 )
 from relay_autotune.record import Outcome
 from relay_autotune.relay import RelayExperiment, SafePolicy
-from relay_autotune.relay_parameters import ExperimentParameters
 from relay_autotune_msgs.srv import StartTune
 
 # How long the end of the process waits for the record to be acknowledged

@@ -12,11 +12,11 @@ import numpy as np
 # numpy loads this with its first median, which would be 20 ms in the middle of a tune.
 import numpy.ma
 
+from relay_autotune.experiment.sensor_watch import ClockWatch
 from relay_autotune.messages import start_seconds
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.record import Record
 from relay_autotune.relay import RelayExperiment
-from relay_autotune.sensor_watch import ClockWatch
 
 
 class Session:

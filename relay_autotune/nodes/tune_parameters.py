@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
+from relay_autotune.experiment.relay_parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.nodes.live_types import COMMAND_TYPES, FLOAT64
 from relay_autotune.nodes.parameters import Entry, NodeParameter
-from relay_autotune.relay_parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 
 __all__ = ["EXPERIMENT_PARAMETERS", "FIXED_PARAMETERS", "NODE_PARAMETERS", "TUNE_PARAMETERS"]
 

@@ -13,7 +13,7 @@ from relay_autotune.cycles import LimitCycle, cycles_of, infer_settings, limit_c
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.fourier import FrequencyPoint
+from relay_autotune.identification.cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival
 from relay_autotune.identification.validation import Validation
 from relay_autotune.models import TransferFunction

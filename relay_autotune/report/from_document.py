@@ -13,7 +13,7 @@ from relay_autotune.cycles import LimitCycle
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.identification import FitReport
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.fourier import FrequencyPoint
+from relay_autotune.identification.cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival, is_logarithmic
 from relay_autotune.identification.validation import DIFFERENCES, Validation
 from relay_autotune.models import TransferFunction

@@ -15,7 +15,7 @@ from relay_autotune.cli.table import table
 from relay_autotune.document import document, to_json
 from relay_autotune.identification import Known, identify
 from relay_autotune.identification.assessment import assess, fit_of_model
-from relay_autotune.identification.residuals import noise_to_signal
+from relay_autotune.identification.fit.residuals import noise_to_signal
 from relay_autotune.identification.validation import DIFFERENCES, integrated_error
 from relay_autotune.messages import fill_transfer_function
 from relay_autotune.models import TransferFunction

@@ -21,9 +21,9 @@ from relay_autotune.identification.atv import (
     two_time_constants,
     ultimate_estimate,
 )
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.lag_models import MODEL_4, MODEL_5, equal_lags
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
 from relay_autotune.simulation import exact_limit_cycle, simulate_relay

@@ -20,9 +20,9 @@ from relay_autotune.identification.chang1992 import (
     two_time_constants,
 )
 from relay_autotune.identification.chang_method import chang_from_numbers, identify_chang
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.square_wave import fundamental, level, peak, slope_sign
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
 from relay_autotune.sampled_relay import simulate_sampled_relay

@@ -10,11 +10,11 @@ from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import ParameterError
+from relay_autotune.experiment.no_return import is_growing
+from relay_autotune.experiment.sensor_watch import ClockWatch, FrozenWatch
 from relay_autotune.models import TransferFunction
-from relay_autotune.no_return import is_growing
 from relay_autotune.record import Outcome
 from relay_autotune.relay import ExperimentParameters, RelayExperiment, SafePolicy
-from relay_autotune.sensor_watch import ClockWatch, FrozenWatch
 from relay_autotune.simulation import Plant
 
 

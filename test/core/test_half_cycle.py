@@ -10,7 +10,7 @@ from worked_cases import cases
 
 from relay_autotune.errors import ModelError
 from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.envelope import normalised_growth
+from relay_autotune.identification.cycle.envelope import normalised_growth
 from relay_autotune.identification.thyagarajan2003 import equal_lags
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import RelaySettings

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.kick import DirectionWatch, ResponseDetector
+from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
+from relay_autotune.experiment.settling import RestState, Settling, rest_state
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant
 from relay_autotune.response import response
-from relay_autotune.settling import RestState, Settling, rest_state
 
 
 def at_rest(noise_std=0.0, mean=0.0):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from relay_autotune.errors import RecordError
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.fourier import FrequencyPoint
+from relay_autotune.identification.cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import FitReport
 from relay_autotune.identification.validation import Validation
 from relay_autotune.messages import (

@@ -11,15 +11,15 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.envelope import (
+from relay_autotune.identification.cycle.envelope import (
     Envelope,
     curvature_time,
     envelope,
     growth_time,
     normalised_growth,
 )
-from relay_autotune.identification.fold import fold
-from relay_autotune.identification.shape import (
+from relay_autotune.identification.cycle.fold import fold
+from relay_autotune.identification.cycle.shape import (
     Shape,
     read_shape,
     shape_of_curve,

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.identification.factors import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.identification.fit.factors import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.identification.fit.lags import FOPDT
+from relay_autotune.identification.fit.partial_fractions import partial_fractions
+from relay_autotune.identification.fit.rational import free_motion, responses
+from relay_autotune.identification.fit.structures import lag_n
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.lags import FOPDT
-from relay_autotune.identification.partial_fractions import partial_fractions
-from relay_autotune.identification.rational import free_motion, responses
-from relay_autotune.identification.structures import lag_n
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings

@@ -14,8 +14,8 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
 from relay_autotune.identification.atv import atv_from_numbers
 from relay_autotune.identification.chang_method import chang_from_numbers, identify_chang
+from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.symmetric_cycle import SymmetricCycle
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import RelaySettings
 from relay_autotune.sampled_relay import simulate_sampled_relay

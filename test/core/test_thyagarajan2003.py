@@ -12,7 +12,7 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.shape import shape_of_half_cycle
+from relay_autotune.identification.cycle.shape import shape_of_half_cycle
 from relay_autotune.identification.thyagarajan2003 import (
     dead_time_ratio,
     equal_lags,

@@ -10,11 +10,11 @@ import pytest
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification import Known, estimate, identify
-from relay_autotune.identification.lags import FOPDT
-from relay_autotune.identification.profiles import profile_ends
-from relay_autotune.identification.quantisation import quantisation_step
+from relay_autotune.identification.fit.lags import FOPDT
+from relay_autotune.identification.fit.profiles import profile_ends
+from relay_autotune.identification.fit.quantisation import quantisation_step
+from relay_autotune.identification.fit.separable import evaluate, problem_of, refine
 from relay_autotune.identification.result import with_uncertainty
-from relay_autotune.identification.separable import evaluate, problem_of, refine
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.response import response

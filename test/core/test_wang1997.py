@@ -9,7 +9,7 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.fourier import cycle_means, frequency_point
+from relay_autotune.identification.cycle.fourier import cycle_means, frequency_point
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.wang1997 import (
     FopdtCycle,

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.fit.residuals import covariance_meat, ljung_box
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.residuals import covariance_meat, ljung_box
 from relay_autotune.identification.waveform import identify_waveform
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import ModelError
 from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.shape import shape_of_half_cycle
+from relay_autotune.identification.cycle.shape import shape_of_half_cycle
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import UltimatePoint, ultimate_point
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 from scipy.optimize import brentq
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.identification.shape import Shape, shape_of_half_cycle
+from relay_autotune.identification.cycle.shape import Shape, shape_of_half_cycle
 from relay_autotune.identification.thyagarajan2003 import (
     dead_time_ratio,
     flat_fopdt,

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.averaging import averaged_point
 from relay_autotune.identification.checks import disagreeing_point, unequal_gains
-from relay_autotune.identification.determination import with_what_is_determined
-from relay_autotune.identification.fit_covariance import (
+from relay_autotune.identification.fit.averaging import averaged_point
+from relay_autotune.identification.fit.determination import with_what_is_determined
+from relay_autotune.identification.fit.fit_covariance import (
     NEGLIGIBLE,
     Fit,
     Noise,
@@ -22,16 +22,16 @@ from relay_autotune.identification.fit_covariance import (
     noise_of,
     raw_residual,
 )
-from relay_autotune.identification.residuals import ljung_box
+from relay_autotune.identification.fit.residuals import ljung_box
+from relay_autotune.identification.fit.selection import Candidate, support
+from relay_autotune.identification.fit.separable import Problem, State, evaluate, refine
+from relay_autotune.identification.fit.structures import Reading
 from relay_autotune.identification.result import (
     FitReport,
     Identification,
     Rival,
     with_uncertainty,
 )
-from relay_autotune.identification.selection import Candidate, support
-from relay_autotune.identification.separable import Problem, State, evaluate, refine
-from relay_autotune.identification.structures import Reading
 from relay_autotune.record import Record
 
 FloatArray = NDArray[np.float64]

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import Stretch
-from relay_autotune.identification.fourier import (
+from relay_autotune.identification.cycle.cycle_scatter import Stretch
+from relay_autotune.identification.cycle.fourier import (
     FrequencyPoint,
     cycle_window,
     excitation,
     fourier_integral_sampled,
     frequency_point,
 )
-from relay_autotune.identification.symmetric_cycle import roughness
+from relay_autotune.identification.cycle.symmetric_cycle import roughness
 from relay_autotune.models import TransferFunction
 from relay_autotune.response import response
 

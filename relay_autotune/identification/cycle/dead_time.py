@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import RelayTest, Stretch
-from relay_autotune.identification.fold import Fold, fold
+from relay_autotune.experiment.kick import ResponseDetector
+from relay_autotune.experiment.settling import RestState
+from relay_autotune.identification.cycle.cycle_scatter import RelayTest, Stretch
+from relay_autotune.identification.cycle.fold import Fold, fold
 from relay_autotune.identification.known import Known
-from relay_autotune.kick import ResponseDetector
 from relay_autotune.record import Record, RelaySettings
-from relay_autotune.settling import RestState
 
 FloatArray = NDArray[np.float64]
 

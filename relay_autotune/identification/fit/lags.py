@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.factors import Denominator, Lag
-from relay_autotune.identification.structures import RationalStructure
+from relay_autotune.identification.fit.factors import Denominator, Lag
+from relay_autotune.identification.fit.structures import RationalStructure
 from relay_autotune.record import Input, PiecewiseLinear
 
 FloatArray = NDArray[np.float64]

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.advice import advice
 from relay_autotune.identification.combinations import determined_combinations, is_determined
-from relay_autotune.identification.fit_covariance import (
+from relay_autotune.identification.fit.fit_covariance import (
     NEGLIGIBLE,
     Fit,
     Noise,
     covariance_of_values,
 )
+from relay_autotune.identification.fit.profiles import profile_ends
+from relay_autotune.identification.fit.separable import Problem, State, refine
 from relay_autotune.identification.intervals import NORMAL, Estimate, is_logarithmic
-from relay_autotune.identification.profiles import profile_ends
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.separable import Problem, State, refine
 from relay_autotune.record import Record
 
 FloatArray = NDArray[np.float64]

@@ -7,13 +7,13 @@ from collections import deque
 from dataclasses import replace
 
 from relay_autotune.cycles import next_cycle
-from relay_autotune.levels import Levels, clear_swing
-from relay_autotune.no_return import is_growing, why_no_return
+from relay_autotune.experiment.levels import Levels, clear_swing
+from relay_autotune.experiment.no_return import is_growing, why_no_return
+from relay_autotune.experiment.relay_law import Patience, Relay
+from relay_autotune.experiment.relay_parameters import ExperimentParameters
+from relay_autotune.experiment.samples import Samples
+from relay_autotune.experiment.settling import RestState
 from relay_autotune.record import Cycle, Outcome
-from relay_autotune.relay_law import Patience, Relay
-from relay_autotune.relay_parameters import ExperimentParameters
-from relay_autotune.samples import Samples
-from relay_autotune.settling import RestState
 
 # A stay at the low level shorter than this part of the longest stay (less, in proportion to how
 # unequally a biased relay pushes), or of half the time that the process took to respond, cannot be

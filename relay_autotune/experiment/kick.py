@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from relay_autotune.settling import RestState
+from relay_autotune.experiment.settling import RestState
 
 # White noise leaves three standard deviations on one side three times in a row once in 4e8
 # samples; without noise one sample is enough.

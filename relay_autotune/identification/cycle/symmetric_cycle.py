@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import Stretch
+from relay_autotune.identification.cycle.cycle_scatter import Stretch
 from relay_autotune.identification.known import Known
 from relay_autotune.record import Record, RelaySettings
 

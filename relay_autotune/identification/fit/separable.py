@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.structures import RationalStructure
+from relay_autotune.identification.fit.structures import RationalStructure
 from relay_autotune.record import Input
 
 FloatArray = NDArray[np.float64]

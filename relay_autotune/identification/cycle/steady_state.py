@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle_scatter import RelayTest, Stretch
-from relay_autotune.identification.fourier import cycle_means
-from relay_autotune.identification.symmetric_cycle import roughness
+from relay_autotune.identification.cycle.cycle_scatter import RelayTest, Stretch
+from relay_autotune.identification.cycle.fourier import cycle_means
+from relay_autotune.identification.cycle.symmetric_cycle import roughness
 from relay_autotune.record import FloatArray, Record, RelaySettings
 
 _LEAST_BIAS = 0.02

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.quantisation import quantisation_step
-from relay_autotune.identification.residuals import covariance_meat
-from relay_autotune.identification.robust import mean_slope, scale_of, weights
-from relay_autotune.identification.selection import Candidate
-from relay_autotune.identification.separable import Problem, State
+from relay_autotune.identification.fit.quantisation import quantisation_step
+from relay_autotune.identification.fit.residuals import covariance_meat
+from relay_autotune.identification.fit.robust import mean_slope, scale_of, weights
+from relay_autotune.identification.fit.selection import Candidate
+from relay_autotune.identification.fit.separable import Problem, State
 from relay_autotune.record import Record
 
 FloatArray = NDArray[np.float64]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.separable import Problem, State
+from relay_autotune.identification.fit.separable import Problem, State
 
 FloatArray = NDArray[np.float64]
 # A parameter as a function of theta and the linear coefficients.

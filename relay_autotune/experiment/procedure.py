@@ -21,14 +21,14 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from relay_autotune.kick import DirectionWatch, ResponseDetector
-from relay_autotune.levels import Levels
-from relay_autotune.oscillation import Oscillation, count_cycles
+from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
+from relay_autotune.experiment.levels import Levels
+from relay_autotune.experiment.oscillation import Oscillation, count_cycles
+from relay_autotune.experiment.relay_law import Relay
+from relay_autotune.experiment.relay_parameters import ExperimentParameters
+from relay_autotune.experiment.samples import Samples
+from relay_autotune.experiment.settling import NOT_SETTLED, RestState, Settling, rest_state
 from relay_autotune.record import Cycle, Outcome, RelaySettings
-from relay_autotune.relay_law import Relay
-from relay_autotune.relay_parameters import ExperimentParameters
-from relay_autotune.samples import Samples
-from relay_autotune.settling import NOT_SETTLED, RestState, Settling, rest_state
 
 SETTLING_LIMIT = 600.0
 """Longest settling [s], where settle_time does not say; or 500 samples, if these take longer."""

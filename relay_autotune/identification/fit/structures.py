@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.factors import Denominator, Lag, Quadratic, UnstableLag
-from relay_autotune.identification.rational import free_motion, responses
+from relay_autotune.identification.fit.factors import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.identification.fit.rational import free_motion, responses
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Input
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.separable import Problem, State, evaluate, refine
+from relay_autotune.identification.fit.separable import Problem, State, evaluate, refine
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
 

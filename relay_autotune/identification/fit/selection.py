@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification import structures as known_structures
-from relay_autotune.identification.lags import FOPDT
-from relay_autotune.identification.residuals import autocorrelation
-from relay_autotune.identification.separable import (
+from relay_autotune.identification.fit import structures as known_structures
+from relay_autotune.identification.fit.lags import FOPDT
+from relay_autotune.identification.fit.residuals import autocorrelation
+from relay_autotune.identification.fit.separable import (
     Problem,
     State,
     information_criterion,
     refine,
 )
-from relay_autotune.identification.starts import (
+from relay_autotune.identification.fit.starts import (
     Starts,
     coarse,
     refine_all,
@@ -26,7 +26,12 @@ from relay_autotune.identification.starts import (
     start_fopdt,
     time_scales,
 )
-from relay_autotune.identification.structures import RationalStructure, Reading, lag_n, lag_n_zero
+from relay_autotune.identification.fit.structures import (
+    RationalStructure,
+    Reading,
+    lag_n,
+    lag_n_zero,
+)
 
 FloatArray = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.cycles import find_cycles, infer_settings, limit_cycle
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.periodic_spline import Basis, Spline
+from relay_autotune.identification.cycle.periodic_spline import Basis, Spline
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
 
 FloatArray = NDArray[np.float64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.factors import Denominator, Lag, UnstableLag
-from relay_autotune.identification.partial_fractions import follow, partial_fractions
+from relay_autotune.identification.fit.factors import Denominator, Lag, UnstableLag
+from relay_autotune.identification.fit.partial_fractions import follow, partial_fractions
 from relay_autotune.modes import Modes
 from relay_autotune.record import Input, PiecewiseLinear
 from relay_autotune.response import coordinates_at_changes

@@ -20,8 +20,8 @@ from scipy.optimize import brentq
 from relay_autotune.cycles import cycles_of, limit_cycle
 from relay_autotune.errors import IdentificationError
 from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.envelope import envelope, growth_time, normalised_growth
-from relay_autotune.identification.fold import Fold, fold
+from relay_autotune.identification.cycle.envelope import envelope, growth_time, normalised_growth
+from relay_autotune.identification.cycle.fold import Fold, fold
 from relay_autotune.record import Record
 
 FloatArray = NDArray[np.float64]

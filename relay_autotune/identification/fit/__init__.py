@@ -1,0 +1,1 @@
+"""The waveform fit: structures, responses with derivatives, least squares, covariance, choice."""
