@@ -103,6 +103,7 @@ def analyse(
     known: Known = NOTHING,
     options: DesignOptions | None = None,
     final: bool = True,
+    alone: bool = False,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
     """Identify a record and, where the experiment was completed, tune.
@@ -118,6 +119,8 @@ def analyse(
         where they are not given.
     :param final: False while the experiment still runs: only the chosen model, by default a FOPDT
         unless another structure is known, and no gains; this takes a twentieth of the time.
+    :param alone: True: only the chosen method's model and the chosen rule's gains, equal to those
+        beside all others; for many records.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
     :raises RelayAutotuneError: if method or rule are unknown.
@@ -137,9 +140,12 @@ def analyse(
         )
     models = [chosen]
     if final:
-        models += _others(record, method, known, chosen)
+        if not alone:
+            models += _others(record, method, known, chosen)
         models = list(assess(models, record))
     simple = next((m.model for m in models if m.structure == "fopdt"), None)
+    if alone and simple is None and rule != DEFAULT_RULE:
+        simple = _simple((record,), known, chosen)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
         return found
@@ -148,7 +154,7 @@ def analyse(
         return Analysis(
             record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
         )
-    return _tuned(found, rule, rng, simple, options)
+    return _tuned(found, (rule,) if alone else _first(rule), rng, simple, options)
 
 
 def analyse_jointly(
@@ -186,7 +192,12 @@ def analyse_jointly(
         if record.outcome in _NO_GAINS:
             why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
             return replace(found, reason=why)
-    return _tuned(found, rule, rng, _simple(records, known, chosen), options)
+    return _tuned(found, _first(rule), rng, _simple(records, known, chosen), options)
+
+
+def _first(rule: str) -> tuple[str, ...]:
+    """Return the names of all rules, the chosen one first."""
+    return (rule, *(name for name in RULES if name != rule))
 
 
 def _simple(
@@ -204,12 +215,12 @@ def _simple(
 
 def _tuned(
     found: Analysis,
-    rule: str,
+    rules: Sequence[str],
     rng: np.random.Generator | None,
     simple: TransferFunction | None,
     options: DesignOptions | None,
 ) -> Analysis:
-    """Add the gains of every rule that applies to the selected model, the chosen rule's first."""
+    """Add the gains of the rules that apply to the selected model; the first one has to."""
     chosen = found.models[0]
     task = DesignTask(
         model=chosen.model,
@@ -219,13 +230,11 @@ def _tuned(
         describing=_describing_point(found),
     )
     try:
-        first = design(task, rule)
+        first = design(task, rules[0])
     except TuningError as error:
         return replace(found, reason=f"no gains: {error}")
     gains = [first]
-    for name in RULES:
-        if name == rule:
-            continue
+    for name in rules[1:]:
         try:
             gains.append(design(task, name))
         except TuningError:

@@ -58,6 +58,17 @@ def test_while_it_runs_there_is_a_model_and_no_gains():
     assert found.gains == ()
 
 
+@pytest.mark.parametrize(("method", "rule"), [("waveform", "robust"), ("wang_biased", "imc")])
+def test_alone_they_are_what_they_are_beside_others(method, rule):
+    beside = analyse(_record(), method=method, rule=rule)
+    alone = analyse(_record(), method=method, rule=rule, alone=True)
+    assert [m.method for m in alone.models] == [method]
+    assert alone.model.values.tolist() == beside.model.values.tolist()
+    assert alone.model.fit == beside.model.fit
+    assert alone.gains == (beside.best_gains,)
+    assert alone.added_delay == beside.added_delay
+
+
 def test_equal_records_give_equal_numbers():
     one, two = analyse(_record()), analyse(_record())
     assert one.model.values.tolist() == two.model.values.tolist()
