@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.cycle.shape import shape_of_record
@@ -120,7 +122,9 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
         "method": identification.method,
         "structure": identification.structure,
         **model_fields(identification.model),
+        "values": _named(names, identification.values),
         "std": _named(names, identification.std),
+        "covariance": _covariance(identification),
         "ci95": {n: _numbers(ends) for n, ends in zip(names, intervals, strict=True)},
         "fit": {name: _number(getattr(identification.fit, name)) for name in _FIT},
         "validation": _validation(identification),
@@ -161,6 +165,13 @@ def identification_fields(identification: Identification) -> dict[str, Any]:
             for r in identification.rivals
         ],
     }
+
+
+def _covariance(identification: Identification) -> list[Any] | None:
+    """Return the covariance by rows; null where any of it was not estimated."""
+    if not bool(np.all(np.isfinite(identification.covariance))):
+        return None
+    return [_numbers(row) for row in identification.covariance]
 
 
 def _validation(identification: Identification) -> dict[str, Any] | None:

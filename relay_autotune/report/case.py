@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -166,11 +167,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
     :param source: name of the recording.
     :param truth: the process, where it was a simulated one.
     """
-    record, model = analysis.record, analysis.model
-    around: tuple[TransferFunction, ...] = ()
-    if model is not None:
-        # The seed is that of the analysis, so that the band holds the models that it judged.
-        around = ensemble(model, rng=np.random.default_rng(0))
+    record = analysis.record
     return Case(
         source=source,
         experiment_id=record.experiment_id,
@@ -178,7 +175,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         duration=record.duration,
         outcome=record.outcome,
         reason=analysis.reason or record.reason,
-        models=tuple(_model_case(m, truth) for m in analysis.models),
+        models=tuple(model_case(m, truth) for m in analysis.models),
         selected=analysis.selected,
         gains=analysis.gains,
         recommended=analysis.recommended,
@@ -186,9 +183,9 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         record=record,
         settings=record.settings or infer_settings(record),
         cycles=analysis.cycles or _cycles(record),
-        models_around=around,
+        models_around=around(analysis.model),
         added_delay=analysis.added_delay,
-        points=next((m.points for m in analysis.models if m.points), ()),
+        points=measured_points(analysis.models),
     )
 
 
@@ -199,7 +196,29 @@ def _cycles(record: Record) -> tuple[Cycle, ...]:
         return ()
 
 
-def _model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
+def around(model: Identification | None) -> tuple[TransferFunction, ...]:
+    """Return models within the uncertainty of the one that counts, empty where it is not known.
+
+    :param model: the one that counts; None: there is none.
+    """
+    # The seed is that of the analysis, so that the band holds the models that it judged.
+    return () if model is None else ensemble(model, rng=np.random.default_rng(0))
+
+
+def measured_points(models: Sequence[Identification]) -> tuple[FrequencyPoint, ...]:
+    """Return the points of the frequency response that a method measured.
+
+    :param models: what each method found.
+    """
+    return next((m.points for m in models if m.points), ())
+
+
+def model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
+    """Return a model as the report shows it.
+
+    :param found: by one method.
+    :param truth: the process, where it was a simulated one.
+    """
     low, high = found.ci95_low, found.ci95_high
     estimates = tuple(
         Estimate(

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from relay_autotune.cycles import LimitCycle
 from relay_autotune.errors import BagError, RelayAutotuneError
-from relay_autotune.identification import FitReport
+from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.cycle.fourier import FrequencyPoint
-from relay_autotune.identification.result import Rival, is_logarithmic
+from relay_autotune.identification.result import Rival
 from relay_autotune.identification.validation import DIFFERENCES, Validation
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome
-from relay_autotune.report.case import (
-    Case,
-    Estimate,
-    ModelCase,
-    true_value,
-    ultimate_estimates,
-    unit_of,
-)
+from relay_autotune.report.case import Case, around, measured_points, model_case
 from relay_autotune.tuning import Gains
+
+FloatArray = NDArray[np.float64]
 
 
 def read_documents(path: Path | str) -> tuple[Case, ...]:
@@ -82,8 +80,9 @@ def _unreadable(source: str, error: str) -> Case:
 
 def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Case:
     cycle = e["limit_cycle"]
-    models = tuple(_model_case(m, truth) for m in e["models"])
+    models = tuple(_identification(m) for m in e["models"])
     gains = tuple(_gains(g) for g in e["gains"])
+    selected = _index(e["selected"], models)
     return Case(
         source=source,
         experiment_id=str(e["experiment_id"]),
@@ -91,13 +90,14 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         duration=_number(e["duration"]),
         outcome=Outcome[str(e["outcome"]).upper()],
         reason=str(e["reason"]),
-        models=models,
-        selected=_index(e["selected"], models),
+        models=tuple(model_case(m, truth) for m in models),
+        selected=selected,
         gains=gains,
         recommended=_index(e["recommended"], gains),
         limit_cycle=None if cycle is None else _limit_cycle(cycle),
+        models_around=around(None if selected is None else models[selected]),
         added_delay=_number(e.get("added_delay", 0.0)),
-        points=tuple(_point(p) for m in e["models"] for p in m.get("points", ())),
+        points=measured_points(models),
     )
 
 
@@ -117,31 +117,70 @@ def _limit_cycle(c: dict[str, Any]) -> LimitCycle:
     return LimitCycle(**numbers, cycles=cycles, converged=bool(c["converged"]))
 
 
-def _model_case(m: dict[str, Any], truth: TransferFunction | None) -> ModelCase:
-    model = _model(m)
-    return ModelCase(
+def _identification(m: dict[str, Any]) -> Identification:
+    model, names = _model(m), tuple(m["values"])
+    build = _builder(model, names)
+    size = (len(names), len(names))
+    covariance = np.full(size, math.nan)
+    # Where a parameter is tied to another one, only the method knows how.
+    if build is not None and m["covariance"] is not None:
+        covariance = np.array(m["covariance"], dtype=float).reshape(size)
+    ends = np.array([[_number(end) for end in m["ci95"][n]] for n in names]).reshape(-1, 2)
+    return Identification(
         method=str(m["method"]),
         model=model,
-        estimates=tuple(
-            _estimate(name, ends, m, model, truth) for name, ends in m["ci95"].items()
-        ),
-        ultimate=ultimate_estimates(
-            _number(m["ultimate_gain"]),
-            _number(m["ultimate_gain_std"]),
-            _number(m["ultimate_frequency"]),
-            _number(m["ultimate_frequency_std"]),
-            truth,
-        ),
+        build=build or (lambda _: model),
+        parameters=names,
+        values=np.array([_number(v) for v in m["values"].values()]),
+        covariance=covariance,
+        ci95_low=ends[:, 0],
+        ci95_high=ends[:, 1],
+        ultimate_gain=_number(m["ultimate_gain"]),
+        ultimate_gain_std=_number(m["ultimate_gain_std"]),
+        ultimate_frequency=_number(m["ultimate_frequency"]),
+        ultimate_frequency_std=_number(m["ultimate_frequency_std"]),
         fit=FitReport(
             **{f.name: _number(m["fit"][f.name]) for f in fields(FitReport) if f.name in m["fit"]}
         ),
         warnings=tuple(map(str, m["warnings"])),
+        undetermined=tuple(map(str, m["undetermined"])),
         rivals=tuple(Rival(_model(r), _number(r["support"])) for r in m["rivals"]),
         validation=_validation(m.get("validation")),
+        points=tuple(_point(p) for p in m.get("points", ())),
         integrated_error=_number(m.get("integrated_error")),
         combinations=tuple(_combination(c) for c in m.get("combinations", ())),
         advice=tuple(map(str, m.get("advice", ()))),
     )
+
+
+def _builder(
+    model: TransferFunction, names: tuple[str, ...]
+) -> Callable[[FloatArray], TransferFunction] | None:
+    """Return the transfer function for any values of its parameters.
+
+    :param model: the one for the values that were found.
+    :param names: of the parameters.
+    :return: None where these parameters alone do not make the structure.
+    """
+
+    def build(values: FloatArray) -> TransferFunction:
+        given = dict(zip(names, map(float, values), strict=True))
+        zeros = [given[n] for n in ("zero",) if n in given]
+        zeros += [-given[n] for n in ("inverse_time_constant",) if n in given]
+        return TransferFunction.from_structure(
+            model.structure,
+            gain=given["gain"],
+            time_constants=[v for n, v in given.items() if n.startswith("time_constant")],
+            zeros=zeros,
+            dead_time=given["dead_time"],
+            order=model.order,
+            natural_frequency=given.get("natural_frequency", 0.0),
+            damping=given.get("damping", 0.0),
+        )
+
+    if not {"gain", "dead_time"} <= set(names) or model.structure == "general":
+        return None
+    return build
 
 
 def _validation(v: dict[str, Any] | None) -> Validation | None:
@@ -155,38 +194,6 @@ def _combination(c: dict[str, Any]) -> Combination:
     low, high = (_number(end) for end in c["ci95"])
     value, std = _number(c["value"]), _number(c["std"])
     return Combination(str(c["name"]), str(c["unit"]), value, std, low, high)
-
-
-def _estimate(
-    name: str,
-    ends: Sequence[Any],
-    m: dict[str, Any],
-    model: TransferFunction,
-    truth: TransferFunction | None,
-) -> Estimate:
-    low, high = (_number(end) for end in ends)
-    return Estimate(
-        name,
-        _value(name, low, high, model),
-        low,
-        high,
-        unit_of(name, model),
-        name not in m["undetermined"],
-        true_value(name, model, truth),
-    )
-
-
-def _value(name: str, low: float, high: float, model: TransferFunction) -> float:
-    """Return a parameter's value, which the document has in its transfer function alone."""
-    if name == "dead_time":
-        return model.dead_time
-    if name == "gain" and model.structure not in ("unstable_fopdt", "unstable_sopdt"):
-        return model.gain
-    if name == "time_constant" and model.time_constants:
-        return abs(model.time_constants[0].real)
-    if is_logarithmic(name):
-        return math.copysign(math.sqrt(low * high), low) if low * high > 0.0 else math.nan
-    return 0.5 * (low + high)
 
 
 def _model(m: dict[str, Any]) -> TransferFunction:

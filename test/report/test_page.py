@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -13,6 +14,7 @@ from report_cases import MODEL, aborted, completed, fruitless, only
 
 from relay_autotune.document import document, model_fields, to_json
 from relay_autotune.identification.combinations import Combination
+from relay_autotune.identification.result import Rival, with_uncertainty
 from relay_autotune.models import TransferFunction
 from relay_autotune.report.case import Case, case_of, true_value
 from relay_autotune.report.figures import PLATES
@@ -176,15 +178,98 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
     assert case.model.model == direct.model.model
     for ours, theirs in zip(case.model.estimates, direct.model.estimates, strict=True):
         assert (ours.name, ours.unit, ours.low) == (theirs.name, theirs.unit, theirs.low)
-        assert ours.value == pytest.approx(theirs.value, rel=1e-9)
+        assert ours.value == theirs.value
     assert case.model.ultimate == direct.model.ultimate
     assert case.limit_cycle.period == direct.limit_cycle.period
+    assert case.models_around == direct.models_around
+    assert len(case.models_around) == 100
+    assert case.points == direct.points
     there = {plate.key for plate in PLATES if not plate.missing(case)}
     assert there == {"nyquist", "bode", "closed_loop", "rules", "uncertainty"}
     only(monkeypatch, "experiment", "uncertainty")
     found = read(page([case]))
     assert [i for i in found.ids if i.count("-") == 1] == ["e1-uncertainty"]
     assert "The experiment: it needs the samples" in found.text
+
+
+@pytest.mark.parametrize(
+    ("build", "parameters"),
+    [
+        (lambda v: TransferFunction.fopdt(*v), {"gain": -2.0, "time_constant": 3.0}),
+        (
+            lambda v: TransferFunction.lag_n(v[0], v[1], 4, v[2]),
+            {"gain": 2.0, "time_constant": 3.0},
+        ),
+        (
+            lambda v: TransferFunction.lag_n_zero(v[0], v[1], 3, v[2], v[3]),
+            {"gain": 2.0, "time_constant": 3.0, "zero": -0.7},
+        ),
+        (
+            lambda v: TransferFunction.sopdt(v[0], v[1:3], v[4], v[3]),
+            {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 0.5, "zero": 0.3},
+        ),
+        (
+            lambda v: TransferFunction.oscillator(v[0], v[1], v[2], v[3]),
+            {"gain": 2.0, "natural_frequency": 3.0, "damping": 0.3},
+        ),
+        (
+            lambda v: TransferFunction.two_equal_one(*v),
+            {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 0.5},
+        ),
+        (
+            lambda v: TransferFunction.three_lags(v[0], v[1:4], v[4]),
+            {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 2.0, "time_constant_3": 1.0},
+        ),
+        (
+            lambda v: TransferFunction.lag_complex(*v),
+            {"gain": 2.0, "time_constant": 3.0, "natural_frequency": 4.0, "damping": 0.3},
+        ),
+        (lambda v: TransferFunction.ipdt(*v), {"gain": 2.0}),
+        (lambda v: TransferFunction.integrator_lag(*v), {"gain": 2.0, "time_constant": 3.0}),
+        (
+            lambda v: TransferFunction.integrator_inverse(*v),
+            {"gain": 2.0, "inverse_time_constant": 0.4, "time_constant": 3.0},
+        ),
+        (lambda v: TransferFunction.unstable_fopdt(*v), {"gain": 2.0, "time_constant": 3.0}),
+        (
+            lambda v: TransferFunction.unstable_sopdt(*v),
+            {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 0.5},
+        ),
+    ],
+    ids=lambda p: "" if callable(p) else "-".join(p),
+)
+def test_the_models_within_the_uncertainty_are_those_of_the_document(build, parameters) -> None:
+    """Whatever the structure: the band of a report is drawn from these models."""
+    parameters = parameters | {"dead_time": 0.2}
+    values = np.array([*parameters.values()])
+    rng = np.random.default_rng(1)
+    root = 0.1 * rng.standard_normal((values.size, values.size)) * values[:, None]
+    rival = Rival(TransferFunction.fopdt(math.copysign(1.0, values[0]), 2.0, 1.0), 0.1)
+    found = replace(
+        with_uncertainty("waveform", build, tuple(parameters), values, root @ root.T),
+        rivals=(rival,),
+    )
+    analysis = replace(fruitless(), models=(found,), selected=0)
+    direct = case_of(analysis, "bag").models_around
+    assert len(set(direct)) > 80
+    assert from_json(analysis).models_around == direct
+    assert {e.value for e in from_json(analysis).model.estimates} == set(values)
+
+
+def test_without_a_covariance_a_document_gives_no_models_around() -> None:
+    known = with_uncertainty(
+        "atv", lambda v: TransferFunction.fopdt(*v), ("gain", "time_constant", "dead_time"),
+        np.array((2.0, 3.0, 0.2)),
+    )  # fmt: skip
+    # A method may tie the dead time to the lags, and only the method knows how.
+    tied = with_uncertainty(
+        "thyagarajan", lambda v: TransferFunction.lag_n(v[0], v[1], 2, 0.1 * v[1]),
+        ("gain", "time_constant"), np.array((2.0, 3.0)), np.eye(2) * 1e-4,
+    )  # fmt: skip
+    for found in (known, tied):
+        case = from_json(replace(fruitless(), models=(found,), selected=0))
+        assert case.models_around == ()
+        assert [e.value for e in case.model.estimates] == list(found.values)
 
 
 def test_a_simulated_process_is_compared_with_the_truth(tmp_path) -> None:
