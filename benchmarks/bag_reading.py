@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import struct
 import subprocess
 import sys
@@ -156,7 +157,7 @@ def comparison(folder: Path, count: int, turns: int) -> list[tuple[str, ...]]:
 def needed_bytes(path: Path) -> Callable[[], None]:
     """Return the work of reading the bytes of the chunks in which the pair lies."""
     with McapFile(path) as file:
-        ranges = [(s.start, s.end) for s in file.segments if s.channels and s.channels & {1, 2}]
+        ranges = [(s.start, s.end) for s in file.segments((1, 2))]
 
     def work() -> None:
         with path.open("rb") as handle:
@@ -173,17 +174,19 @@ def images(folder: Path, length: int, turns: int) -> list[tuple[str, ...]]:
         path = folder / "images.mcap"
         write_recording(path, among_images(length, apart=apart), compression=compression)
         plain = needed_bytes(path)
-        mine, base = [], []
-        for _ in range(turns):
-            mine.append(from_disk(path, ours, path))
-            base.append(from_disk(path, plain))
+        # What is imported at first use is no part of it.
+        ours(path)
+        # Mixed, each turn reads all of the file.
+        counted = range(turns if apart else min(turns, 3))
+        taken = [(from_disk(path, ours, path), from_disk(path, plain)) for _ in counted]
+        mine, base = (statistics.median(column) for column in zip(*taken, strict=True))
         name = f"{'apart' if apart else 'mixed'}, {compression or 'uncompressed'}"
         size = path.stat().st_size / 1e9
         peak, signals = memory(path)
         rows.append(
             (
-                *(name, three(size), three(1e3 * min(mine)), three(1e3 * min(base))),
-                *(three(min(mine) / min(base)), "<= 3" if apart else "", three(peak - signals)),
+                *(name, three(size), three(1e3 * mine), three(1e3 * base)),
+                *(three(mine / base), "<= 3" if apart else "", three(peak - signals)),
                 "<= 300",
             )
         )
@@ -256,12 +259,15 @@ def comparison_table(folder: Path, options: argparse.Namespace) -> str:
 
 def images_table(folder: Path, options: argparse.Namespace) -> str:
     """Return the table of (b) and (c)."""
-    length, turns = (QUICK_IMAGE_SECONDS, 1) if options.quick else (IMAGE_SECONDS, 3)
+    length, turns = (QUICK_IMAGE_SECONDS, 1) if options.quick else (IMAGE_SECONDS, TURNS)
     headings = (
         *("images and numbers", "[GB]", "this [ms]", "bytes alone [ms]", "x", "target"),
         *("memory beyond the signals [MB]", "target"),
     )
-    said = "The pair, 6,000 messages a second, in a bag of camera images that is on the disk:"
+    said = (
+        f"The pair, 100 messages a second, in a bag of camera images that is on the disk; "
+        f"median of {turns} turns (mixed: at most 3) in which both are timed:"
+    )
     return f"{said}\n\n{table(headings, images(folder, length, turns))}\n"
 
 

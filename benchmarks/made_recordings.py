@@ -193,7 +193,7 @@ def among_others(count: int) -> Iterator[Chunk]:
 
 
 def among_images(seconds: int, *, apart: bool) -> Iterator[Chunk]:
-    """Yield chunks of 30 camera images a second, and 6,000 messages a second of the pair.
+    """Yield chunks of 30 camera images a second, and 100 messages a second of the pair.
 
     :param seconds: length of the recording.
     :param apart: whether images and numbers lie in different chunks.
@@ -203,7 +203,7 @@ def among_images(seconds: int, *, apart: bool) -> Iterator[Chunk]:
     for second in range(seconds):
         start = START + second * 10**9
         numbers = [
-            (start + k * 10**7, 1 + c, float64(float(k % 29 + c)))
+            (start + k * 20_000_000, 1 + c, float64(float(k % 29 + c)))
             for k in range(50)
             for c in (0, 1)
         ]

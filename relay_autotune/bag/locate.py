@@ -148,12 +148,15 @@ def indexed_offsets(index: bytes, channel: int, size: int) -> IntArray:
     return offsets
 
 
-def messages_at(content: Content, offsets: IntArray, channel: int) -> Messages:
+def messages_at(
+    content: Content, offsets: IntArray, channel: int, limit: IntArray | None = None
+) -> Messages:
     """Return the messages at some places.
 
     :param content: the records.
-    :param offsets: where messages of the channel are said to begin.
+    :param offsets: where messages of the channel are said to begin, shape (n,).
     :param channel: their channel.
+    :param limit: where each must have ended, shape (n,); None: at the end of the content.
     :raises DamageError: if one of the places holds something else.
     """
     heads = _heads(content, offsets)
@@ -166,7 +169,7 @@ def messages_at(content: Content, offsets: IntArray, channel: int) -> Messages:
         # A length beyond the signed range is negative here.
         | (length < MESSAGE_HEAD_SIZE)
         | (length > len(content))
-        | (end > len(content))
+        | (end > (len(content) if limit is None else limit))
     )
     if bool(wrong.any()):
         raise DamageError("an index does not lead to a message of its channel")

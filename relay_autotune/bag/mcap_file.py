@@ -5,10 +5,14 @@ A file without its footer, as a killed recorder leaves it, is read from its fron
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import contextlib
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+
+import numpy as np
 
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.locate import (
@@ -19,19 +23,37 @@ from relay_autotune.bag.locate import (
     messages_by_channel,
     record_offsets,
 )
-from relay_autotune.bag.mcap_index import (
-    Segment,
-    damage_note,
-    is_chunk_there,
-    read_layout,
-    scan,
-    segment_content,
-)
+from relay_autotune.bag.mcap_layout import Segment, damage_note, is_chunk_there, segment_content
 from relay_autotune.bag.mcap_records import Channel, DamageError
+from relay_autotune.bag.mcap_scan import scan
+from relay_autotune.bag.mcap_summary import layout_by_summary
 from relay_autotune.bag.source import Source
+from relay_autotune.record import IntArray
 
 # Two records cannot begin nearer to each other than this.
 _SMALLEST_RECORD = 9
+
+# Segments are put together up to this size: an array operation on few messages takes as long as
+# one on a thousand.
+_BATCH = 256 << 10
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A segment with the places at which messages are said to begin.
+
+    :param segment: where it lies.
+    :param content: its records.
+    :param wanted: the channels that are wanted.
+    :param places: where their messages begin in the content, by channel, shape (n,) each.
+    :param by_index: whether the file says so; else they were found there.
+    """
+
+    segment: Segment
+    content: Content
+    wanted: frozenset[int]
+    places: dict[int, IntArray]
+    by_index: bool
 
 
 class McapFile:
@@ -47,15 +69,14 @@ class McapFile:
         self._largest = largest_chunk
         self._source = Source(path)
         try:
-            layout = read_layout(self._source, largest_chunk)
+            layout = layout_by_summary(self._source) or scan(self._source, largest_chunk)
         except BaseException:
             self.close()
             raise
         self.channels: dict[int, Channel] = layout.declared.channels
         self.metadata = layout.declared.metadata
         self.notes = [*self._source.notes, *layout.notes]
-        self.segments = layout.segments
-        self._unseen = layout.by_index
+        self._layout = layout
         self._counts = layout.declared.message_counts
 
     def __enter__(self) -> Self:
@@ -82,6 +103,24 @@ class McapFile:
         """Return how many messages of a channel the file says it has; 0: it does not say."""
         return self._counts.get(channel, 0)
 
+    def segments(self, channels: Collection[int]) -> list[Segment]:
+        """Return the segments that may hold messages of some channels, in the order of the file.
+
+        :param channels: their ids.
+        """
+        wanted = frozenset(channels)
+        chosen = self._layout.holding(wanted)
+        if self._layout.index is None:
+            return chosen
+        self._source.announce((segment.start, segment.index_end) for segment in chosen)
+        # Only the chunks that are read are looked at before: on a disk each look takes its time.
+        if all(is_chunk_there(self._source, segment) for segment in chosen):
+            return chosen
+        self._layout = scan(self._source, self._largest)
+        for note in self._layout.notes:
+            self._note(note)
+        return self._layout.holding(wanted)
+
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:
         """Yield the messages of some channels, a run of them at a time.
 
@@ -91,70 +130,109 @@ class McapFile:
         :return: the channel; the number of bytes that came before the run, so that messages of
             different channels can be put into the order of the file; the messages.
         """
-        wanted, before = frozenset(channels), 0
-        for segment in self._with(wanted):
+        before = 0
+        for pieces in self._batches(frozenset(channels)):
+            for size, found in self._messages(pieces):
+                for channel, messages in found.items():
+                    yield channel, before, messages
+                before += size + _SMALLEST_RECORD
+
+    def _batches(self, wanted: frozenset[int]) -> Iterator[list[_Piece]]:
+        """Yield the segments that may hold messages of some channels, small ones together."""
+        batch: list[_Piece] = []
+        size = 0
+        for segment in self.segments(wanted):
             try:
                 content = segment_content(self._source, segment, self._largest)
-                found = self._found(segment, content, wanted)
             except DamageError as damage:
                 self._note(damage_note(self._source, segment, damage))
                 continue
-            for channel, messages in found.items():
-                yield channel, before, messages
-            before += len(content) + _SMALLEST_RECORD
+            if batch and size + len(content) > _BATCH:
+                yield batch
+                batch, size = [], 0
+            batch.append(self._piece(segment, content, wanted))
+            size += len(content)
+        if batch:
+            yield batch
 
-    def _with(self, wanted: frozenset[int]) -> list[Segment]:
-        """Return the segments that may hold messages of some channels."""
-
-        def chosen() -> list[Segment]:
-            return [s for s in self.segments if s.channels is None or s.channels & wanted]
-
-        # Only the chunks that are read are looked at before: on a disk each look takes its time.
-        if self._unseen and not all(is_chunk_there(self._source, s) for s in chosen()):
-            layout = scan(self._source, self._largest)
-            self.segments, self._unseen = layout.segments, False
-            self.notes += [note for note in layout.notes if note not in self.notes]
-        return chosen()
-
-    def _found(
-        self, segment: Segment, content: Content, wanted: frozenset[int]
-    ) -> dict[int, Messages]:
+    def _piece(self, segment: Segment, content: Content, wanted: frozenset[int]) -> _Piece:
         if segment.index:
             try:
-                return self._by_index(segment, content, wanted)
+                places = self._by_index(segment, len(content), wanted)
+                return _Piece(segment, content, wanted, places, by_index=True)
             except DamageError as damage:
-                self._note(
-                    f"{self.path.name} has a bad message index at byte {segment.end}: {damage}; "
-                    f"the chunk before it is searched instead"
-                )
-        offsets, end = record_offsets(content)
-        if segment.whole and end != len(content):
-            self._note(
-                damage_note(
-                    self._source, segment, DamageError(f"a record of impossible length at {end}")
-                )
-            )
-        places, _ = messages_by_channel(content, offsets)
+                self._note_bad_index(segment, damage)
+        return self._searched(segment, content, wanted)
+
+    def _by_index(
+        self, segment: Segment, size: int, wanted: frozenset[int]
+    ) -> dict[int, IntArray]:
+        """Return where messages begin, by the message indexes behind their chunk."""
         return {
-            channel: messages_at(content, found, channel)
-            for channel, found in places.items()
+            channel: indexed_offsets(self._source.read(begin, end), channel, size)
+            for channel, (begin, end) in segment.index.items()
             if channel in wanted
         }
 
-    def _by_index(
-        self, segment: Segment, content: Content, wanted: frozenset[int]
-    ) -> dict[int, Messages]:
-        records = self._source.read(segment.end, segment.index_end)
-        return {
-            channel: messages_at(
-                content,
-                indexed_offsets(records[place - segment.end :], channel, len(content)),
-                channel,
-            )
-            for channel, place in segment.index.items()
-            if channel in wanted
-        }
+    def _searched(self, segment: Segment, content: Content, wanted: frozenset[int]) -> _Piece:
+        """Find messages by going through the records."""
+        offsets, end = record_offsets(content)
+        if segment.whole and end != len(content):
+            damage = DamageError(f"a record of impossible length at {end}")
+            self._note(damage_note(self._source, segment, damage))
+        places, _ = messages_by_channel(content, offsets)
+        places = {channel: places[channel] for channel in places.keys() & wanted}
+        return _Piece(segment, content, wanted, places, by_index=False)
+
+    def _messages(self, pieces: Sequence[_Piece]) -> list[tuple[int, dict[int, Messages]]]:
+        """Return the messages of each run of records, after the size of that."""
+        if len(pieces) > 1:
+            # Where an index leads astray, below is found out which one.
+            with contextlib.suppress(DamageError):
+                return [_joined(pieces)]
+        return [self._alone(piece) for piece in pieces]
+
+    def _alone(self, piece: _Piece) -> tuple[int, dict[int, Messages]]:
+        try:
+            return _joined([piece])
+        except DamageError as damage:
+            if not piece.by_index:
+                raise
+            self._note_bad_index(piece.segment, damage)
+        return _joined([self._searched(piece.segment, piece.content, piece.wanted)])
+
+    def _note_bad_index(self, segment: Segment, damage: DamageError) -> None:
+        self._note(
+            f"{self.path.name} has a bad message index at byte {segment.end}: {damage}; "
+            f"the chunk before it is searched instead"
+        )
 
     def _note(self, note: str) -> None:
         if note not in self.notes:
             self.notes.append(note)
+
+
+def _joined(pieces: Sequence[_Piece]) -> tuple[int, dict[int, Messages]]:
+    """Return the messages of segments as one run of records, after the size of that.
+
+    :raises DamageError: if a place holds something else than a message of its channel.
+    """
+    if len(pieces) == 1:
+        content, places = pieces[0].content, pieces[0].places
+        found = {channel: messages_at(content, at, channel) for channel, at in places.items()}
+        return len(content), found
+    joined = b"".join(piece.content for piece in pieces)
+    listed: dict[int, list[IntArray]] = {}
+    limits: dict[int, list[IntArray]] = {}
+    begin = 0
+    for piece in pieces:
+        end = begin + len(piece.content)
+        for channel, at in piece.places.items():
+            listed.setdefault(channel, []).append(at + begin)
+            limits.setdefault(channel, []).append(np.full(at.size, end))
+        begin = end
+    found = {
+        channel: messages_at(joined, np.concatenate(at), channel, np.concatenate(limits[channel]))
+        for channel, at in listed.items()
+    }
+    return len(joined), found

@@ -6,7 +6,6 @@ Layout: https://mcap.dev/spec. Every length is checked against what is there bef
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
@@ -21,26 +20,6 @@ FOOTER_SIZE = 20
 
 class DamageError(Exception):
     """Bytes that are no MCAP records."""
-
-
-def records(data: bytes, *, strict: bool = True) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, begin and end of each record.
-
-    :param strict: raise if the last one is cut; else leave it out.
-    :raises DamageError: if a record is longer than what is left.
-    """
-    position, stop = 0, len(data)
-    while position < stop:
-        if stop - position >= RECORD.size:
-            opcode, length = RECORD.unpack_from(data, position)
-            begin = position + RECORD.size
-            if opcode != 0 and length <= stop - begin:
-                yield opcode, begin, begin + length
-                position = begin + length
-                continue
-        if strict:
-            raise DamageError(f"a record of impossible length at {position}")
-        return
 
 
 def unsigned(data: bytes, at: int, form: str) -> int:

@@ -5,20 +5,26 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from relay_autotune.bag.limits import (
     FREE_DISK,
+    LARGEST_SUMMARY,
     LARGEST_WINDOW,
     MOST_EXPANSION,
     UNSUSPICIOUS,
     missing_package,
 )
+from relay_autotune.bag.mcap_records import RECORD, DamageError
 from relay_autotune.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+# Of each range that is announced at most so much is fetched before it is read.
+_ANNOUNCED = 64 << 10
 
 # What the file might be instead, by its first bytes.
 _OTHERS = (
@@ -79,6 +85,18 @@ class Source:
         except OSError as error:
             raise BagError(f"cannot read {self.path}: {error.strerror or error}") from error
         return data
+
+    def announce(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Tell the system what will be read, so that a disk fetches it all at once.
+
+        :param ranges: where each begins and ends; of a long one the beginning is announced, the
+            rest is then read ahead by itself.
+        """
+        if not hasattr(os, "posix_fadvise"):
+            return
+        for start, end in ranges:
+            length = min(end - start, _ANNOUNCED)
+            os.posix_fadvise(self._file.fileno(), start, length, os.POSIX_FADV_WILLNEED)
 
     def _check_start(self) -> None:
         start = self.read(0, 16)
@@ -149,3 +167,30 @@ class Source:
             # What came before is a recording that ends there.
             self.notes.append(f"{self.path.name} cannot be expanded to its end ({error})")
             return b""
+
+
+def file_records(source: Source, position: int, stop: int) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, begin and end of each record between two places of a file.
+
+    :raises DamageError: if a record is longer than what is left.
+    """
+    while position < stop:
+        head = source.read(position, min(position + RECORD.size, stop))
+        if len(head) == RECORD.size:
+            opcode, length = RECORD.unpack(head)
+            begin = position + RECORD.size
+            if opcode != 0 and length <= stop - begin:
+                yield opcode, begin, begin + length
+                position = begin + length
+                continue
+        raise DamageError(f"a record of impossible length at {position}")
+
+
+def record_body(source: Source, begin: int, end: int) -> bytes:
+    """Return what a record that declares something holds.
+
+    :raises DamageError: if it is larger than such records are.
+    """
+    if end - begin > LARGEST_SUMMARY:
+        raise DamageError(f"a record of {end - begin} bytes")
+    return source.read(begin, end)

@@ -8,6 +8,8 @@ import tracemalloc
 import numpy as np
 import pytest
 import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from made_bags import START
 from mcap.writer import CompressionType, Writer
 
@@ -199,3 +201,90 @@ def test_messages_that_are_compressed_one_by_one_are_told(tmp_path):
         writer.finish()
     with pytest.raises(BagError, match="compressed one by one, convert the bag with: ros2 bag"):
         read(path)
+
+
+def without_summary(data):
+    """Return a file whose footer tells of no summary, so that it is gone through."""
+    foot = len(data) - 8 - 20
+    assert data[foot - 9] == 2
+    return data[:foot] + bytes(20) + data[foot + 20 :]
+
+
+@given(
+    turns=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 60)), min_size=1, max_size=80),
+    chunk_size=st.sampled_from((1, 90, 700, 10**6)),
+    compression=st.sampled_from(list(CompressionType)),
+    wanted=st.sets(st.sampled_from(("/a", "/b", "/c")), min_size=1),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_index_and_the_chunks_say_the_same(
+    tmp_path_factory, turns, chunk_size, compression, wanted
+):
+    path = tmp_path_factory.mktemp("index") / "bag.mcap"
+    names = ("/a", "/b", "/c")
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_size, compression=compression)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        ids = [writer.register_channel(name, "cdr", schema) for name in names]
+        for k, (which, more) in enumerate(turns):
+            data = encode_float64(float(k)) + bytes(more)
+            writer.add_message(ids[which], START + k, data, START + k)
+        writer.finish()
+    cut = path.with_name("cut.mcap")
+    cut.write_bytes(without_summary(path.read_bytes()))
+    for file in (path, cut):
+        with McapFile(file) as opened:
+            topics = Topics(file, [opened])
+            found = topics.signals(sorted(wanted & set(topics.types())))
+            assert opened.notes == []
+        for name, timed in found.items():
+            expected = [float(k) for k, (which, _) in enumerate(turns) if names[which] == name]
+            assert timed.signal.values.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("place", "form", "value"),
+    [
+        (1, "<Q", 10),  # a record too short for what it holds
+        (25, "<Q", 4),  # a chunk within the magic
+        (25, "<Q", 2**64 - 60),  # start and length that together seem small
+        (33, "<Q", 9),  # no room for a chunk
+        (41, "<I", 2**32 - 1),  # a list beyond the record
+        (41, "<I", 7),  # one that ends within an entry
+        (47, "<Q", 8),  # a message index before its chunk
+        (55, "<Q", 2**64 - 2),  # message indexes beyond the data
+    ],
+)
+def test_a_chunk_index_out_of_bounds_sends_through_the_file(tmp_path, place, form, value):
+    path = write(tmp_path / "bag.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    index = list(records(data, 8))[1]
+    # One channel in each chunk.
+    assert struct.unpack_from("<I", data, index + 41) == (10,)
+    struct.pack_into(form, data, index + place, value)
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert notes == []
+
+
+def test_message_indexes_of_other_topics_are_not_read(tmp_path):
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        ids = [writer.register_channel(name, "cdr", schema) for name in ("/y", "/x", "/z")]
+        for k in range(COUNT):
+            for channel in ids:
+                writer.add_message(channel, START + k, encode_float64(float(k)), START + k)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    for at in records(data, 7):
+        if struct.unpack_from("<H", data, at + 9)[0] != ids[1]:
+            data[at + 15 : at + 30] = bytes(range(15))
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert notes == []

@@ -1,0 +1,153 @@
+"""Where the messages of an MCAP file are: its chunks, and the records outside of any."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from relay_autotune.bag.chunks import chunk_content
+from relay_autotune.bag.locate import Content
+from relay_autotune.bag.mcap_records import CHUNK, RECORD, DamageError, Declarations
+from relay_autotune.bag.source import Source
+from relay_autotune.record import IntArray
+
+# What a chunk takes beside its content, compressed or not.
+_CHUNK_OVERHEAD = 1 << 20
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A run of bytes with messages: a chunk, or records outside of any chunk.
+
+    :param start: where its first record begins in the file.
+    :param end: where its last one ends, or the file if that ends before.
+    :param whole: whether all of it is there.
+    :param is_chunk: whether it is a chunk.
+    :param channels: those of its messages; None: not known.
+    :param index: where the message index of a channel begins and ends in the file.
+    """
+
+    start: int
+    end: int
+    whole: bool
+    is_chunk: bool
+    channels: frozenset[int] | None = None
+    index: dict[int, tuple[int, int]] = field(default_factory=dict)
+
+    @property
+    def index_end(self) -> int:
+        """Where the last of the message indexes ends; without any, the segment itself."""
+        return max((self.end, *(end for _, end in self.index.values())))
+
+
+@dataclass(frozen=True)
+class ChunkIndex:
+    """The chunks of a file by the index at its end, as columns: a bag may have very many.
+
+    :param start: where each chunk begins in the file, rising, shape (n,).
+    :param end: where it ends, shape (n,).
+    :param index_end: where its message indexes end, shape (n,).
+    :param count: number of its message indexes; 0: which messages it holds is not known;
+        shape (n,).
+    :param channel: channel of each message index, those of a chunk together, shape (m,).
+    :param place: where it begins in the file, shape (m,).
+    """
+
+    start: IntArray
+    end: IntArray
+    index_end: IntArray
+    count: IntArray
+    channel: IntArray
+    place: IntArray
+
+    def holding(self, channels: frozenset[int]) -> list[Segment]:
+        """Return the chunks that may hold messages of some channels, in the order of the file.
+
+        :param channels: their ids; message indexes of others are left out.
+        """
+        wanted = np.isin(self.channel, list(channels))
+        owner = np.repeat(np.arange(self.start.size), self.count)
+        chosen = self.count == 0
+        chosen[owner[wanted]] = True
+        # A message index ends where the next one of its chunk begins.
+        of_chosen = np.flatnonzero(chosen[owner])
+        of_chosen = of_chosen[np.argsort(self.place[of_chosen], kind="stable")]
+        begin = self.place[of_chosen]
+        end = np.minimum(
+            np.append(begin[1:], np.iinfo(np.int64).max), self.index_end[owner[of_chosen]]
+        )
+        indexes: dict[int, dict[int, tuple[int, int]]] = {}
+        listed = wanted[of_chosen]
+        for number, channel, first, last in zip(
+            owner[of_chosen][listed].tolist(),
+            self.channel[of_chosen][listed].tolist(),
+            begin[listed].tolist(),
+            end[listed].tolist(),
+            strict=True,
+        ):
+            indexes.setdefault(number, {})[channel] = (first, last)
+        return [
+            Segment(start, end, whole=True, is_chunk=True, index=indexes.get(number, {}))
+            for number, start, end in zip(
+                np.flatnonzero(chosen).tolist(),
+                self.start[chosen].tolist(),
+                self.end[chosen].tolist(),
+                strict=True,
+            )
+        ]
+
+
+@dataclass
+class Layout:
+    """What a file holds, and where.
+
+    :param declared: channels and metadata.
+    :param notes: what was found amiss, each a sentence.
+    :param segments: in the order of the file, where it was gone through.
+    :param index: the index at its end, whose places are yet to be looked at; None: it was gone
+        through.
+    """
+
+    declared: Declarations = field(default_factory=Declarations)
+    notes: list[str] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
+    index: ChunkIndex | None = None
+
+    def holding(self, channels: frozenset[int]) -> list[Segment]:
+        """Return the segments that may hold messages of some channels."""
+        if self.index is not None:
+            return self.index.holding(channels)
+        return [s for s in self.segments if s.channels is None or s.channels & channels]
+
+
+def segment_content(source: Source, segment: Segment, largest: int) -> Content:
+    """Return the records of a segment.
+
+    :param largest: size that a chunk may have [bytes].
+    :raises DamageError: if nothing of it can be used.
+    """
+    if not segment.is_chunk:
+        return source.read(segment.start, segment.end)
+    if segment.end - segment.start > largest + _CHUNK_OVERHEAD:
+        raise DamageError(
+            f"a chunk takes {segment.end - segment.start} bytes, more than the {largest} that "
+            f"--max-chunk allows"
+        )
+    body = source.read(segment.start + RECORD.size, segment.end)
+    whole = segment.whole and len(body) == segment.end - segment.start - RECORD.size
+    return chunk_content(body, whole=whole, largest=largest)
+
+
+def is_chunk_there(source: Source, segment: Segment) -> bool:
+    """Return whether a chunk of the index begins where that says."""
+    head = source.read(segment.start, segment.start + RECORD.size)
+    return head == RECORD.pack(CHUNK, segment.end - segment.start - RECORD.size)
+
+
+def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
+    """Return what to say of a segment that cannot be used."""
+    return (
+        f"{source.path.name} is damaged at byte {segment.start}: {damage}; "
+        f"what lay there is left out"
+    )
