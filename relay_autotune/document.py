@@ -11,6 +11,7 @@ import numpy as np
 
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.foreign import infer_settings
 from relay_autotune.identification.cycle.shape import shape_of_record
 from relay_autotune.identification.validation import DIFFERENCES
 from relay_autotune.record import Outcome, Record
@@ -73,6 +74,9 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "outcome": record.outcome.name.lower(),
         "reason": _reason(analysis),
         "experiment_id": record.experiment_id,
+        "samples": len(record),
+        "lost_samples": record.lost_samples,
+        "relay": _relay(record),
         "limit_cycle": _limit_cycle(analysis),
         "models": [identification_fields(model) for model in analysis.models],
         "selected": analysis.selected,
@@ -80,6 +84,13 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "recommended": analysis.recommended,
         "added_delay": _number(analysis.added_delay),
     }
+
+
+def _relay(record: Record) -> dict[str, Any] | None:
+    settings = record.settings or infer_settings(record)
+    if settings is None:
+        return None
+    return {name: _number(value) for name, value in vars(settings).items()}
 
 
 def _reason(analysis: Analysis) -> str:

@@ -112,7 +112,8 @@ class Case:
     :param gains: what each rule gives.
     :param recommended: index of the gains that count; None: there are none.
     :param limit_cycle: averages over its cycles; None: no whole cycle.
-    :param category: of the shape (Thyagarajan and Yu 2003); empty: not told.
+    :param samples: how many there are; 0: not known.
+    :param lost_samples: how many were sent and did not come.
     :param record: the samples; None: not known.
     :param settings: of the relay; None: no relay, or not known.
     :param cycles: the whole cycles; empty where there are no samples.
@@ -132,7 +133,8 @@ class Case:
     gains: tuple[Gains, ...] = ()
     recommended: int | None = None
     limit_cycle: LimitCycle | None = None
-    category: str = ""
+    samples: int = 0
+    lost_samples: int = 0
     record: Record | None = None
     settings: RelaySettings | None = None
     cycles: tuple[Cycle, ...] = ()
@@ -180,6 +182,8 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         gains=analysis.gains,
         recommended=analysis.recommended,
         limit_cycle=limit_cycle(analysis.cycles) if analysis.cycles else None,
+        samples=len(record),
+        lost_samples=record.lost_samples,
         record=record,
         settings=record.settings or infer_settings(record),
         cycles=analysis.cycles or _cycles(record),

@@ -103,10 +103,10 @@ def facts_of(case: Case, *, with_id: bool) -> tuple[str, ...]:
     if case.start:
         found.append(date_text(case.start))
     length = f"{digits(case.duration)} s"
-    if case.record is not None:
-        length += f", {len(case.record)} samples"
-        if case.record.lost_samples:
-            length += f", {case.record.lost_samples} lost"
+    if case.samples:
+        length += f", {case.samples} samples"
+        if case.lost_samples:
+            length += f", {case.lost_samples} lost"
     return (*found, length)
 
 

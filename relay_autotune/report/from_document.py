@@ -20,7 +20,7 @@ from relay_autotune.identification.cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival
 from relay_autotune.identification.validation import DIFFERENCES, Validation
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
+from relay_autotune.record import Outcome, RelaySettings
 from relay_autotune.report.case import Case, around, measured_points, model_case
 from relay_autotune.tuning import Gains
 
@@ -95,6 +95,9 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         gains=gains,
         recommended=_index(e["recommended"], gains),
         limit_cycle=None if cycle is None else _limit_cycle(cycle),
+        samples=int(e["samples"]),
+        lost_samples=int(e["lost_samples"]),
+        settings=None if e["relay"] is None else RelaySettings(**e["relay"]),
         models_around=around(None if selected is None else models[selected]),
         added_delay=_number(e.get("added_delay", 0.0)),
         points=measured_points(models),

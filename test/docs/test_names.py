@@ -221,6 +221,7 @@ def test_the_guide_has_the_fields_of_the_document() -> None:
     model = experiment["models"][0]
     for column, fields in {
         "field of an experiment": experiment,
+        "field of `relay`": experiment["relay"],
         "field of `limit_cycle`": experiment["limit_cycle"],
         "field of a model": model,
         "field of `fit`": model["fit"],

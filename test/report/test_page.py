@@ -184,6 +184,8 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
     assert case.models_around == direct.models_around
     assert len(case.models_around) == 100
     assert case.points == direct.points
+    assert case.settings == direct.settings
+    assert case.samples == len(completed().record)
     there = {plate.key for plate in PLATES if not plate.missing(case)}
     assert there == {"nyquist", "bode", "closed_loop", "rules", "uncertainty"}
     only(monkeypatch, "experiment", "uncertainty")
