@@ -57,10 +57,10 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     return status
 
 
-def add_known(parser: argparse.ArgumentParser) -> None:
+def add_known(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
     """Add the flags that say what is known of the process, which :func:`known_facts` reads.
 
-    :param parser: of the command.
+    :param parser: of the command, or a group of its options.
     """
     parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
     parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")

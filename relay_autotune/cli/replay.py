@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relay_autotune.bag.limits import LARGEST_CHUNK
-from relay_autotune.bag.reader import Selection
-from relay_autotune.bag.timing import CLOCKS
-from relay_autotune.cli.arguments import DONE, add_known, finite, guarded, known_facts, say
-from relay_autotune.cli.design_arguments import (
-    add_design,
-    add_export,
-    design_options,
-    export_target,
-)
+from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
+from relay_autotune.cli.arguments import DONE, guarded, say
+from relay_autotune.cli.design_arguments import add_export, export_target
 from relay_autotune.cli.progress import ProgressLine
 from relay_autotune.cli.replay_bag import Done, Job, replay
-from relay_autotune.errors import RelayAutotuneError, SelectionError
+from relay_autotune.errors import SelectionError
 
 if TYPE_CHECKING:
     from relay_autotune.autotune import Analysis
@@ -68,44 +61,8 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help="recordings")
-    parser.add_argument(
-        "--measurement", metavar="TOPIC[:FIELD]", help="topic, or column of a CSV, it is in"
-    )
-    parser.add_argument(
-        "--command", metavar="TOPIC[:FIELD]", help="topic, or column of a CSV, it is in"
-    )
-    parser.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
-    parser.add_argument(
-        "--start", type=finite, metavar="S", help="leave out what is before S [s from the start]"
-    )
-    parser.add_argument(
-        "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
-    )
-    parser.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
-    add_known(parser)
-    parser.add_argument(
-        "--loss", metavar="NAME", help="huber or tukey: for a sensor with many outliers"
-    )
-    parser.add_argument(
-        "--joint",
-        action="store_true",
-        help="take all experiments for tests of one process, with one model",
-    )
-    parser.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
+    add_analysis(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
-    parser.add_argument(
-        "--clock", choices=CLOCKS, default=CLOCKS[0],
-        help="time of a message: when it was published, when it was recorded, or its header's "
-        "stamp (%(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--join", action="store_true", help="take all BAGs for one recording on one timeline"
-    )
-    parser.add_argument(
-        "--max-chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
-        help="leave out chunks that declare more than SIZE, such as 64M or 2G "
-        f"({LARGEST_CHUNK >> 20}M)",
-    )  # fmt: skip
     parser.add_argument(
         "--report", metavar="FILE", help="write a report, too: .html, or a .png, .svg or .pdf"
     )
@@ -120,7 +77,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
     )
-    add_design(parser)
     add_export(parser)
     return parser
 
@@ -129,13 +85,6 @@ def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 1024:
         raise argparse.ArgumentTypeError(f"expected a number from 1 to 1024, found {text!r}")
     return int(text)
-
-
-def _size(text: str) -> int:
-    match = re.fullmatch(r"(\d{1,12})([kMG]?)", text)
-    if match is None or int(match[1]) == 0:
-        raise argparse.ArgumentTypeError(f"expected a size such as 64M or 2G, found {text!r}")
-    return int(match[1]) << {"": 0, "k": 10, "M": 20, "G": 30}[match[2]]
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -169,54 +118,18 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
     :raises SelectionError: if options contradict each other, or name what there is not.
     """
-    from relay_autotune.autotune import check_names
-    from relay_autotune.identification import ONLY_JOINT
-
-    try:
-        check_names(options.method, options.rule)
-        known = known_facts(options)
-        asked = design_options(options)
-    except RelayAutotuneError as error:
-        raise SelectionError(str(error)) from error
-    start, end = options.start, options.end
-    if start is not None and end is not None and start >= end:
-        raise SelectionError(f"--start {start:g} is not before --end {end:g}")
-    selection = Selection(
-        options.measurement,
-        options.command,
-        options.time,
-        start,
-        end,
-        options.clock,
-        options.max_chunk,
-    )
-    jointly = options.joint or options.method in ONLY_JOINT
     with_table = not (options.json or options.output)
-    bags = list(dict.fromkeys(options.bags))
-    groups = [tuple(bags)] if jointly or options.join else [(bag,) for bag in bags]
-    export = None
+    jobs = jobs_of(options, options.bags, with_table=with_table)
+    if options.scheduler:
+        # The workers of a cluster have working directories of their own.
+        jobs = [replace(j, paths=tuple(str(Path(p).absolute()) for p in j.paths)) for j in jobs]
     if options.export:
-        if len(groups) > 1 or options.json or options.output:
+        if len(jobs) > 1 or not with_table:
             raise SelectionError(
                 "--export writes the gains of one bag alone, without --json and --output"
             )
-        export = (options.export, export_target(options))
-    return [
-        Job(
-            ", ".join(group),
-            # The workers of a cluster have working directories of their own.
-            tuple(str(Path(bag).absolute()) for bag in group) if options.scheduler else group,
-            selection,
-            options.method,
-            options.rule,
-            known,
-            jointly,
-            with_table,
-            asked,
-            export,
-        )
-        for group in groups
-    ]
+        jobs = [replace(jobs[0], export=(options.export, export_target(options)))]
+    return jobs
 
 
 def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:

@@ -80,7 +80,7 @@ def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Anal
     """
     said: list[str] = []
     try:
-        analyses = _analysed(job, said, progress)
+        analyses = analysed(job, said, progress)
         if job.export is not None:
             text = _exported(analyses, *job.export)
             return Done(job.name, DONE, tuple(said), text), analyses
@@ -98,7 +98,14 @@ def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Anal
     return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
 
 
-def _analysed(job: Job, said: list[str], progress: Progress | None) -> tuple[Analysis, ...]:
+def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tuple[Analysis, ...]:
+    """Read, identify and tune.
+
+    :param job: what to do.
+    :param said: gets sentences for standard error.
+    :param progress: told of how far a bag has been read.
+    :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
+    """
     # Loading scipy takes longer than finding out that a bag does not exist.
     if job.jointly:
         records: list[Record] = []

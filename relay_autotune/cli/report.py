@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import (
-    DONE,
-    NOTHING_FOUND,
-    add_known,
-    guarded,
-    known_facts,
-    say,
-)
+from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, guarded, say
+from relay_autotune.cli.replay_bag import Job, analysed
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.report import PICTURES, write_figures, write_page, write_picture
 
@@ -67,16 +62,7 @@ def _parser() -> argparse.ArgumentParser:
         "--format", choices=("png", "svg"), default="png", help="of these figures (%(default)s)"
     )
     parser.add_argument("--title", metavar="TEXT", default="", help="title of the report")
-    parser.add_argument(
-        "--measurement", metavar="TOPIC", help="topic, or column of a CSV, of the measurement"
-    )
-    parser.add_argument(
-        "--command", metavar="TOPIC", help="topic, or column of a CSV, of the command"
-    )
-    parser.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
-    parser.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
-    add_known(parser)
-    parser.add_argument("--rule", help="how to tune")
+    add_analysis(parser)
     return parser
 
 
@@ -84,13 +70,14 @@ def _run(options: argparse.Namespace) -> int:
     check_output(options.output)
     cases: list[Case] = []
     status = DONE
-    for source in options.sources:
+    for names, read in _sources(options):
         try:
-            cases += _cases(source, options)
+            cases += read()
         except SelectionError:
             raise
         except RelayAutotuneError as error:
-            say(PROGRAM, str(error) if source in str(error) else f"{source}: {error}")
+            told = any(name in str(error) for name in names)
+            say(PROGRAM, str(error) if told else f"{', '.join(names)}: {error}")
             status = NOTHING_FOUND
     if not cases:
         return NOTHING_FOUND
@@ -142,30 +129,35 @@ def write_report(cases: Sequence[Case], output: str, *, title: str = "") -> None
         raise BagError(f"the report cannot be written: {error}") from error
 
 
-def _cases(source: str, options: argparse.Namespace) -> list[Case]:
-    """Read one source and make of it what a report tells."""
+_Source = tuple[tuple[str, ...], Callable[[], Sequence["Case"]]]
+
+
+def _sources(options: argparse.Namespace) -> list[_Source]:
+    """Return the names of each source, with what reads it, in the order of the command line."""
     from relay_autotune.report.from_document import read_documents
 
-    if source.lower().endswith(".json"):
-        return list(read_documents(source))
-    from relay_autotune.autotune import analyse, check_names
-    from relay_autotune.report.case import case_of
-    from relay_autotune.tuning import DEFAULT_RULE
+    names = list(dict.fromkeys(options.sources))
+    jobs = jobs_of(options, [name for name in names if not _is_result(name)])
+    found: list[_Source] = [(job.paths, partial(_cases, job)) for job in jobs]
+    found += [((name,), partial(read_documents, name)) for name in names if _is_result(name)]
+    # What several recordings make together stands where the first of them does.
+    return sorted(found, key=lambda source: names.index(source[0][0]))
 
-    rule = options.rule or DEFAULT_RULE
+
+def _is_result(source: str) -> bool:
+    return source.lower().endswith(".json")
+
+
+def _cases(job: Job) -> list[Case]:
+    """Read recordings and make of them what a report tells."""
+    from relay_autotune.report.case import case_of
+
+    said: list[str] = []
     try:
-        check_names(options.method, rule)
-        known = known_facts(options)
-    except RelayAutotuneError as error:
-        raise SelectionError(str(error)) from error
-    selection = Selection(options.measurement, options.command, options.time, None, None)
-    recording = read_experiments(source, selection)
-    for note in recording.notes:
-        say(PROGRAM, f"{source}: {note}")
-    return [
-        case_of(analyse(record, method=options.method, rule=rule, known=known), source)
-        for record in recording.experiments
-    ]
+        return [case_of(analysis, job.name) for analysis in analysed(job, said)]
+    finally:
+        for sentence in said:
+            say(PROGRAM, sentence)
 
 
 if __name__ == "__main__":

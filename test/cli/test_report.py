@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from report_cases import completed, fruitless, only
 
@@ -40,21 +41,43 @@ def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path, monkeypatch) -
 
     def analyse(record, **how):
         # What it would take seconds to find again.
-        asked.append((len(record), how["method"], how["rule"], how["known"].structure))
+        facts, wanted = how["known"], how["options"]
+        asked.append((len(record), how["method"], how["rule"], facts.structure, facts.loss))
+        asked.append((wanted.controller, wanted.ms, wanted.loop_delay))
         return completed()
 
     monkeypatch.setattr("relay_autotune.autotune.analyse", analyse)
     write_csv(tmp_path / "log.csv")
     page, folder = tmp_path / "page.html", tmp_path / "figures"
-    facts = ("--structure", "fopdt", "--rule", "imc", "--title", "Tank 7")
-    arguments = (tmp_path / "log.csv", "-o", page, "--figures", folder, "--format", "svg", *facts)
+    facts = ("--structure", "fopdt", "--loss", "huber", "--rule", "imc", "--title", "Tank 7")
+    wanted = ("--pi", "--ms", "1.6", "--loop-delay", "0.5", "--end", "200")
+    outputs = ("-o", page, "--figures", folder, "--format", "svg")
+    arguments = (tmp_path / "log.csv", *outputs, *facts, *wanted)
     status, out, err = run(capsys, *arguments)
     assert (status, err) == (0, "")
-    assert asked == [(len(completed().record), "waveform", "imc", "fopdt")]
+    samples = np.count_nonzero(completed().record.time <= 200.0)
+    assert asked == [(samples, "waveform", "imc", "fopdt", "huber"), ("pi", 1.6, 0.5)]
     assert out.splitlines()[0] == str(page)
     assert out.splitlines()[1:] == [str(folder / f"{plate.key}.svg") for plate in figures.PLATES]
     assert all(file.read_text().startswith("<?xml") for file in folder.iterdir())
     assert "<title>Tank 7</title>" in page.read_text()
+
+
+def test_several_recordings_of_one_process_have_one_model(capsys, tmp_path, monkeypatch) -> None:
+    only(monkeypatch, "uncertainty")
+    asked = []
+
+    def analyse_jointly(records, **how):
+        asked.append((len(records), how["method"]))
+        return completed()
+
+    monkeypatch.setattr("relay_autotune.autotune.analyse_jointly", analyse_jointly)
+    names = (tmp_path / "a.csv", tmp_path / "b.csv")
+    for name in names:
+        write_csv(name)
+    status, _, err = run(capsys, *names, "--method", "li", "-o", tmp_path / "page.html")
+    assert (status, err) == (0, "")
+    assert asked == [(2, "li")]
 
 
 def test_results_of_several_recordings_share_a_page(capsys, tmp_path, result, monkeypatch) -> None:

@@ -1,0 +1,118 @@
+"""Options that decide what a recording gives, for every command that reads recordings."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+
+from relay_autotune.bag.limits import LARGEST_CHUNK
+from relay_autotune.bag.reader import Selection
+from relay_autotune.bag.timing import CLOCKS
+from relay_autotune.cli.arguments import add_known, finite, known_facts
+from relay_autotune.cli.design_arguments import add_design, design_options
+from relay_autotune.cli.replay_bag import Job
+from relay_autotune.errors import RelayAutotuneError, SelectionError
+
+
+def add_analysis(parser: argparse.ArgumentParser) -> None:
+    """Add what is taken of a recording, how it is identified, and for what it is tuned.
+
+    :param parser: of the command.
+    """
+    taken = parser.add_argument_group("what is taken of a recording")
+    for signal in ("measurement", "command"):
+        taken.add_argument(
+            f"--{signal}",
+            metavar="TOPIC[:FIELD]",
+            help=f"topic, or column of a CSV, of the {signal}",
+        )
+    taken.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
+    taken.add_argument(
+        "--start", type=finite, metavar="S", help="leave out what is before S [s from the start]"
+    )
+    taken.add_argument(
+        "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
+    )
+    taken.add_argument(
+        "--clock", choices=CLOCKS, default=CLOCKS[0],
+        help="time of a message: when it was published, when it was recorded, or its header's "
+        "stamp (%(default)s)",
+    )  # fmt: skip
+    taken.add_argument(
+        "--join", action="store_true", help="take all BAGs for one recording on one timeline"
+    )
+    taken.add_argument(
+        "--joint", action="store_true",
+        help="take all experiments for tests of one process, with one model",
+    )  # fmt: skip
+    taken.add_argument(
+        "--max-chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
+        help="leave out chunks that declare more than SIZE, such as 64M or 2G "
+        f"({LARGEST_CHUNK >> 20}M)",
+    )  # fmt: skip
+    how = parser.add_argument_group("identification and design")
+    how.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
+    add_known(how)
+    how.add_argument(
+        "--loss", metavar="NAME", help="huber or tukey: for a sensor with many outliers"
+    )
+    how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
+    add_design(parser)
+
+
+def _size(text: str) -> int:
+    match = re.fullmatch(r"(\d{1,12})([kMG]?)", text)
+    if match is None or int(match[1]) == 0:
+        raise argparse.ArgumentTypeError(f"expected a size such as 64M or 2G, found {text!r}")
+    return int(match[1]) << {"": 0, "k": 10, "M": 20, "G": 30}[match[2]]
+
+
+def jobs_of(
+    options: argparse.Namespace, recordings: Sequence[str], *, with_table: bool = False
+) -> list[Job]:
+    """Return what is to be done with recordings, each once.
+
+    :param options: with those of :func:`add_analysis`.
+    :param recordings: their names.
+    :param with_table: whether results are wanted as the table for people.
+    :raises SelectionError: if options contradict each other, or name what there is not.
+    """
+    from relay_autotune.autotune import check_names
+    from relay_autotune.identification import ONLY_JOINT
+
+    try:
+        check_names(options.method, options.rule)
+        known = known_facts(options)
+        asked = design_options(options)
+    except RelayAutotuneError as error:
+        raise SelectionError(str(error)) from error
+    start, end = options.start, options.end
+    if start is not None and end is not None and start >= end:
+        raise SelectionError(f"--start {start:g} is not before --end {end:g}")
+    jointly = options.joint or options.method in ONLY_JOINT
+    names = list(dict.fromkeys(recordings))
+    groups = [tuple(names)] if jointly or options.join else [(name,) for name in names]
+    return [
+        Job(
+            name=", ".join(group),
+            paths=group,
+            selection=Selection(
+                options.measurement,
+                options.command,
+                options.time,
+                start,
+                end,
+                options.clock,
+                options.max_chunk,
+            ),
+            method=options.method,
+            rule=options.rule,
+            known=known,
+            jointly=jointly,
+            with_table=with_table,
+            options=asked,
+        )
+        for group in groups
+        if group
+    ]
