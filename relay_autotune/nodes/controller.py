@@ -21,7 +21,8 @@ from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
-from relay_autotune.nodes.verifier import NotVerifiable, Verifier
+from relay_autotune.nodes.remote_loop import RemoteLoop
+from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
 from relay_autotune.pid import PidController
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.sampled import Limits
@@ -46,7 +47,6 @@ class ControllerNode(ServedNode):
         self._gains = gains_from(values)
         self._pending: Any = None
         self._previous: Controller | None = None
-        self._previous_remote: dict[str, float] | None = None
         self._model: TransferFunction | None = None
         self._limits = limits_from(values)
         self._pid = PidController(
@@ -60,11 +60,23 @@ class ControllerNode(ServedNode):
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._count = 0
         self._held = False
+        # What a verification adds to set-point and command.
+        self._offset = self._load = 0.0
+        # True while the parameters follow the gains, not the gains the parameters.
+        self._following = False
         self._message = Float64()
-        self._remote: RemoteGains | None = None
+        self._verifier = Verifier(
+            self,
+            ready=self._ready_to_verify,
+            heights=self._steps_of,
+            move=self._move,
+            ended=self._after_verification,
+        )
+        self._remote: RemoteLoop | None = None
         if values["apply_to"]:
             mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
-            self._remote = RemoteGains(self, values["apply_to"], mapping)
+            gains = RemoteGains(self, values["apply_to"], mapping)
+            self._remote = RemoteLoop(self, gains, self._setpoint, self._verifier.interrupt)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
         self._commands = self.create_publisher(
@@ -78,7 +90,8 @@ class ControllerNode(ServedNode):
         )
         if not self._simulated:
             self.favoured = measurement
-        self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
+        if self._remote is None:
+            self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
         self.create_subscription(Bool, "hold_request", self._on_hold, quality.RESULT)
         self.create_subscription(PidGains, "pi_gains", self._on_gains, quality.RESULT)
@@ -87,9 +100,6 @@ class ControllerNode(ServedNode):
         self.create_service(Trigger, "~/discard", self._on_discard)
         self.create_service(Trigger, "~/revert", self._on_revert)
         self.create_service(SetBool, "~/automatic", self._on_automatic)
-        self._verifier = Verifier(
-            self, self._ready_to_verify, self._steps_of, self._after_verification
-        )
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self.get_logger().info(
@@ -101,8 +111,6 @@ class ControllerNode(ServedNode):
     # The loop.
 
     def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
-        if self._remote is not None:
-            return
         value = self._value(message)
         if math.isnan(self._setpoint) and math.isfinite(value):
             self._setpoint = value
@@ -115,10 +123,13 @@ class ControllerNode(ServedNode):
             at = self._stamp(message) * 1e-9
         else:
             at = (info["source_timestamp"] or time.time_ns()) * 1e-9
-        command = self._pid.step(at, self._setpoint + self._verifier.offset, value)
-        self._message.data = self._limits.clip(command + self._verifier.load)
-        self._commands.publish(self._message)
-        if math.isfinite(value):
+        if self._remote is not None:
+            command = self._remote.command
+        else:
+            command = self._pid.step(at, self._setpoint + self._offset, value)
+            self._message.data = self._limits.clip(command + self._load)
+            self._commands.publish(self._message)
+        if math.isfinite(value) and math.isfinite(command):
             self._verifier.sample(at, value, command)
 
     def _on_setpoint(self, message: Float64) -> None:
@@ -126,7 +137,9 @@ class ControllerNode(ServedNode):
             self._setpoint = message.data
 
     def _on_command(self, message: Float64) -> None:
-        if self._held and math.isfinite(message.data):
+        if self._remote is not None:
+            self._remote.command = message.data
+        elif self._held and math.isfinite(message.data):
             self._pid.track(message.data)
 
     def _on_hold(self, message: Bool) -> None:
@@ -137,6 +150,8 @@ class ControllerNode(ServedNode):
     def _on_automatic(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
+        if not request.data:
+            self._verifier.interrupt("the controller was switched to manual")
         self._pid.switch(automatic=request.data)
         response.success = self._pid.is_automatic == request.data
         response.message = (
@@ -184,14 +199,14 @@ class ControllerNode(ServedNode):
             return False, "a verification is running; wait for its end"
         if self._remote is not None:
             try:
-                self._previous_remote = await self._remote.write(message)
+                await self._remote.apply(message)
             except RelayAutotuneError as error:
                 return False, str(error)
             self._pending = None
             return True, f"{self._remote.target} has the gains of {message.experiment_id}"
-        self._previous, self._gains = self._gains, controller_from(message)
+        self._previous = self._gains
         self._pending = None
-        self._pid.use(self._gains)
+        self._use(controller_from(message))
         return True, f"{said(self._gains)} in force; the gains before are kept for ~/revert"
 
     async def _on_apply(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -205,41 +220,51 @@ class ControllerNode(ServedNode):
         return response
 
     async def _on_revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._remote is not None:
-            if self._previous_remote is None:
-                response.message = "nothing was applied"
-                return response
-            try:
-                await self._remote.restore(self._previous_remote)
-            except RelayAutotuneError as error:
-                response.message = str(error)
-                return response
-            self._previous_remote = None
-            response.success = True
-            response.message = f"{self._remote.target} has its gains of before"
+        if self._verifier.is_running:
+            response.message = "a verification is running; wait for its end"
             return response
-        response.success, response.message = self._revert()
+        response.success, response.message = await self._revert()
         return response
 
-    def _revert(self) -> tuple[bool, str]:
+    async def _revert(self) -> tuple[bool, str]:
+        if self._remote is not None:
+            return await self._remote.revert()
         if self._previous is None and self._gains is None:
             return False, "there are no gains before these"
-        self._gains, self._previous = self._previous, self._gains
-        self._pid.use(self._gains)
-        return True, f"{said(self._gains)} in force again"
+        before, self._previous = self._previous, self._gains
+        self._use(before)
+        return True, f"{said(before)} in force again"
+
+    def _use(self, gains: Controller | None) -> None:
+        """Put gains in force, and into the parameters."""
+        self._gains = gains
+        self._pid.use(gains)
+        values: dict[str, Any] = {entry.name: entry.default for entry in GAINS}
+        if gains is not None:
+            values = {name: getattr(gains, name) for name in values}
+        self._following = True
+        try:
+            done = self.set_parameters_atomically(
+                [Parameter(name, value=float(value)) for name, value in values.items()]
+            )
+        finally:
+            self._following = False
+        if not done.successful:
+            self.get_logger().error(f"the parameters do not show these gains: {done.reason}")
 
     # Proof.
 
-    def _ready_to_verify(self) -> tuple[Controller, TransferFunction, Limits]:
-        if self._remote is not None:
-            raise NotVerifiable(f"{self._remote.target} controls, not this node")
+    async def _ready_to_verify(self) -> Verifiable:
         if self._held:
             raise NotVerifiable("a tune is running")
-        if self._gains is None or not self._pid.is_automatic:
-            raise NotVerifiable("the controller is not in automatic, or has no gains")
+        self._verifier.require_samples()
         if self._model is None:
             raise NotVerifiable("no model has come that could predict anything")
-        return self._gains, self._model, self._limits
+        if self._remote is not None:
+            return Verifiable(await self._remote.ready(), self._model, self._limits)
+        if self._gains is None or not self._pid.is_automatic:
+            raise NotVerifiable("the controller is not in automatic, or has no gains")
+        return Verifiable(self._gains, self._model, self._limits)
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value
@@ -250,6 +275,10 @@ class ControllerNode(ServedNode):
             raise NotVerifiable(
                 "no step is given: set setpoint_step, or the parameter verify_step"
             )
+        if request.load_step and self._remote is not None:
+            raise NotVerifiable(
+                f"{self._remote.target} commands: no load step can be added to that, ask for none"
+            )
         if abs(request.load_step) > allowed:
             raise NotVerifiable(
                 f"load_step is {request.load_step:g}, verify_load_max allows {allowed:g}"
@@ -257,15 +286,22 @@ class ControllerNode(ServedNode):
         steps = [Step(setpoint=height)] if height else []
         return steps + ([Step(load=request.load_step)] if request.load_step else [])
 
-    def _after_verification(self, passed: bool, reason: str) -> str:
-        if not passed and self._previous is not None:
-            reason = f"{reason}; {self._revert()[1]}"
+    def _move(self, setpoint: float, load: float) -> None:
+        if self._remote is not None:
+            self._remote.move(setpoint)
+        self._offset, self._load = setpoint, load
+
+    async def _after_verification(self, passed: bool, reason: str) -> str:
+        if not passed and (self._remote is not None or self._previous is not None):
+            reason = f"{reason}; {(await self._revert())[1]}"
         self.get_logger().info(f"verification {'passed' if passed else 'failed'}: {reason}")
         return reason
 
     # Parameters.
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+        if self._following:
+            return SetParametersResult(successful=True)
         try:
             values = merged(self, (*GAINS, *OTHERS), changes)
             gains_from(values)
@@ -277,6 +313,8 @@ class ControllerNode(ServedNode):
         return SetParametersResult(successful=True)
 
     def _after_set(self, changes: list[Parameter]) -> None:
+        if self._following:
+            return
         names = {change.name for change in changes}
         values = values_of(self, (*GAINS, *OTHERS))
         if names & {entry.name for entry in GAINS}:

@@ -16,6 +16,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.node import Node
@@ -63,6 +64,24 @@ class ServedNode(Node):
         self._when_idle.clear()
         while self.work(idle=False):
             pass
+
+    def compute(self, work: Callable[[], Any], taken: Callable[[Any], None]) -> None:
+        """Do ``work`` in a thread while the callbacks go on, then hand over what came of it.
+
+        :param work: called in the thread; it must not touch the node.
+        :param taken: called as a callback of the node, with what ``work`` returned or raised.
+        """
+        executor = self.executor
+
+        def run() -> None:
+            try:
+                found = work()
+            except Exception as error:  # whoever asked for the work judges it
+                found = error
+            executor.create_task(taken, found)
+
+        # Nobody waits for a computation when the process ends.
+        threading.Thread(target=run, name="computation", daemon=True).start()
 
     def end(self, reason: str) -> None:
         """Bring the loop to a safe state first of all, then finish what is open.

@@ -11,6 +11,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
 from relay_autotune.errors import ParameterError, RelayAutotuneError
+from relay_autotune.tuning.gains import Controller
 
 # What may be sent, by the names of the gains in both forms.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
@@ -39,6 +40,29 @@ def mapping_of(texts: Sequence[str]) -> dict[str, str]:
             )
         found[name] = target
     return found
+
+
+def controller_of(gains: Mapping[str, float]) -> Controller:
+    """Return the controller that gains by name make, in the ISA or the parallel form.
+
+    :param gains: some of `NAMES`; without a derivative, filter or set-point weight, there is
+        none, none, and 1.
+    :raises RelayAutotuneError: if they make none.
+    """
+    proportional = gains.get("kc", gains.get("p"))
+    if proportional is None or not {"ti", "i"} & set(gains):
+        raise RemoteError(
+            f"of the gains only {', '.join(gains)} are known, expected kc or p, and ti or i: name "
+            "their parameters in apply_parameters"
+        )
+    integral, derivative = gains.get("i", 0.0), gains.get("d", 0.0)
+    return Controller(
+        proportional,
+        gains.get("ti", proportional / integral if integral else 0.0),
+        gains.get("td", derivative / proportional if proportional else 0.0),
+        gains.get("tf", 0.0),
+        gains.get("b", 1.0),
+    )
 
 
 class RemoteGains:
@@ -80,6 +104,14 @@ class RemoteGains:
         if missing:
             raise RemoteError(f"{self.target} has no number {', '.join(missing)}")
         return values
+
+    async def controller(self) -> Controller:
+        """Return the gains in force.
+
+        :raises RelayAutotuneError: if they cannot be read, or make no controller.
+        """
+        values = await self.read()
+        return controller_of({name: values[target] for name, target in self._mapping.items()})
 
     async def write(self, gains: Any) -> dict[str, float]:
         """Set the parameters, read them back, and undo all if one is not as it was set.

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rclpy.action import ActionServer, CancelResponse
-from rclpy.node import Node
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.messages import float64_array, set_stamp
 from relay_autotune.models import TransferFunction
 from relay_autotune.nodes.goals import conclude
+from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.sampled import Limits
 from relay_autotune.verification import Plan, Step, compare, plan
@@ -24,160 +30,244 @@ from relay_autotune_msgs.msg import Verification
 # Samples before a step that tell where the loop was, and how noisy it is.
 _BEFORE = 50
 _LEAST_BEFORE = 10
+# Without a measurement for so long, or for so many of the usual intervals, it is given up [s].
+_SILENCE = 2.0
+_SILENT_INTERVALS = 20.0
+_LOOK_EVERY = 0.2
+
+_Sample = tuple[float, float, float]
 
 
 class NotVerifiable(RelayAutotuneError):  # noqa: N818  it is a state of the loop, not a defect
     """A loop that cannot be verified now."""
 
 
+@dataclass(frozen=True)
+class Verifiable:
+    """What is tried.
+
+    :param gains: the controller in force.
+    :param model: the process as identified.
+    :param limits: range of the command.
+    """
+
+    gains: Controller
+    model: TransferFunction
+    limits: Limits
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A loop before a step.
+
+    :param measurement: its mean [y].
+    :param command: its mean [u].
+    :param noise_std: standard deviation of the measurement about its trend [y].
+    """
+
+    measurement: float
+    command: float
+    noise_std: float
+
+
+class _Phase(Enum):
+    IDLE = auto()
+    PREPARING = auto()
+    STEPPING = auto()
+    RETURNING = auto()
+    ENDING = auto()
+
+
 class Verifier:
     """Make steps on a running loop and compare each with the prediction.
 
+    The predictions take up to seconds, and are computed beside the callbacks.
+
     :param node: the node.
-    :param ready: returns gains, model, limits and the way a request may go; raises
-        RelayAutotuneError with the reason where there is none.
-    :param ended: called with True if all steps passed, and a sentence.
+    :param ready: returns what can be tried; raises RelayAutotuneError with the reason where
+        nothing can.
+    :param heights: returns the steps that a request asks for; raises likewise.
+    :param move: puts a step on the set-point [y] and one on the command [u], 0: none.
+    :param ended: called with True if all steps passed, and a sentence; returns what to say.
     """
 
     def __init__(
         self,
-        node: Node,
-        ready: Callable[[], tuple[Controller, TransferFunction, Limits]],
+        node: ServedNode,
+        *,
+        ready: Callable[[], Awaitable[Verifiable]],
         heights: Callable[[Any], list[Step]],
-        ended: Callable[[bool, str], str],
+        move: Callable[[float, float], None],
+        ended: Callable[[bool, str], Awaitable[str]],
     ) -> None:
         self._node = node
         self._ready = ready
         self._heights = heights
+        self._move = move
         self._ended = ended
-        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_BEFORE)
+        self._phase = _Phase.IDLE
+        self._recent: deque[_Sample] = deque(maxlen=_BEFORE)
+        self._arrivals: deque[float] = deque(maxlen=_BEFORE)
         self._goal: Any = None
+        self._tried: Verifiable
         self._steps: list[Step] = []
         self._plans: list[Plan] = []
         self._found: list[Any] = []
         self._number = 0
-        self._pausing = False
-        self._samples: list[tuple[float, float, float]] = []
-        self._rest = self._noise = self._centre = 0.0
+        self._samples: list[_Sample] = []
+        self._rest: Rest
         self._begun = 0.0
-        self.offset = 0.0
-        """Added to the set-point now [y]."""
-        self.load = 0.0
-        """Added to the command now [u]."""
+        self._watch = node.create_timer(
+            _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
+        )
         self._server = ActionServer(
             node,
             Verify,
             "~/verify",
             self._unused,
             handle_accepted_callback=self._accept,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
         )
 
     @property
     def is_running(self) -> bool:
-        """True while steps are made."""
+        """True from the acceptance of a goal to its end."""
         return self._goal is not None
 
     # Beginning.
 
-    def _accept(self, goal: Any) -> None:
-        try:
-            if self._goal is not None:
-                raise NotVerifiable("a verification is running")
-            self._gains, self._model, self._limits = self._ready()
-            self._steps = self._heights(goal.request)
-            self._look_at_rest()
-            self._plans = [
-                plan(self._gains, self._model, step, self._period, self._noise)
-                for step in self._steps
-            ]
-        except RelayAutotuneError as error:
-            conclude(goal, Verify.Result(passed=False, reason=str(error)), succeeded=False)
-            return
-        self._goal, self._found, self._number = goal, [], 0
-        self._begun = self._recent[-1][0]
-        self._begin_step()
+    def require_samples(self) -> None:
+        """Refuse a loop of which nothing is heard.
 
-    def _look_at_rest(self) -> None:
+        :raises NotVerifiable: if there are too few samples to tell where it rests.
+        """
         if len(self._recent) < _LEAST_BEFORE:
             raise NotVerifiable(
-                f"only {len(self._recent)} samples have come, expected {_LEAST_BEFORE}"
+                f"only {len(self._recent)} samples have come with a command, expected "
+                f"{_LEAST_BEFORE}"
             )
-        time, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
-        self._period = float(np.median(np.diff(time)))
-        self._rest, self._centre = float(y.mean()), float(u.mean())
-        line = np.polyfit(time - time[0], y, 1)
-        self._noise = float(np.std(y - np.polyval(line, time - time[0]), ddof=2))
-        drift = abs(float(line[0])) * float(time[-1] - time[0])
-        smallest = min((abs(s.setpoint) for s in self._steps if s.setpoint), default=math.inf)
-        if drift > 4.0 * self._noise and drift > 0.1 * smallest:
+
+    def _accept(self, goal: Any) -> None:
+        if self._goal is not None:
+            _refuse(goal, NotVerifiable("a verification is running"))
+            return
+        self._goal, self._phase = goal, _Phase.PREPARING
+        self._node.executor.create_task(self._prepare, goal)
+
+    async def _prepare(self, goal: Any) -> None:
+        try:
+            tried = await self._ready()
+            steps = self._heights(goal.request)
+            rest, period = self._at_rest(steps)
+        except RelayAutotuneError as error:
+            self._planned(goal, error)
+            return
+        if goal is not self._goal or self._phase is not _Phase.PREPARING:
+            return
+        self._tried, self._steps, self._rest = tried, steps, rest
+
+        def plans() -> list[Plan]:
+            return [plan(tried.gains, tried.model, s, period, rest.noise_std) for s in steps]
+
+        self._node.compute(plans, partial(self._planned, goal))
+
+    def _planned(self, goal: Any, plans: list[Plan] | Exception) -> None:
+        if goal is not self._goal or self._phase is not _Phase.PREPARING:
+            return
+        if isinstance(plans, Exception):
+            self._goal, self._phase = None, _Phase.IDLE
+            _refuse(goal, plans)
+            return
+        self._plans, self._found, self._number = plans, [], 0
+        self._begun = self._recent[-1][0]
+        self._watch.reset()
+        self._begin_step()
+
+    def _at_rest(self, steps: list[Step]) -> tuple[Rest, float]:
+        """Return where the loop rests, and its sample period [s]."""
+        t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
+        line = np.polyfit(t - t[0], y, 1)
+        noise = float(np.std(y - np.polyval(line, t - t[0]), ddof=2))
+        drift = abs(float(line[0])) * float(t[-1] - t[0])
+        smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
+        if drift > 4.0 * noise and drift > 0.1 * smallest:
             raise NotVerifiable(
                 f"the loop is not at rest: the measurement moved by {drift:.3g} over the last "
                 f"{len(self._recent)} samples; wait until it has settled"
             )
+        return Rest(float(y.mean()), float(u.mean()), noise), float(np.median(np.diff(t)))
 
     def _begin_step(self) -> None:
+        self._phase, self._samples = _Phase.STEPPING, []
         step = self._steps[self._number]
-        self._samples = []
-        self._pausing = False
-        self.offset, self.load = step.setpoint, step.load
+        self._move(step.setpoint, step.load)
+        self._tell()
 
     # While it runs.
 
-    def sample(self, time: float, measurement: float, command: float) -> None:
+    def sample(self, at: float, measurement: float, command: float) -> None:
         """Take a sample of the loop, after it was answered.
 
-        :param time: s.
+        :param at: its time [s].
         :param measurement: y.
         :param command: the controller's answer, without the load [u].
         """
-        self._recent.append((time, measurement, command))
-        goal = self._goal
-        if goal is None:
+        sample = (at, measurement, command)
+        self._recent.append(sample)
+        self._arrivals.append(time.monotonic())
+        if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
             return
-        if goal.is_cancel_requested:
-            self._end(False, "cancelled", revert=False)
-            return
-        self._samples.append((time, measurement, command))
+        self._samples.append(sample)
         wanted = self._plans[self._number]
-        elapsed = time - self._samples[0][0]
-        if abs(measurement - self._rest) > wanted.runaway and not self._pausing:
+        over = at - self._samples[0][0] >= wanted.duration
+        if self._phase is _Phase.RETURNING:
+            # What was found of the step before has come, too.
+            if over and len(self._found) > self._number:
+                self._go_on()
+            return
+        away = abs(measurement - self._rest.measurement)
+        if away > wanted.runaway:
             self._end(
                 False,
-                f"the measurement went {abs(measurement - self._rest):.3g} away from where it "
-                f"was, more than {wanted.runaway:.3g}: three times what was predicted",
+                f"the measurement went {away:.3g} away from where it was, more than "
+                f"{wanted.runaway:.3g}: three times what was predicted",
             )
-        elif elapsed >= wanted.duration:
-            self._after_step(time)
+        elif over:
+            self._return()
 
-    def interrupt(self, reason: str) -> None:
-        """End it without a verdict [the loop is no longer the controller's]."""
-        if self._goal is not None:
-            self._end(False, reason, revert=False)
+    def _return(self) -> None:
+        """Go back to where the loop was, while the step is judged."""
+        judge = partial(
+            judged, self._tried, self._steps[self._number], tuple(self._samples), self._rest
+        )
+        self._node.compute(judge, partial(self._judged, self._goal))
+        self._phase, self._samples = _Phase.RETURNING, []
+        self._move(0.0, 0.0)
 
-    def _after_step(self, time: float) -> None:
-        if not self._pausing:
-            message = self._compared()
-            self._found.append(message)
-            if not message.passed:
-                self._end(False, message.reason)
-                return
-            if self._number + 1 == len(self._steps):
-                self._end(True, "; ".join(m.reason for m in self._found))
-                return
-            # Back to where it was, before the next one.
-            self.offset = self.load = 0.0
-            self._pausing = True
-            self._samples = []
+    def _judged(self, goal: Any, message: Any) -> None:
+        if goal is not self._goal or self._phase is not _Phase.RETURNING:
             return
+        if isinstance(message, Exception):
+            self._end(False, f"the step could not be judged: {_said(message)}")
+            return
+        self._found.append(message)
+        if not message.passed:
+            self._end(False, message.reason)
+        elif len(self._found) == len(self._steps):
+            self._end(True, "; ".join(m.reason for m in self._found))
+
+    def _go_on(self) -> None:
+        last = self._samples[-_BEFORE:]
+        self._rest = Rest(
+            float(np.mean([y for _, y, _ in last])),
+            float(np.mean([u for _, _, u in last])),
+            self._rest.noise_std,
+        )
         self._number += 1
-        self._rest = float(np.mean([y for _, y, _ in self._samples[-_BEFORE:]]))
-        self._centre = float(np.mean([u for _, _, u in self._samples[-_BEFORE:]]))
-        self._tell(time)
         self._begin_step()
 
-    def _tell(self, time: float) -> None:
-        elapsed = time - self._begun
+    def _tell(self) -> None:
+        elapsed = self._recent[-1][0] - self._begun
         whole = 2.0 * sum(p.duration for p in self._plans)
         self._goal.publish_feedback(
             Verify.Feedback(
@@ -185,51 +275,92 @@ class Verifier:
             )
         )
 
-    def _compared(self) -> Any:
-        step = self._steps[self._number]
-        time, y, u = (np.array(column) for column in zip(*self._samples, strict=True))
-        found = compare(
-            self._gains,
-            self._model,
-            step,
-            time - time[0],
-            y - self._rest,
-            limits=Limits(self._limits.low - self._centre, self._limits.high - self._centre),
-            noise_std=self._noise,
-        )
-        message = Verification(
-            kind=Verification.SETPOINT if step.setpoint else Verification.LOAD,
-            step=step.setpoint or step.load,
-            passed=found.passed,
-            reason=found.reason,
-            overshoot=found.measured.overshoot,
-            overshoot_predicted=found.expected.overshoot,
-            settling_time=found.measured.settling_time,
-            settling_time_predicted=found.expected.settling_time,
-            iae=found.measured.iae,
-            iae_predicted=found.expected.iae,
-            fit=found.fit,
-            gain_ratio=found.gain_ratio,
-            ms=found.ms,
-            ms_predicted=found.ms_predicted,
-            time=float64_array(time - time[0]),
-            measurement=float64_array(y),
-            command=float64_array(u),
-            predicted=float64_array(self._rest + found.predicted),
-        )
-        set_stamp(message.header.stamp, round(float(time[0]) * 1e9))
-        return message
-
     # Ending.
 
-    def _end(self, passed: bool, reason: str, *, revert: bool = True) -> None:
-        goal, self._goal = self._goal, None
-        self.offset = self.load = 0.0
-        if passed or revert:
-            reason = self._ended(passed, reason)
+    def interrupt(self, reason: str) -> None:
+        """End it without a verdict [the loop is no longer the controller's]."""
+        if self._phase not in (_Phase.IDLE, _Phase.ENDING):
+            self._end(False, reason, verdict=False)
+
+    def _look(self) -> None:
+        arrivals = self._arrivals
+        usual = (arrivals[-1] - arrivals[0]) / max(len(arrivals) - 1, 1)
+        silent = time.monotonic() - arrivals[-1]
+        if silent > max(_SILENCE, _SILENT_INTERVALS * usual):
+            self.interrupt(f"no measurement for {silent:.3g} s")
+
+    def _on_cancel(self, goal: Any) -> CancelResponse:
+        if self._goal is not None and goal.goal_id == self._goal.goal_id:
+            self._node.executor.create_task(self.interrupt, "cancelled")
+        return CancelResponse.ACCEPT
+
+    def _end(self, passed: bool, reason: str, *, verdict: bool = True) -> None:
+        if self._phase is not _Phase.PREPARING:
+            self._move(0.0, 0.0)
+        self._phase = _Phase.ENDING
+        self._watch.cancel()
+        self._node.executor.create_task(self._conclude, passed, reason, verdict)
+
+    async def _conclude(self, passed: bool, reason: str, verdict: bool) -> None:
+        if verdict:
+            reason = await self._ended(passed, reason)
+        goal, self._goal, self._phase = self._goal, None, _Phase.IDLE
         result = Verify.Result(passed=passed, reason=reason, steps=self._found)
+        self._found = []
         conclude(goal, result, succeeded=True)
 
     def _unused(self, goal: Any) -> Any:
         goal.abort()
         return Verify.Result()
+
+
+def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Rest) -> Any:
+    """Compare a step with its prediction and return the `Verification` message.
+
+    :param tried: what is tried.
+    :param step: the step.
+    :param samples: time [s], measurement [y] and command [u] of each, the first at the step.
+    :param rest: where the loop was before it.
+    """
+    t, y, u = (np.array(column) for column in zip(*samples, strict=True))
+    limits = tried.limits
+    found = compare(
+        tried.gains,
+        tried.model,
+        step,
+        t - t[0],
+        y - rest.measurement,
+        limits=Limits(limits.low - rest.command, limits.high - rest.command),
+        noise_std=rest.noise_std,
+    )
+    message = Verification(
+        kind=Verification.SETPOINT if step.setpoint else Verification.LOAD,
+        step=step.setpoint or step.load,
+        passed=found.passed,
+        reason=found.reason,
+        overshoot=found.measured.overshoot,
+        overshoot_predicted=found.expected.overshoot,
+        settling_time=found.measured.settling_time,
+        settling_time_predicted=found.expected.settling_time,
+        iae=found.measured.iae,
+        iae_predicted=found.expected.iae,
+        fit=found.fit,
+        gain_ratio=found.gain_ratio,
+        ms=found.ms,
+        ms_predicted=found.ms_predicted,
+        time=float64_array(t - t[0]),
+        measurement=float64_array(y),
+        command=float64_array(u),
+        predicted=float64_array(rest.measurement + found.predicted),
+    )
+    set_stamp(message.header.stamp, round(float(t[0]) * 1e9))
+    return message
+
+
+def _refuse(goal: Any, error: Exception) -> None:
+    conclude(goal, Verify.Result(passed=False, reason=_said(error)), succeeded=False)
+
+
+def _said(error: Exception) -> str:
+    known = isinstance(error, RelayAutotuneError)
+    return str(error) if known else f"{type(error).__name__}: {error}"

@@ -42,6 +42,12 @@ def trigger(rig: Rig, name: str) -> Any:
     return rig.call(Trigger, f"controller_node/{name}", Trigger.Request())
 
 
+def parameters_of(rig: Rig) -> list[float]:
+    request = GetParameters.Request(names=["kc", "ti"])
+    answer = rig.call(GetParameters, "controller_node/get_parameters", request)
+    return [v.double_value for v in answer.values]
+
+
 def verify(rig: Rig, **request: float) -> tuple[int, Any]:
     client = ActionClient(rig.node, Verify, "controller_node/verify")
     rig.until(client.server_is_ready, "the action")
@@ -60,12 +66,12 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     gains = rig.listen("pi_gains", PidGains)
     experiments = rig.listen("relay_experiment", RelayExperiment)
     rig.plant(**PLANT)
-    rig.relay(
+    relay = rig.relay(
         use_sim_time=True,
         amplitude=0.5,
         settle_time=1.0,
         measurement_timeout=3.0,
-        controller_timeout=3.0,
+        controller_timeout=1.0,
     )
     controller = rig.start("controller_node", **CONTROLLER, verify_load_max=0.1)
     rig.identifier(use_sim_time=True)
@@ -90,6 +96,7 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     applied = trigger(rig, "apply")
     assert applied.success, applied.message
     assert f"kc {gains[-1].kc:.6g}" in applied.message
+    assert parameters_of(rig) == [gains[-1].kc, gains[-1].ti]
     rig.run_for(1.0)
     status, result = verify(rig, setpoint_step=0.2, load_step=0.1)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
@@ -104,6 +111,9 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     assert "verify_load_max allows 0.1" in result.reason
     reverted = trigger(rig, "revert")
     assert "kc 0.3" in reverted.message
+    assert parameters_of(rig) == [0.3, 0.8]
+    # While the predictions were computed, each measurement was answered.
+    assert "has been silent" not in relay.log
     # By hand.
     answer = rig.call(SetBool, "controller_node/automatic", SetBool.Request(data=False))
     assert answer.success
@@ -137,6 +147,7 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
     assert not result.passed
     assert "kc 0.3, ti 0.8 s, td 0 s in force again" in result.reason
+    assert parameters_of(rig) == [0.3, 0.8]
     # Without gains before these there is nothing left to go back to twice.
     assert len(result.steps) <= 1
 
