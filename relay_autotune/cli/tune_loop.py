@@ -5,7 +5,7 @@ On a terminal the progress is shown in place and in colour (NO_COLOR turns that 
 for each cycle goes to standard error. The result goes to standard output.
 
 Exit status: 0 the tune completed, with gains (of a dry run: it could start); 1 it did not, or
-there is nobody to do it; 2 the command line does not fit.
+there is nobody to do it, or the report was not written; 2 the command line does not fit.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -32,7 +33,7 @@ from relay_autotune.cli.tune_view import (
     result_lines,
     wants_colour,
 )
-from relay_autotune.errors import LoopError, ParameterError
+from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 PROGRAM = "tune_loop"
 # How often the times on a terminal advance [s].
 _TICK = 0.25
+# How long the nodes have to tell what the report needs [s].
+_PATIENCE = 5.0
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -50,6 +53,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(own)
     if options.amplitude < 0.0 or options.wait < 0.0:
         parser.error("--amplitude and --wait are at least 0")
+    options.typed = given
     return guarded(PROGRAM, lambda: _tune(options, ros))
 
 
@@ -68,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5",
+        epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5 --report tank.html",
     )
     parser.add_argument(
         "--amplitude", type=finite, default=0.0, metavar="U",
@@ -89,6 +93,10 @@ def _parser() -> argparse.ArgumentParser:
         "--wait", type=finite, default=5.0, metavar="S",
         help="how long to look for the nodes [s] (%(default)s)",
     )  # fmt: skip
+    parser.add_argument(
+        "--report", metavar="FILE",
+        help="write a report of it: .html, or a picture: .png, .svg or .pdf",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     return parser
 
@@ -97,6 +105,10 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     # What a command needs is imported when it is needed: --help waits for no rclpy.
     from relay_autotune.nodes.tune_client import TuneClient
 
+    if options.report:
+        from relay_autotune.cli.report import check_output
+
+        check_output(options.report)
     interrupted: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda n, _: interrupted.append(n))
@@ -113,6 +125,9 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
         _follow(client, shown, interrupted)
         shown.clear()
+        # Nothing moves any more: whoever does not want to wait for the rest may leave.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         return _conclude(client, options)
 
 
@@ -138,28 +153,69 @@ def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
 def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
     result, cancelled = client.result, client.cancelled
     if not result.experiment.experiment_id:
-        # Nothing was started: a dry run, or a refusal.
-        if options.json:
-            answer = {"node": client.name, "accepted": client.succeeded, "reason": result.reason}
-            print(json.dumps(answer))
-        elif client.succeeded:
-            print(result.reason)
-        if not client.succeeded:
-            say(PROGRAM, f"{client.name} refuses: {result.reason}")
-        return DONE if client.succeeded else NOTHING_FOUND
-    if options.json:
-        print(json.dumps(document(result, client.name, cancelled)))
-    else:
+        return _nothing_started(client, options)
+    if not options.json:
         paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-        print("\n".join(result_lines(result, cancelled, paint)))
-        prefix = "" if shutil.which("replay") else "ros2 run relay_autotune "
-        steps = next_commands(result, client.controllers(), prefix)
+        print("\n".join(result_lines(result, cancelled, paint)), flush=True)
+    flags, report = _afterwards(client, options)
+    if options.json:
+        print(json.dumps(document(result, client.name, cancelled, report)))
+    else:
+        steps = next_commands(result, client.controllers(), _prefix(), flags, report)
         if steps:
             print("\nNext:")
         for what, command in steps:
             print(f"  {what:<26} {command}")
     complete = result.gains.experiment_id or options.record_only
-    return DONE if client.succeeded and complete else NOTHING_FOUND
+    written = report or not options.report
+    return DONE if client.succeeded and complete and written else NOTHING_FOUND
+
+
+def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
+    """Tell what came of a dry run, or why the node refuses."""
+    reason = client.result.reason
+    if options.json:
+        print(json.dumps({"node": client.name, "accepted": client.succeeded, "reason": reason}))
+    elif client.succeeded:
+        print(reason)
+        again = [word for word in options.typed if word != "--dry-run"]
+        print(f"\nNext:\n  {'start it':<26} {_prefix()}{shlex.join((PROGRAM, *again))}")
+    if not client.succeeded:
+        say(PROGRAM, f"{client.name} refuses: {reason}")
+    return DONE if client.succeeded else NOTHING_FOUND
+
+
+def _prefix() -> str:
+    return "" if shutil.which("replay") else "ros2 run relay_autotune "
+
+
+def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, str]:
+    """Write the report if it is wanted; return the flags for `replay`, and the report's name."""
+    from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
+
+    result = client.result
+    values = None if options.record_only else client.identifier_values(_PATIENCE)
+    flags = flags_of(values) if values is not None else ""
+    if not options.report:
+        return flags, ""
+    try:
+        if values is None:
+            say(PROGRAM, "no identifier_node tells its parameters: the report has the defaults")
+        told = report_of_tune(
+            client.record(_PATIENCE),
+            values or defaults(),
+            result,
+            result.bag or client.name,
+            options.report,
+        )
+    except RelayAutotuneError as error:
+        say(PROGRAM, f"no report: {error}")
+        return flags, ""
+    if told:
+        say(PROGRAM, told)
+    if not options.json:
+        print(f"  {'report':<16} {options.report}")
+    return flags, str(options.report)
 
 
 class Shown:

@@ -214,15 +214,28 @@ def _continued(lines: Sequence[str]) -> list[str]:
 
 
 def next_commands(
-    result: Any, controllers: Sequence[str], prefix: str = ""
+    result: Any,
+    controllers: Sequence[str],
+    prefix: str = "",
+    flags: str = "",
+    report: str = "",
 ) -> list[tuple[str, str]]:
     """Return what to type next, each with what it is for.
 
     :param result: a `Tune.Result`.
     :param controllers: full names of the controller_nodes that hear these gains.
     :param prefix: what runs the package's executables, where the shell does not find them.
+    :param flags: with which these give what the identifier_node gave.
+    :param report: the report that was written; empty: none was.
     """
     steps = []
+    if report:
+        steps.append(("see it in figures", f"xdg-open {shlex.quote(report)}"))
+    if result.bag:
+        bag = f"{shlex.quote(result.bag)} {flags}".rstrip()
+        if result.transfer_function.experiment_id and not report:
+            steps.append(("see it in figures", f"{prefix}report {bag} -o report.html"))
+        steps.append(("see every method and rule", f"{prefix}replay {bag}"))
     if result.gains.experiment_id:
         for name in controllers:
             steps += [
@@ -232,20 +245,16 @@ def next_commands(
                     f"ros2 action send_goal {name}/verify relay_autotune_msgs/action/Verify {{}}",
                 ),
             ]
-    if result.bag:
-        bag = shlex.quote(result.bag)
-        if result.transfer_function.experiment_id:
-            steps.append(("see it in figures", f"{prefix}report {bag}"))
-        steps.append(("see every method and rule", f"{prefix}replay {bag}"))
     return steps
 
 
-def document(result: Any, node: str, cancelled: bool) -> dict[str, Any]:
+def document(result: Any, node: str, cancelled: bool, report: str = "") -> dict[str, Any]:
     """Return a result for a JSON document; null stands for "not estimated", and "none came".
 
     :param result: a `Tune.Result`.
     :param node: full name of the relay_node.
     :param cancelled: whether it was cancelled from here.
+    :param report: the report that was written; empty: none was.
     """
     model, gains = result.transfer_function, result.gains
     return {
@@ -254,6 +263,7 @@ def document(result: Any, node: str, cancelled: bool) -> dict[str, Any]:
         "outcome": "cancelled" if cancelled else OUTCOMES[result.outcome],
         "reason": result.reason,
         "bag": result.bag or None,
+        "report": report or None,
         "transfer_function": _fields(model) if model.experiment_id else None,
         "gains": _fields(gains) if gains.experiment_id else None,
     }

@@ -9,17 +9,23 @@ from typing import Any
 
 import rclpy
 from action_msgs.msg import GoalStatus
+from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import LoopError, ParameterError
+from relay_autotune.messages import record_from_message
+from relay_autotune.nodes import quality
+from relay_autotune.record import Record
 from relay_autotune_msgs.action import Tune
+from relay_autotune_msgs.msg import RelayExperiment
 
 # A relay_node that is not seen for so long during a tune is taken for gone [s].
 _GONE = 3.0
@@ -156,6 +162,45 @@ class TuneClient:
     def controllers(self) -> list[str]:
         """Return the full names of the nodes of this namespace that can apply gains."""
         return [name for name in self._owners("/apply") if self._is_here(name)]
+
+    def record(self, patience: float) -> Record:
+        """Return the samples of the tune, which relay_node keeps for who comes late.
+
+        :param patience: how long to wait for them [s].
+        :raises LoopError: if they do not come.
+        :raises RelayAutotuneError: if they are no record.
+        """
+        wanted = self.result.experiment.experiment_id
+        came: list[Any] = []
+        self._node.create_subscription(
+            RelayExperiment, self._resolved("relay_experiment"), came.append, quality.latched(10)
+        )
+        deadline = time.monotonic() + patience
+        if not self._wait(lambda: any(m.experiment_id == wanted for m in came), deadline):
+            raise LoopError(f"the samples of {wanted} have not come within {patience:g} s")
+        return record_from_message(next(m for m in came if m.experiment_id == wanted))
+
+    def identifier_values(self, patience: float) -> dict[str, Any] | None:
+        """Return the parameters of the identifier_node, by name; None: it does not tell them.
+
+        :param patience: how long to wait for them [s].
+        """
+        # Imported here, since no tune shall wait for it.
+        from relay_autotune.nodes.identifier import PARAMETERS
+
+        names = [entry.name for entry in PARAMETERS]
+        for end in self._node.get_publishers_info_by_topic(self._resolved("pi_gains")):
+            name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+            client = self._node.create_client(GetParameters, f"{name}/get_parameters")
+            deadline = time.monotonic() + patience
+            if self._wait(client.service_is_ready, deadline):
+                answer = client.call_async(GetParameters.Request(names=names))
+                if self._wait(answer.done, deadline):
+                    values = map(parameter_value_to_python, answer.result().values)
+                    found = dict(zip(names, values, strict=False))
+                    if len(found) == len(names) and None not in found.values():
+                        return found
+        return None
 
     def _is_here(self, name: str) -> bool:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
+from argparse import ArgumentParser
 from typing import Any
 
 import pytest
+from report_cases import completed as analysed
+from report_cases import only
 
 from relay_autotune.cli import tune_loop
+from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
+from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
 from relay_autotune.cli.tune_view import (
     OUTCOMES,
     STATES,
@@ -23,6 +29,8 @@ from relay_autotune.cli.tune_view import (
     result_lines,
     wants_colour,
 )
+from relay_autotune.nodes.design_parameters import options_from
+from relay_autotune.nodes.known_parameters import known_from
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
@@ -181,13 +189,54 @@ def test_a_result_has_model_gains_recording_and_what_to_type_next() -> None:
         "/records/x y",
     ):
         assert part in text
-    commands = [c for _, c in next_commands(completed(), ["/a/controller_node"])]
-    assert commands == [
+    controllers = (
         "ros2 service call /a/controller_node/apply std_srvs/srv/Trigger",
         "ros2 action send_goal /a/controller_node/verify relay_autotune_msgs/action/Verify {}",
-        "report '/records/x y'",
+    )
+    commands = [c for _, c in next_commands(completed(), ["/a/controller_node"])]
+    assert commands == [
+        "report '/records/x y' -o report.html",
         "replay '/records/x y'",
+        *controllers,
     ]
+    told = {"flags": "--rule imc", "report": "my page.html"}
+    commands = [c for _, c in next_commands(completed(), ["/a/controller_node"], **told)]
+    assert commands == [
+        "xdg-open 'my page.html'",
+        "replay '/records/x y' --rule imc",
+        *controllers,
+    ]
+
+
+def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() -> None:
+    assert flags_of(defaults()) == ""
+    told = {
+        "method": "chang", "rule": "imc", "known_gain": 1.65, "known_dead_time": 0.5,
+        "structure": "lag_n", "order": 3, "controller": "pi", "ms": 1.6, "mt": 1.5,
+        "sample_period": 0.01, "loop_delay": 0.02, "noise_share": 0.2, "filter_ratio": 8.0,
+        "closed_loop_time": 2.0, "phase_peak": math.radians(-130.0), "resonance": 3.0,
+    }  # fmt: skip
+    assert set(told) == set(defaults())
+    values = defaults() | told
+    parser = ArgumentParser()
+    add_analysis(parser)
+    (job,) = jobs_of(parser.parse_args(shlex.split(flags_of(values))), ["bag"])
+    assert (job.method, job.rule) == ("chang", "imc")
+    assert job.known == known_from(values)
+    assert job.options == options_from(values)
+
+
+def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_path) -> None:
+    only(monkeypatch, "uncertainty")
+    monkeypatch.setattr("relay_autotune.autotune.analyse", lambda record, **_: analysed())
+    page = str(tmp_path / "page.html")
+    tune = completed()
+    tune.gains.kc = analysed().best_gains.kc
+    record = analysed().record
+    assert report_of_tune(record, defaults(), tune, "/records/x", page) == ""
+    assert "Gains to type in" in (tmp_path / "page.html").read_text()
+    tune.gains.kc *= 1.1
+    assert "identifier_node gave" in report_of_tune(record, defaults(), tune, "x", page)
 
 
 def test_a_tune_without_gains_offers_none() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -60,21 +61,26 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
     status, output, said = run(rig, "--namespace", "tank", "--dry-run", "--amplitude", "0.25")
     assert status == 0
     assert output.startswith("a tune could start: relay between 0.825 and 1.325")
+    assert output.endswith("tune_loop --namespace tank --amplitude 0.25\n")
     said = "tune_loop: no relay_node"  # on a busy machine it is not found so soon
     while said.startswith("tune_loop: no relay_node"):
         status, output, said = run(rig, "--namespace", "tank", "--wait", "0.5")
     assert status == 1
     assert said.startswith("tune_loop: no identifier_node publishes /tank/pi_gains")
     assert said.count("\n") == 1
-    rig.start("identifier_node", *NAMED)
-    status, output, said = run(rig, "--ros-args", "-r", "__ns:=/tank")
+    rig.start("identifier_node", *NAMED, rule="imc")
+    page = rig.records.parent / "page.html"
+    status, output, said = run(rig, "--report", str(page), "--ros-args", "-r", "__ns:=/tank")
     assert status == 0, said
     assert "\x1b" not in output + said
     for part in ("tune of /tank/relay_node", "cycle 2, period", "left", "completed, period"):
         assert part in said
     (bag,) = Path(records).iterdir()
-    for part in ("completed: ", "(fopdt, waveform)", "kc ", str(bag), f"replay {bag}"):
+    for part in ("completed: ", "(fopdt, waveform)", "kc ", str(bag), f"xdg-open {page}"):
         assert part in output
+    assert output.endswith(f"replay {bag} --rule imc\n")
+    kc = re.search(r"kc (\S+)", output)[1]
+    assert kc in page.read_text()
 
 
 def test_ctrl_c_cancels_and_says_that_the_safe_command_is_out(rig: Rig) -> None:
@@ -102,6 +108,9 @@ def test_without_a_relay_node_it_says_so_in_one_line(rig: Rig) -> None:
     status, output, said = run(rig, "--namespace", "tank", "--wait", "0.2")
     assert (status, output) == (1, "")
     assert said.startswith("tune_loop: no relay_node /tank/relay_node within 0.2 s")
+    assert said.count("\n") == 1
+    status, output, said = run(rig, "--report", "page.doc")
+    assert (status, output) == (2, "")
     assert said.count("\n") == 1
     status, output, said = run(rig, "--namespace", "no name")
     assert (status, output) == (2, "")

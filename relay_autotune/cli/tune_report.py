@@ -1,0 +1,90 @@
+"""What a tune gave, told once more from its samples, as the identifier_node was asked to."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.cli.report import write_report
+
+if TYPE_CHECKING:
+    from relay_autotune.autotune import Analysis
+    from relay_autotune.record import Record
+
+_RENAMED = {"known_gain": "gain", "known_dead_time": "dead_time", "closed_loop_time": "lambda"}
+_NEAR = 1e-6
+
+
+def flags_of(values: Mapping[str, Any]) -> str:
+    """Return what `replay` and `report` must be told to give what the identifier_node gave.
+
+    :param values: of its parameters, by name.
+    :return: the flags of those that are not the default.
+    """
+    from relay_autotune.nodes.identifier import PARAMETERS
+
+    found = []
+    for entry in PARAMETERS:
+        value = values[entry.name]
+        if value == entry.default or value != value:
+            continue
+        name = _RENAMED.get(entry.name, entry.name).replace("_", "-")
+        if entry.name == "phase_peak":
+            value = math.degrees(value)
+        found += [f"--{name}", f"{value:.12g}" if isinstance(value, float) else str(value)]
+    return shlex.join(found)
+
+
+def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
+    """Identify and tune as the identifier_node does.
+
+    :param record: the samples.
+    :param values: of its parameters, by name.
+    """
+    from relay_autotune.autotune import analyse
+    from relay_autotune.nodes.design_parameters import options_from
+    from relay_autotune.nodes.known_parameters import known_from
+
+    return analyse(
+        record,
+        method=values["method"],
+        rule=values["rule"],
+        known=known_from(values),
+        options=options_from(values),
+    )
+
+
+def defaults() -> dict[str, Any]:
+    """Return the parameters of an identifier_node that was told nothing, by name."""
+    from relay_autotune.nodes.identifier import PARAMETERS
+
+    return {entry.name: entry.default for entry in PARAMETERS}
+
+
+def report_of_tune(
+    record: Record, values: Mapping[str, Any], result: Any, source: str, output: str
+) -> str:
+    """Write a report of a tune.
+
+    :param record: its samples.
+    :param values: of the identifier_node's parameters, by name.
+    :param result: the `Tune.Result`.
+    :param source: how the report calls it.
+    :param output: its file.
+    :return: what the user must know of it; empty: nothing.
+    :raises BagError: if it cannot be written.
+    """
+    from relay_autotune.report.case import case_of
+
+    found = analysed_as_there(record, values)
+    write_report([case_of(found, source)], output)
+    gains, published = found.best_gains, result.gains
+    kc = gains.kc if gains is not None else math.nan
+    if published.experiment_id and not math.isclose(kc, published.kc, rel_tol=_NEAR):
+        return (
+            f"the report has kc {kc:.6g} where the identifier_node gave {published.kc:.6g}: "
+            "it was asked for something else, or runs another version"
+        )
+    return ""
