@@ -6,14 +6,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import Float64
 
-from relay_autotune.nodes import quality
+from relay_autotune.nodes import quality, signs_of_life
 from relay_autotune.nodes.live_types import Reader, command_setter
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
@@ -29,6 +29,7 @@ class Ends:
     :param node: the node.
     :param on_measurement: called with each measurement and the middleware's facts about it.
     :param on_result: called with the topic's unresolved name and each model or gains.
+    :param on_status: called with each sign of life of the identifier.
     :param cycles_kept: cycles that wait for who comes late.
     :param reader: how the measurement is read from its messages.
     :param command_type: message type of the command.
@@ -41,6 +42,7 @@ class Ends:
         *,
         on_measurement: Callable[[Any, dict[str, Any]], None],
         on_result: Callable[[str, Any], None],
+        on_status: Callable[[Any], None],
         cycles_kept: int,
         reader: Reader,
         command_type: str,
@@ -92,6 +94,13 @@ class Ends:
                 kind, name, partial(on_result, name), quality.RESULT, event_callbacks=unheard
             )
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
+        )
+        node.create_subscription(
+            DiagnosticStatus,
+            signs_of_life.TOPIC,
+            on_status,
+            quality.RESULT,
+            event_callbacks=unheard,
         )
         self.sent: Callable[[float], None] | None = None
         """Told each command before it goes out."""

@@ -23,6 +23,7 @@ from relay_autotune.nodes.design_parameters import DESIGN_PARAMETERS, options_fr
 from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
+from relay_autotune.nodes.signs_of_life import SignsOfLife
 from relay_autotune.record import Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
@@ -64,6 +65,7 @@ class IdentifierNode(ServedNode):
         self._earlier: Record | None = None
         self._fit_asked_for = False
         self._progress: Any = None
+        self._signs = SignsOfLife(self)
         self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
         self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
         self.create_subscription(
@@ -130,20 +132,26 @@ class IdentifierNode(ServedNode):
     def _on_experiment(self, message: Any) -> None:
         self._ended = message.experiment_id
         self._cycles.clear()
+        with self._signs.working_on(self._ended):
+            lacking = self._identify_whole(message)
+        self._signs.done(self._ended, lacking)
+
+    def _identify_whole(self, message: Any) -> str:
+        """Publish model and gains of an experiment; return why one of them does not come."""
         try:
             record = record_from_message(message)
         except RelayAutotuneError as error:
             self.get_logger().error(f"experiment {self._ended} cannot be used: {error}")
-            return
+            return f"the experiment cannot be used: {error}"
         analysis = self._analyse(record, final=True)
         if analysis is None:
-            return
+            return "the experiment could not be analysed; the log of identifier_node says why"
         if analysis.model is not None:
             self._publish_model(analysis, final=True)
         gains = analysis.best_gains
         if gains is None:
             self.get_logger().warning(f"experiment {self._ended}: {analysis.reason}")
-            return
+            return analysis.reason
         message = PidGains()
         fill_gains(
             message, gains, experiment_id=record.experiment_id, stamp_ns=_last_stamp(record)
@@ -153,6 +161,7 @@ class IdentifierNode(ServedNode):
             f"experiment {self._ended}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
             f"ti {gains.ti:.6g} s, td {gains.td:.6g} s"
         )
+        return ""
 
     def _on_identify(self, request: Any, response: Any) -> Any:
         """Answer with every method's model and every rule's gains for a record."""

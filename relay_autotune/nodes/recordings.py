@@ -26,6 +26,10 @@ RESULTS = ("transfer_function", "pi_gains")
 
 # How long a start waits for the recording's folder [s].
 OPEN_WITHIN = 0.3
+# While the identifier gives signs of life, it is waited for so many times as long as without.
+LONGEST = 30.0
+# When it says that no more will come, what it has sent may still be on its way [s].
+ON_THE_WAY = 0.5
 
 
 class _Recording:
@@ -34,6 +38,8 @@ class _Recording:
         self.missing = list(RESULTS)
         self.waiting = False
         self.timer: Timer | None = None
+        self.until = 0.0
+        self.reason = ""
         self.closed: Callable[[str], None] | None = None
 
 
@@ -113,13 +119,31 @@ class Recordings:
         """
         return self._paths.get(experiment_id, "") if not self.problem() else ""
 
+    def told(self, experiment_id: str, working: bool, lacking: str) -> None:
+        """Take a sign of life of the identifier.
+
+        :param experiment_id: what it works on, or has finished.
+        :param working: True if it still works on it.
+        :param lacking: why model or gains will not come; "": they have been sent.
+        """
+        recording = self._open.get(experiment_id)
+        if recording is None or recording.timer is None:
+            return
+        if not working:
+            recording.reason = lacking
+            period = min(recording.timer.timer_period_ns, round(ON_THE_WAY * 1e9))
+            recording.timer.timer_period_ns = period
+            recording.timer.reset()
+        elif time.monotonic() < recording.until:
+            recording.timer.reset()
+
     def close_with_results(
         self, experiment_id: str, timeout: float, closed: Callable[[str], None]
     ) -> None:
         """Close a recording once model and gains are in it, or after a time without them.
 
         :param experiment_id: the id of the experiment.
-        :param timeout: how long to wait [s].
+        :param timeout: how long to wait from the end, or from the last sign of life [s].
         :param closed: called with a sentence on what is missing, "" if nothing is.
         """
         recording = self._open.get(experiment_id)
@@ -133,8 +157,10 @@ class Recordings:
 
         def late() -> None:
             missing = " and ".join(recording.missing)
-            self.close(experiment_id, f"without {missing}, not come within {timeout:g} s")
+            recording.reason = recording.reason or f"not come within {timeout:g} s"
+            self.close(experiment_id, f"without {missing}, {recording.reason}")
 
+        recording.until = time.monotonic() + LONGEST * timeout
         recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=self._steady)
 
     def close(self, experiment_id: str, why: str) -> None:
@@ -150,7 +176,8 @@ class Recordings:
             self._node.destroy_timer(recording.timer)
         if recording.closed is not None:
             missing = " and ".join(recording.missing)
-            recording.closed(f"{missing} did not come" if missing else "")
+            cause = f": {recording.reason}" if recording.reason else ""
+            recording.closed(f"{missing} did not come{cause}" if missing else "")
         log = self._node.get_logger()
         say = log.warning if recording.waiting and recording.missing else log.info
         recording.recorder.close(

@@ -45,6 +45,7 @@ from relay_autotune.nodes.reports import (
 )
 from relay_autotune.nodes.session import Session
 from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
+from relay_autotune.nodes.signs_of_life import said_by
 from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
@@ -89,6 +90,7 @@ class RelayNode(ServedNode):
             self,
             on_measurement=self._on_measurement,
             on_result=self._on_result,
+            on_status=lambda status: self._recordings.told(*said_by(status)),
             cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
             reader=self._reader,
             command_type=fixed["command_type"],
@@ -96,9 +98,8 @@ class RelayNode(ServedNode):
         )
         self._send, self._relay = self._ends.send, self._ends.relay
         self._on_setpoint = fixed["relay_on"] == "setpoint"
-        self._loop = LoopEnds(
-            self, self._ends, takeover=fixed["path"] == "takeover", stop=self._stop_now
-        )
+        takeover = fixed["path"] == "takeover"
+        self._loop = LoopEnds(self, self._ends, takeover=takeover, stop=self._stop_now)
         if not self._simulated:
             # With /clock, the time of a sample comes by another callback.
             self.favoured = self._ends.measurement
@@ -268,12 +269,10 @@ class RelayNode(ServedNode):
             response.message = "no tune is running"
             return response
         acknowledged = self._stop(session, "aborted on request")
+        but = "" if acknowledged else ", but was not acknowledged"
+        safe = session.experiment.after_end(math.nan)
         response.success = True
-        response.message = (
-            f"tune {session.id} aborted; the safe command "
-            f"{session.experiment.after_end(math.nan):g} is out"
-            f"{'' if acknowledged else ', but was not acknowledged'}"
-        )
+        response.message = f"tune {session.id} aborted; the safe command {safe:g} is out{but}"
         return response
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
@@ -301,8 +300,8 @@ class RelayNode(ServedNode):
     # Ending.
 
     def _stop_now(self, reason: str) -> None:
-        if self._session is not None:
-            self._stop(self._session, reason)
+        if (session := self._session) is not None:
+            self._stop(session, reason)
 
     def _stop(self, session: Session, reason: str) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
@@ -381,15 +380,16 @@ class RelayNode(ServedNode):
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem()))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
+        running = "" if session is None else session.id
         values: dict[str, object] = {
             "state": idle,
-            "experiment": "" if session is None else session.id,
+            "experiment": running,
             "rate [Hz]": float(self._counter.since_last_asked()),
             "age of the last sample [s]": self._counter.age,
         }
         if session is not None:
             values |= state_values(session, self._counter.lost if self._counted else 0)
-        summary = self._summary if session is None else f"tune {session.id} is running"
+        summary = f"tune {running} is running" if running else self._summary
         now = int(self.get_clock().now().nanoseconds)
         message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)
         self._ends.diagnostics.publish(message)

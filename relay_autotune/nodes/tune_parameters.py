@@ -105,7 +105,8 @@ NODE_PARAMETERS = (
         "model_timeout",
         10.0,
         "s",
-        "After a tune, the recording waits so long for model and gains.",
+        "After a tune, the recording waits so long for model and gains, counted from the last "
+        "sign that identifier_node works on them.",
         0.0,
     ),
     NodeParameter(

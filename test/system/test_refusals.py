@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -295,6 +296,43 @@ def test_without_an_identifier_the_bag_is_closed_with_the_reason(rig: Rig) -> No
     rig.until(lambda: said in relay.log, "the end of the recording")
     (record,) = read_experiments(rig.bag(answer)).experiments
     assert record.experiment_id == answer.experiment_id
+
+
+LATE = """
+import sys, time
+from relay_autotune.nodes import identifier
+analyse = identifier.analyse
+def late(record, *, final=True, **asked):
+    if final:
+        time.sleep(3.5)
+        if len(record.cycle_start) > 6:
+            raise RuntimeError("too much for it")
+    return analyse(record, final=final, **asked)
+identifier.analyse = late
+sys.exit(identifier.main())
+"""
+
+
+def test_an_identifier_that_takes_long_is_waited_for_and_says_if_nothing_comes(rig: Rig) -> None:
+    rig.plant(
+        sample_period=0.1,
+        mode="lockstep",
+        structure="fopdt",
+        time_constants=[2.0],
+        dead_time=1.0,
+    )
+    identifier = rig.start_python("late_identifier", LATE)
+    rig.until(lambda: "ready" in identifier.log, "the identifier")
+    limits = {"sample_period": 0.1, "model_timeout": 2.0, "amplitude": 1.0, "baseline": 0.0}
+    relay = rig.relay(**limits)
+    rig.tune()
+    rig.until(lambda: "is closed with model and gains" in relay.log, "the end of the recording")
+    relay.signal(signal.SIGTERM)
+    relay.wait()
+    relay = rig.relay(**limits, min_cycles=8)
+    rig.tune()
+    said = "is closed without transfer_function and pi_gains, the experiment could not be analysed"
+    rig.until(lambda: said in relay.log, "the end of the recording")
 
 
 def test_the_identifier_survives_messages_that_make_no_sense(rig: Rig) -> None:

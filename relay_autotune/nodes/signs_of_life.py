@@ -1,0 +1,88 @@
+"""What identifier_node tells of its work, so that nobody waits in vain or leaves too soon."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+
+from relay_autotune.nodes import quality
+
+TOPIC = "identifier_status"
+# While it computes, a sign of life comes so often [s].
+EVERY = 1.0
+
+_EXPERIMENT, _STATE = "experiment", "state"
+_WORKING, _DONE = "working", "done"
+
+
+class SignsOfLife:
+    """Publish which experiment is worked on, from a thread, since a fit keeps the node busy.
+
+    :param node: identifier_node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._name = node.get_fully_qualified_name().lstrip("/")
+        self._publisher = node.create_publisher(
+            DiagnosticStatus,
+            TOPIC,
+            quality.RESULT,
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+        )
+
+    @contextmanager
+    def working_on(self, experiment_id: str) -> Iterator[None]:
+        """Give signs of life until the work is done.
+
+        :param experiment_id: what is worked on.
+        """
+        done = threading.Event()
+
+        def tell() -> None:
+            while not done.wait(EVERY):
+                self._publish(experiment_id, _WORKING, "")
+
+        self._publish(experiment_id, _WORKING, "")
+        thread = threading.Thread(target=tell, name="signs of life", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+    def done(self, experiment_id: str, lacking: str) -> None:
+        """Tell that no more will come of an experiment.
+
+        :param experiment_id: its id.
+        :param lacking: why there is no model or are no gains; empty: both have been published.
+        """
+        self._publish(experiment_id, _DONE, lacking)
+
+    def _publish(self, experiment_id: str, state: str, reason: str) -> None:
+        values = {_EXPERIMENT: experiment_id, _STATE: state}
+        self._publisher.publish(
+            DiagnosticStatus(
+                level=DiagnosticStatus.WARN if reason else DiagnosticStatus.OK,
+                name=self._name,
+                message=reason or state,
+                values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            )
+        )
+
+
+def said_by(message: Any) -> tuple[str, bool, str]:
+    """Return experiment id, whether it is still worked on, and why something will not come.
+
+    :param message: the `DiagnosticStatus`.
+    """
+    values = {pair.key: pair.value for pair in message.values}
+    working = values.get(_STATE) == _WORKING
+    lacking = message.message if message.level != DiagnosticStatus.OK else ""
+    return values.get(_EXPERIMENT, ""), working, lacking
