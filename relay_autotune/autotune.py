@@ -11,6 +11,7 @@ import numpy as np
 from relay_autotune.cycles import cycles_of, limit_cycle
 from relay_autotune.disturbance import without_disturbance
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
+from relay_autotune.experiment.early_end import Finding
 from relay_autotune.identification import (
     DEFAULT_METHOD,
     METHODS,
@@ -35,6 +36,7 @@ from relay_autotune.tuning import (
     ensemble,
     rule_named,
 )
+from relay_autotune.tuning.prediction import PredictedMs, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
 from relay_autotune.ultimate import UltimatePoint
 
@@ -42,6 +44,10 @@ _NO_GAINS = {
     Outcome.ABORTED: "the experiment was aborted",
     Outcome.FAILED: "the experiment failed",
 }
+_OPEN_DEAD_TIME = (
+    "no gains: the record goes with a dead time of any length, so that it bounds no gain; record "
+    "a relay test, or a step that stands clear of the noise"
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,8 @@ class Analysis:
     :param reason: why there is no model or no gains; empty where there are both.
     :param added_delay: dead time beside the process's own with which the gains were judged [s]:
         half a sampling period of the controller, and what else its loop adds.
+    :param predicted: of a running experiment, Ms with the gains that its model would give; None:
+        not asked for, or there would be none.
     """
 
     record: Record
@@ -67,6 +75,7 @@ class Analysis:
     recommended: int | None = None
     reason: str = ""
     added_delay: float = 0.0
+    predicted: PredictedMs | None = None
 
     @property
     def model(self) -> Identification | None:
@@ -77,6 +86,15 @@ class Analysis:
     def best_gains(self) -> Gains | None:
         """The gains that count."""
         return None if self.recommended is None else self.gains[self.recommended]
+
+    @property
+    def finding(self) -> Finding:
+        """What the model and its prediction say of a running experiment."""
+        model, ms = self.model, self.predicted
+        if model is None:
+            return Finding()
+        found = Finding(model.ultimate_gain, model.ultimate_gain_std)
+        return found if ms is None else replace(found, ms=ms.ms, ms_low=ms.low, ms_high=ms.high)
 
     def _repr_html_(self) -> str:
         """Return model and gains as a table, as notebooks show it."""
@@ -104,6 +122,7 @@ def analyse(
     options: DesignOptions | None = None,
     final: bool = True,
     alone: bool = False,
+    predict: bool = False,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
     """Identify a record and, where the experiment was completed, tune.
@@ -117,17 +136,16 @@ def analyse(
     :param known: what is known of the process beforehand.
     :param options: what is asked of the controller; noise and amplitude come from the record
         where they are not given.
-    :param final: False while the experiment still runs: only the chosen model, by default a FOPDT
-        unless another structure is known, and no gains; this takes a twentieth of the time.
+    :param final: False while the experiment still runs: only the chosen model, and no gains; this
+        takes a fraction of the time.
     :param alone: True: only the chosen method's model and the chosen rule's gains, equal to those
         beside all others; for many records.
+    :param predict: True: of a running experiment, predict Ms, too.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
     :raises RelayAutotuneError: if method or rule are unknown.
     """
     check_names(method, rule)
-    if not final and method == DEFAULT_METHOD and not known.structure:
-        known = replace(known, structure="fopdt")
     cycles: tuple[Cycle, ...] = ()
     try:
         cycles = cycles_of(record)
@@ -148,7 +166,7 @@ def analyse(
         simple = _simple((record,), known, chosen)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
-        return found
+        return _with_prediction(found, rule, known, rng, options) if predict else found
     refused = _NO_GAINS.get(record.outcome)
     if refused:
         return Analysis(
@@ -221,14 +239,9 @@ def _tuned(
     options: DesignOptions | None,
 ) -> Analysis:
     """Add the gains of the rules that apply to the selected model; the first one has to."""
-    chosen = found.models[0]
-    task = DesignTask(
-        model=chosen.model,
-        options=_with_noise(options or DesignOptions(), found),
-        simple=simple,
-        models=ensemble(chosen, rng=rng or np.random.default_rng(0)),
-        describing=_describing_point(found),
-    )
+    if _dead_time_is_open(found.models[0]):
+        return replace(found, reason=_OPEN_DEAD_TIME)
+    task = _task(found, rng, simple, options)
     try:
         first = design(task, rules[0])
     except TuningError as error:
@@ -244,14 +257,51 @@ def _tuned(
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
 
+def _with_prediction(
+    found: Analysis,
+    rule: str,
+    known: Known,
+    rng: np.random.Generator | None,
+    options: DesignOptions | None,
+) -> Analysis:
+    """Add the Ms that the gains of a rule would have on the model and on those around it."""
+    simple = None if rule == DEFAULT_RULE else _simple((found.record,), known, found.models[0])
+    task = _task(found, rng, simple, options)
+    return replace(found, predicted=predicted_ms(task, rule_named(rule)))
+
+
+def _task(
+    found: Analysis,
+    rng: np.random.Generator | None,
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
+) -> DesignTask:
+    chosen = found.models[0]
+    return DesignTask(
+        model=chosen.model,
+        options=_with_noise(options or DesignOptions(), found),
+        simple=simple,
+        models=ensemble(chosen, rng=rng or np.random.default_rng(0)),
+        describing=_describing_point(found),
+    )
+
+
+def _dead_time_is_open(chosen: Identification) -> bool:
+    """Return whether the data go with any dead time, so that they bound no gain."""
+    high = dict(zip(chosen.parameters, chosen.ci95_high, strict=True)).get("dead_time", 0.0)
+    return math.isinf(high)
+
+
 def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
     """Take noise, amplitude and sampling period from the record where they are not given."""
     record, chosen = found.record, found.models[0]
     if math.isnan(options.noise_std):
         measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
         options = replace(options, noise_std=measured)
-    if math.isnan(options.amplitude) and record.settings is not None:
-        options = replace(options, amplitude=abs(record.settings.amplitude))
+    if math.isnan(options.amplitude):
+        # Of another's experiment, half of what the command moved.
+        settings, half = record.settings, 0.5 * float(np.ptp(record.command))
+        options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
     if options.sample_period == 0.0 and len(record) > 1:
         # The controller will see the same measurement.
         options = replace(options, sample_period=float(np.median(np.diff(record.time))))

@@ -165,6 +165,11 @@ class RelayExperiment:
         return self._samples.time[-1] if self._samples else 0.0
 
     @property
+    def kicked_at(self) -> float:
+        """Time of the kick from the first sample on [s]; NaN before."""
+        return self._procedure.kicked_at
+
+    @property
     def cycles_left(self) -> int:
         """Number of cycles until the end, as far as one can tell; at least 1 while it runs."""
         return max(self.parameters.min_cycles + 1 - self.cycle_count, 0 if self.finished else 1)

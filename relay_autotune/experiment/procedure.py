@@ -114,6 +114,11 @@ class Procedure:
         return self._oscillation.sign if self._oscillation else self._sign
 
     @property
+    def kicked_at(self) -> float:
+        """Time of the first kick [s]; NaN before."""
+        return self._settled_at
+
+    @property
     def cycles(self) -> list[Cycle]:
         """The whole cycles."""
         return self._oscillation.cycles if self._oscillation else []

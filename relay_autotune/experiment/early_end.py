@@ -1,0 +1,133 @@
+"""When a running experiment is looked at, and whether it has found out what it should."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
+SOUGHT = (ULTIMATE_GAIN, MS)
+_NAMES = {ULTIMATE_GAIN: "K_u", MS: "the predicted Ms"}
+
+# A 95 % interval of a normal estimate, in standard deviations to either side.
+_NORMAL = 1.96
+
+# Nothing is concluded before the first half cycle.
+_LEAST_SWITCHES = 2
+# From one look to the next, the time since the kick grows by no less and no more. In between,
+# an interval that narrows no faster than the cube of that time decides.
+_LEAST_GROWTH, _MOST_GROWTH = 1.02, 1.15
+_STEEPNESS = 3.0
+
+
+class Running(Protocol):
+    """What is asked of a running experiment, a :class:`~relay_autotune.relay.RelayExperiment`."""
+
+    @property
+    def elapsed(self) -> float:
+        """Time from the first sample to the last [s]."""
+
+    @property
+    def kicked_at(self) -> float:
+        """Time of the kick from the first sample on [s]; NaN before."""
+
+    @property
+    def switches(self) -> int:
+        """Number of switches of the relay so far."""
+
+    @property
+    def cycle_count(self) -> int:
+        """Number of whole cycles so far."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the newest fit of a running experiment tells; NaN: not estimated.
+
+    :param ultimate_gain: K_u [u/y].
+    :param ultimate_gain_std: its standard deviation [u/y].
+    :param ms: Ms that the gains designed on the model would have.
+    :param ms_low: lower end of its 95 % interval.
+    :param ms_high: upper end.
+    """
+
+    ultimate_gain: float = math.nan
+    ultimate_gain_std: float = math.nan
+    ms: float = math.nan
+    ms_low: float = math.nan
+    ms_high: float = math.nan
+
+    def width(self, sought: str) -> float:
+        """Return half the width of a 95 % interval over the value; NaN: not estimated.
+
+        :param sought: one of ``SOUGHT``.
+        """
+        if sought == ULTIMATE_GAIN:
+            value, half = abs(self.ultimate_gain), _NORMAL * self.ultimate_gain_std
+        else:
+            value, half = self.ms, 0.5 * (self.ms_high - self.ms_low)
+        return half / value if value > 0.0 and half >= 0.0 else math.nan
+
+
+class EarlyEnd:
+    """End an experiment once an interval is as narrow as asked.
+
+    Between the switches of the relay it is looked at again when the time since the kick has
+    grown by a share that depends on how far the interval still is from what is asked; so the
+    looks, each a fit of the whole record, cost the same for any sampling rate.
+
+    :param sought: which interval, one of ``SOUGHT``.
+    :param wanted: half its width, as a fraction of the value.
+    """
+
+    def __init__(self, sought: str, wanted: float) -> None:
+        self.sought, self.wanted = sought, wanted
+        self._switches = 0
+        self._next = 0.0
+        self._waits = False
+        self._growth = _MOST_GROWTH
+
+    def is_due(self, running: Running) -> bool:
+        """Return True if the experiment is to be looked at.
+
+        That is at each switch from the first half cycle on; in between, once the last look was
+        answered and enough time has gone by.
+
+        :param running: the experiment.
+        """
+        if running.switches < _LEAST_SWITCHES:
+            return False
+        if running.switches != self._switches:
+            return True
+        return not self._waits and running.elapsed - running.kicked_at >= self._next
+
+    def look(self, running: Running) -> None:
+        """Note that the experiment is looked at now.
+
+        :param running: the experiment.
+        """
+        self._switches = running.switches
+        self._next = (running.elapsed - running.kicked_at) * self._growth
+        self._waits = True
+
+    def judge(self, running: Running, found: Finding) -> str:
+        """Take the answer to a look; return why the experiment may end, "" if it may not.
+
+        :param running: the experiment.
+        :param found: what its newest fit tells.
+        """
+        width = found.width(self.sought)
+        ratio = width / self.wanted if width > 0.0 else math.inf
+        last = self._next / self._growth
+        growth = ratio ** (1.0 / _STEEPNESS) if ratio > 1.0 else 1.0
+        self._growth = min(max(growth, _LEAST_GROWTH), _MOST_GROWTH)
+        self._next = last * self._growth
+        self._waits = False
+        if not width <= self.wanted or running.switches < _LEAST_SWITCHES:
+            return ""
+        return (
+            f"after {running.switches} switches, {running.cycle_count} whole cycles, the 95 % "
+            f"interval of {_NAMES[self.sought]} is within {width:.3g} of it, as narrow as asked, "
+            f"{self.wanted:g}"
+        )
