@@ -41,6 +41,8 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 _BEYOND = 3.0
 # Lower end of a gap over its upper end.
 _NARROW = 0.9
+# Part of kp within which a loop is near -1.
+_NEAR = 0.3
 _NEIGHBOURS = np.array([0.995, 1.0, 1.005])
 
 
@@ -126,7 +128,7 @@ class Responses:
         count = self._poles + _gained(x, reach, height)
         begun = np.where(reach[..., 0] > 0.0, np.where(height[..., 0] > 0.0, -1, 1), 0)
         count = count + np.where(self._at_rest, begun, 0)
-        stable = np.where(count == 0, _first_crossing(reach, w * height), 0.0)
+        stable = np.where(count == 0, _first_crossing(reach, w * height, kp), 0.0)
         return _largest_ki(bounds, kp, td, w, inverse, stable)
 
     def _felt(
@@ -207,11 +209,12 @@ def _largest_ki(
     return np.where(limit > 0.0, refined, limit), below
 
 
-def _first_crossing(distance: FloatArray, ki: FloatArray) -> FloatArray:
+def _first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> FloatArray:
     """Return the least positive integral gain at which a closed-loop pole is on the axis.
 
     :param distance: kp + x, zero where some ki brings the loop to -1, shape (k, m, n).
     :param ki: which one that would be, shape (k, m, n).
+    :param kp: proportional gains, shape (k,).
     :return: shape (k, m); infinite: none.
     """
     before, after = distance[..., :-1], distance[..., 1:]
@@ -219,7 +222,11 @@ def _first_crossing(distance: FloatArray, ki: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         share = before / (before - after)
     at = ki[..., :-1] + share * (ki[..., 1:] - ki[..., :-1])
-    return np.where(crosses & (at > 0.0), at, math.inf).min(axis=-1)
+    # Within one cell of the gain at which no integral is needed for that, the sign is not known.
+    near = np.maximum(np.abs(before), np.abs(after)) < _NEAR * kp[:, None, None]
+    marginal = crosses & near & ((ki[..., :-1] > 0.0) != (ki[..., 1:] > 0.0))
+    at = np.where(marginal, 0.0, at)
+    return np.where(crosses & ((at > 0.0) | marginal), at, math.inf).min(axis=-1)
 
 
 def _highest_gap(

@@ -118,26 +118,30 @@ def _relaxed(search: Search, asked: Bounds, derivative: bool) -> _Attempt:
         if found is not None:
             return replace(found, warnings=(warning,))
         search, warnings = quiet, [warning]
-    least = search.least_ms(derivative=derivative)
-    if least > MS_RANGE[1]:
-        raise TuningError(_cannot_hold(search, kind, least))
-    bounds = asked
-    if least > asked.ms:
-        bounds = replace(bounds, ms=_RELAXED * least)
-        warnings.append(_relaxation(kind, "Ms", asked.ms, least, bounds.ms))
-    least = search.least_mt(bounds.ms, derivative=derivative)
-    if least > asked.mt:
-        bounds = replace(bounds, mt=_RELAXED * least)
-        warnings.append(_relaxation(kind, "Mt", asked.mt, least, bounds.mt))
-    found = _within(search, bounds, derivative)
+    least_ms = search.least_ms(derivative=derivative)
+    if least_ms > MS_RANGE[1]:
+        raise TuningError(_cannot_hold(search, kind, least_ms))
+    ms = _RELAXED * least_ms if least_ms > asked.ms else asked.ms
+    least_mt = search.least_mt(ms, derivative=derivative)
+    mt = _RELAXED * least_mt if least_mt > asked.mt else asked.mt
+    found = _within(search, Bounds(ms, mt), derivative)
+    if found is None:
+        # Some controller keeps them, but so few that none was met.
+        ms, mt = max(ms, _RELAXED * least_ms), max(mt, _RELAXED * least_mt)
+        found = _within(search, Bounds(ms, mt), derivative)
     if found is None:
         raise TuningError(_cannot_hold(search, kind, math.inf))
+    if ms > asked.ms:
+        warnings.append(_relaxation(kind, "Ms", asked.ms, least_ms, ms))
+    if mt > asked.mt:
+        warnings.append(_relaxation(kind, "Mt", asked.mt, least_mt, mt))
     return replace(found, warnings=tuple(warnings))
 
 
 def _relaxation(kind: str, name: str, asked: float, least: float, used: float) -> str:
+    few = "no" if least > asked else "hardly any"
     return (
-        f"no {kind} controller keeps {name} <= {asked:g} on this process, whose smallest "
+        f"{few} {kind} controller keeps {name} <= {asked:g} on this process, whose smallest "
         f"attainable {name} is {least:.3g}: designed for {name} <= {used:.3g}"
     )
 

@@ -133,7 +133,11 @@ class Search:
         if self.models:
             found = self._nearby(bounds, point)
             if found is None:
-                return None
+                # Bounds that can just be kept are kept somewhere else, if anywhere.
+                scanned = self.scan(bounds, self._times(derivative))
+                if scanned is None:
+                    return None
+                found = self.least(scanned)
             point, iae = self.settle(bounds, *self.descend(bounds, *found))
         best = self._at(bounds, point[None])
         if best.kp[0] > _UNLIMITED * self._largest_kp:

@@ -136,6 +136,31 @@ def test_95_percent_of_the_models_around_keep_the_bound():
         assert peaks[37] == pytest.approx(1.4, abs=2e-3)
 
 
+def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
+    rng = np.random.default_rng(0)
+    gains, lags, delays = np.array([0.09, 0.005, 0.009])[:, None] * rng.standard_normal((3, 100))
+    models = tuple(
+        TransferFunction.unstable_fopdt(
+            6.8 * math.exp(g), 1.64 * math.exp(g) * (1.0 + t), 0.1656 + d
+        )
+        for g, t, d in zip(gains, lags, 0.1656 * delays, strict=True)
+    )
+    model = TransferFunction.unstable_fopdt(6.8, 1.64, 0.1656)
+    controller, reason = robust(DesignTask(model=model, models=models))
+    assert "Ms <= 1.4 and Mt <= 1.4" in reason
+    peaks = sorted(_ms_of(controller, m) for m in models)
+    assert peaks[94] <= 1.4 * 1.002
+    assert all(is_stable(controller, m) for m in models[::10])
+
+
+def test_a_gain_beside_the_ultimate_one_does_not_pass_for_one_without_limit():
+    # With the filter, one of the gains that are scanned lies within a cell of the ultimate one.
+    model = TransferFunction.unstable_sopdt(0.976, 0.5765, 0.04902, 0.04714)
+    options = DesignOptions(sample_period=0.0033408, noise_std=0.01503, amplitude=1.0)
+    controller, _ = robust(DesignTask(model=model, options=options))
+    assert is_stable(controller, model)
+
+
 @pytest.mark.parametrize(
     ("model", "limit"),
     [
