@@ -93,6 +93,5 @@ def design(task: DesignTask, rule: str) -> Gains:
         return Gains.of(
             rule, controller, performance, ms_95=performance.ms, reason=reason, warnings=warnings
         )
-    around = [task.in_loop(model) for model in task.models]
-    ms_95 = max(ensemble_ms(controller, around), performance.ms)
+    ms_95 = max(ensemble_ms(controller, task.around), performance.ms)
     return Gains.of(rule, controller, performance, ms_95=ms_95, reason=reason, warnings=warnings)

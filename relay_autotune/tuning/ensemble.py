@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,12 +12,18 @@ from numpy.typing import NDArray
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification, is_logarithmic
 from relay_autotune.models import TransferFunction
-from relay_autotune.tuning.control_law import ControlLaw
+from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.margins import frequencies
+from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.tuning.search import allowed_outside
-from relay_autotune.tuning.stability import closed_loop_unstable_poles, winding
+from relay_autotune.tuning.stability import (
+    at_infinity,
+    closed_loop_unstable_poles,
+    winding,
+)
 
 FloatArray = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _MODELS = 100
 
@@ -83,43 +88,55 @@ class Peaks:
         return int(np.isinf(self.ms).sum())
 
 
-def ensemble_peaks(controller: ControlLaw, models: Sequence[TransferFunction]) -> Peaks:
+def ensemble_peaks(controller: Controller, models: ModelSet) -> Peaks:
     """Return the robustness of a controller on each of many models.
 
     Stability is read off how often each loop turns on the grid; where two points are too far
     apart for that, the argument principle decides.
 
-    :param controller: the gains, or any other linear controller.
+    :param controller: the gains.
     :param models: at least one.
     """
-    terms = [controller.characteristic(model) for model in models]
-    grid = frequencies(*terms[0])
-    s = 1j * grid
-    law = controller(s)
-    ms, mt = np.empty(len(models)), np.empty(len(models))
-    for k, model in enumerate(models):
-        loop = law * model(s)
-        sensitivity = 1.0 / np.abs(1.0 + loop)
-        count = winding(terms[k], grid)
-        stable = (closed_loop_unstable_poles(terms[k]) if count is None else count) == 0
-        ms[k] = sensitivity.max() if stable else math.inf
-        mt[k] = (sensitivity * np.abs(loop)).max() if stable else math.inf
-    return Peaks(ms, mt)
+    loops, distance, unstable = _loops(controller, models)
+    ms, mt = 1.0 / distance.min(axis=0), (np.abs(loops) / distance).max(axis=0)
+    return Peaks(np.where(unstable, math.inf, ms), np.where(unstable, math.inf, mt))
 
 
-def ensemble_ms(controller: ControlLaw, models: Sequence[TransferFunction]) -> float:
+def ensemble_ms(controller: Controller, models: ModelSet) -> float:
     """Return the Ms below which 95 % of the models stay with one controller.
 
-    :param controller: the gains, or any other linear controller.
+    :param controller: the gains.
     :param models: at least one.
     :raises TuningError: if more than 5 % of the loops are unstable.
     """
-    peaks = ensemble_peaks(controller, models)
-    value = float(np.sort(peaks.ms)[len(models) - 1 - allowed_outside(len(models))])
+    _, distance, unstable = _loops(controller, models)
+    ms, count = np.where(unstable, math.inf, 1.0 / distance.min(axis=0)), len(models.models)
+    value = float(np.sort(ms)[count - 1 - allowed_outside(count)])
     if math.isinf(value):
         raise TuningError(
             "the model is too uncertain for these gains: "
-            f"{100 * peaks.unstable / len(models):.0f} % of the models within its uncertainty "
+            f"{100 * unstable.sum() / count:.0f} % of the models within its uncertainty "
             "would be unstable; run more cycles or a larger amplitude"
         )
     return value
+
+
+def _loops(
+    controller: Controller, models: ModelSet
+) -> tuple[ComplexArray, FloatArray, NDArray[np.bool_]]:
+    """Return loops L and |1 + L| on a grid, shape (n, m), and which are unstable, shape (m,)."""
+    grid = frequencies(*controller.characteristic(models.models[0]))
+    # All but integrators has come to rest there.
+    w = np.concatenate(([1e-6 * grid[0]], grid))
+    loops = controller(1j * w)[:, None] * models(w)
+    moved = 1.0 + loops
+    limits = np.array([_at_infinity(controller, model) for model in models.models])
+    integrators = models.integrators + (1 if controller.ti > 0.0 else 0)
+    count = winding(moved, w, models.unstable_poles, integrators, limits)
+    for k in np.flatnonzero(np.isnan(count)):
+        count[k] = closed_loop_unstable_poles(controller.characteristic(models.models[k]))
+    return loops[1:], np.abs(moved[1:]), count != 0.0
+
+
+def _at_infinity(controller: Controller, model: TransferFunction) -> float:
+    return 0.0 if model.dead_time > 0.0 else at_infinity(controller.loop(model))

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.ultimate import unstable_at_small_gain
 
 FloatArray = NDArray[np.floating[Any]]
@@ -78,7 +79,7 @@ class Responses:
     def __init__(
         self, models: Sequence[TransferFunction], grid: FloatArray, crossover: float
     ) -> None:
-        self._models = tuple(models)
+        self._set, self._sign = ModelSet(models), models[0].process_sign
         self.grid = grid
         self.crossover = crossover
         self.inverse = self._evaluate(grid)
@@ -89,9 +90,8 @@ class Responses:
         )
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
-        sign = self._models[0].process_sign
-        values = np.array([sign / m(1j * grid) for m in self._models])
-        return values.astype(np.result_type(grid, np.complex64))
+        values = self._sign / self._set(grid.astype(np.float64)).T
+        return np.ascontiguousarray(values.astype(np.result_type(grid, np.complex64)))
 
     def add(self, frequencies: FloatArray) -> None:
         """Add frequencies to the grid, with neighbours on either side.

@@ -29,6 +29,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
 
 FloatArray = NDArray[np.floating[Any]]
+IntArray = NDArray[np.integer[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _PIECES = 128
@@ -37,8 +38,8 @@ _PARTS = 4
 _SHORTEST = 1e-12
 _MOST_PIECES = 1_000_000
 _SURE = 0.9
-# A step of the phase that can only have gone the short way round.
-_CLEAR = 1.0
+# Tangent of a step of the phase that can only have gone the short way round.
+_CLEAR = math.tan(1.0)
 _COMPLEX_FACTOR = math.sqrt(0.75)
 
 
@@ -51,7 +52,7 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
     """
     if any(t.real == 0.0 for term in terms for t in term.time_constants):
         raise TuningError("a process with undamped poles other than at s = 0 is not supported")
-    limits = [_at_infinity(t) for t in terms]
+    limits = [at_infinity(t) for t in terms]
     at_once = sum(g for g, t in zip(limits, terms, strict=True) if t.dead_time == 0.0)
     later = sum(abs(g) for g, t in zip(limits, terms, strict=True) if t.dead_time > 0.0)
     if not later < abs(1.0 + at_once):
@@ -61,30 +62,42 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
     return math.inf if turns is None else poles - round(turns / math.pi)
 
 
-def winding(terms: Sequence[TransferFunction], grid: FloatArray) -> int | None:
-    """Return the same count from values on a grid, or None where they leave it open.
+def winding(
+    values: ComplexArray, w: FloatArray, poles: IntArray, integrators: IntArray, limits: FloatArray
+) -> FloatArray:
+    """Return the same count for many loops from values on a grid, NaN where they leave it open.
 
     Much faster than :func:`closed_loop_unstable_poles`, for loops that are known to be far from
     zero on a grid that is known to be fine, such as those of models like one another.
 
-    :param terms: the L_k, proper.
-    :param grid: rad/s, shape (n,), increasing, from where all but integrators has come to rest
-        to where the L_k have vanished.
+    :param values: ``1 + L``, shape (n, m).
+    :param w: rad/s, shape (n,), increasing, from where all but integrators has come to rest to
+        where the loops have vanished.
+    :param poles: how many each L has in the right half plane, shape (m,).
+    :param integrators: of each L, shape (m,).
+    :param limits: of each L for s -> infinity; 0 where there is a dead time, shape (m,).
+    :return: shape (m,).
     """
-    limit = 1.0 + sum(_at_infinity(t) for t in terms if t.dead_time == 0.0)
-    n = max(term.integrators for term in terms)
-    a = 1.0 / math.sqrt(grid[0] * grid[-1])
-    s = 1j * np.concatenate(([1e-6 * grid[0]], grid))
-    values = (1.0 + sum(t(s) for t in terms)) * (a * s / (1.0 + a * s)) ** n
-    values = np.append(values, limit)
-    turns = np.angle(values[1:] / values[:-1])
-    if not bool(np.all(np.abs(turns) < _CLEAR)):
-        return None
-    poles = sum(1 for t in _in_common(terms) if t.real < 0.0)
-    return poles - round(float(turns.sum()) / math.pi)
+    s = 1j * w / math.sqrt(w[1] * w[-1])
+    risen = s / (1.0 + s)
+    bounded = np.empty((w.size + 1, poles.size), dtype=np.complex128)
+    bounded[-1] = 1.0 + limits
+    for n in np.unique(integrators):
+        of = integrators == n
+        bounded[:-1, of] = values[:, of] * (risen**n)[:, None]
+    steps = bounded[1:] * bounded[:-1].conj()
+    clear = np.all(np.abs(steps.imag) < _CLEAR * steps.real, axis=0)
+    # With steps so short a turn is a passage of the negative real axis from above.
+    above, left = bounded.imag >= 0.0, bounded.real < 0.0
+    falls = np.sum(left[1:] & above[:-1] & ~above[1:], axis=0)
+    rises = np.sum(left[1:] & ~above[:-1] & above[1:], axis=0)
+    begins, ends = (np.arctan2(v.imag + 0.0, v.real) for v in (bounded[0], bounded[-1]))
+    turns = np.rint((ends - begins) / math.pi + 2.0 * (falls - rises))
+    return np.where(clear, poles - turns, math.nan)
 
 
-def _at_infinity(term: TransferFunction) -> float:
+def at_infinity(term: TransferFunction) -> float:
+    """Return the limit for s -> infinity, of the magnitude where there is a dead time."""
     excess = len(term.zeros) - len(term.time_constants) - term.integrators
     if excess < 0:
         return 0.0

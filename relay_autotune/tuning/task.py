@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
+from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.ultimate import UltimatePoint
 
 CONTROLLERS = ("auto", "pi", "pid")
@@ -127,3 +129,8 @@ class DesignTask:
         :param model: the process, or one of those around it.
         """
         return replace(model, dead_time=model.dead_time + self.options.added_delay)
+
+    @cached_property
+    def around(self) -> ModelSet:
+        """The models within the uncertainty, with the dead time that the loop adds to them."""
+        return ModelSet([self.in_loop(model) for model in self.models])

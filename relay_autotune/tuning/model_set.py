@@ -1,0 +1,81 @@
+"""Frequency responses of many models at once."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.models import TransferFunction
+
+FloatArray = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+_Constants = Sequence[tuple[complex, ...]]
+
+
+class ModelSet:
+    """Models like one another, as those within an uncertainty are.
+
+    :param models: m of them, at least one.
+    :ivar integrators: of each model, shape (m,).
+    :ivar unstable_poles: how many each has in the right half plane, shape (m,).
+    """
+
+    def __init__(self, models: Sequence[TransferFunction]) -> None:
+        self.models = tuple(models)
+        self.integrators = np.array([m.integrators for m in self.models])
+        self.unstable_poles = np.array(
+            [sum(t.real < 0.0 for t in m.time_constants) for m in self.models]
+        )
+        alike = defaultdict(list)
+        for k, model in enumerate(self.models):
+            alike[len(model.zeros), len(model.time_constants), model.integrators].append(k)
+        self._groups = [(integrators, np.array(of)) for (_, _, integrators), of in alike.items()]
+        self._known: FloatArray = np.empty(0)
+        self._responses: ComplexArray = np.empty((0, len(self.models)), dtype=np.complex128)
+
+    def __call__(self, frequency: FloatArray) -> ComplexArray:
+        """Return the response of each model at each frequency.
+
+        Those at the frequencies of the first call are kept, since grids for the loops of one
+        process have most of their frequencies in common.
+
+        :param frequency: rad/s, shape (n,), increasing.
+        :return: y/u, shape (n, m).
+        """
+        if self._known.size == 0:
+            self._known, self._responses = frequency, self._evaluate(frequency)
+            return self._responses
+        place = np.minimum(np.searchsorted(self._known, frequency), self._known.size - 1)
+        found = self._responses[place]
+        new = self._known[place] != frequency
+        found[new] = self._evaluate(frequency[new])
+        return found
+
+    def _evaluate(self, frequency: FloatArray) -> ComplexArray:
+        w = frequency[:, None]
+        s = 1j * w
+        found = np.empty((frequency.size, len(self.models)), dtype=np.complex128)
+        for integrators, of in self._groups:
+            models = [self.models[k] for k in of]
+            lag = np.array([m.dead_time for m in models]) * w
+            gain = np.array([m.gain for m in models])
+            values = np.empty(lag.shape, dtype=np.complex128)
+            # Much faster than a complex exponential.
+            values.real, values.imag = gain * np.cos(lag), -gain * np.sin(lag)
+            if integrators:
+                values *= s ** float(-integrators)
+            for zero in _columns([m.zeros for m in models]):
+                values *= 1.0 + zero * s
+            for constant in _columns([m.time_constants for m in models]):
+                values /= 1.0 + constant * s
+            found[:, of] = values
+        return found
+
+
+def _columns(constants: _Constants) -> ComplexArray:
+    """Return the first constant of each model, then the second, and so on, shape (p, m)."""
+    return np.array(constants, dtype=np.complex128).T
