@@ -10,6 +10,7 @@ import pytest
 from relay_autotune.identification.fit.factors import Denominator, Lag, Quadratic, UnstableLag
 from relay_autotune.identification.fit.lags import FOPDT
 from relay_autotune.identification.fit.partial_fractions import partial_fractions
+from relay_autotune.identification.fit.plausibility import is_unseen
 from relay_autotune.identification.fit.rational import free_motion, responses
 from relay_autotune.identification.fit.structures import lag_n
 from relay_autotune.identification.known import Known
@@ -194,3 +195,19 @@ def test_no_rival_rings_faster_than_the_samples_show(seed):
         for constant in candidate.time_constants:
             assert constant.imag == 0.0 or 2.0 * np.pi * abs(constant) >= 4.0 * period
     assert found.ultimate_gain_std < 0.03 * found.ultimate_gain
+
+
+@pytest.mark.parametrize(
+    ("model", "unseen"),
+    [
+        (TransferFunction.fopdt(1.0, 0.3, 0.0), False),
+        (TransferFunction(1.0, (), (), 0, 0.3), False),
+        (TransferFunction.fopdt(1.0, 0.03, 0.01), True),
+        (TransferFunction(1.0, (20.0,), (5.0, 5.0)), False),
+        (TransferFunction(1.0, (2e5,), (5.0, 5.0)), True),
+        (TransferFunction(1.0, (), (0.02j, -0.02j)), True),
+        (TransferFunction(1.0, (), (), integrators=1), False),
+    ],
+)
+def test_a_fit_that_lives_between_the_samples_is_none(model, unseen):
+    assert is_unseen(model, interval=0.1, length=100.0) is unseen

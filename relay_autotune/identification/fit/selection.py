@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.fit import structures as known_structures
 from relay_autotune.identification.fit.lags import FOPDT
+from relay_autotune.identification.fit.plausibility import is_unseen
 from relay_autotune.identification.fit.residuals import autocorrelation
 from relay_autotune.identification.fit.separable import (
     Problem,
@@ -48,8 +49,6 @@ _EXACT = 1e-7
 _ENOUGH = 4e-3
 # Drift and initial state belong to a fit only on strong evidence, since they blur the gain.
 _EVIDENCE = 6.0
-# Samples that an oscillation of the process must have in each of its periods.
-_SAMPLES_A_SWING = 4.0
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
 # With a mean square so many times the least one, a structure has no support worth telling.
@@ -128,26 +127,19 @@ class Selection:
             reading = problem.structure.read(state.theta, state.coefficients)
         if reading is None or not bool(np.all(np.isfinite(reading.values))):
             return None
-        if reading.values[0] == 0.0 or (
-            self._sign and reading.build(reading.values).process_sign != self._sign
-        ):
+        if reading.values[0] == 0.0:
             return None
-        if self._rings_unseen(reading):
+        model = reading.build(reading.values)
+        if self._sign and model.process_sign != self._sign:
+            return None
+        shortest, _ = time_scales(self._problem)
+        time = self._problem.time
+        if is_unseen(model, shortest, float(time[-1] - time[0])):
             return None
         criterion = information_criterion(
             state.cost, problem.time.size, state.parameters, self._floor
         )
         return Candidate(problem, state, reading, criterion)
-
-    def _rings_unseen(self, reading: Reading) -> bool:
-        """Return whether a fit rings faster than the samples show.
-
-        Noise alone asks for such a resonance, of any height, and it would bound every gain.
-        """
-        shortest, _ = time_scales(self._problem)
-        least = _SAMPLES_A_SWING * shortest / (2.0 * math.pi)
-        constants = reading.build(reading.values).time_constants
-        return any(c.imag != 0.0 and abs(c) < least for c in constants)
 
     def with_nuisances(self, found: Candidate) -> Candidate:
         """Add drift and a free initial state to a fit where the data ask for them.
