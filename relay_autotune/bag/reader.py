@@ -8,6 +8,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.experiments import interrupted_experiment, recorded_experiments
 from relay_autotune.bag.fields import split_name
@@ -190,8 +192,15 @@ def _experiments(record: Record, wanted: Selection) -> tuple[list[Record], list[
         return [record], []
     stretches = find_experiments(record)
     if not stretches:
-        note = "no relay phase, step, pulse or closed loop stands out; all of it is used"
-        return [record], [note]
+        if np.ptp(record.measurement) == 0.0 or np.ptp(record.command) == 0.0:
+            # Why nothing can be told from it is said where that is tried.
+            return [record], []
+        raise BagError(
+            "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
+            "a controller's command follows the measurement, and read as an answer to it would "
+            "give a wrong model; record an experiment, or name a part to be used all the same "
+            "with --start and --end"
+        )
     records = [cut(record, stretch.first, stretch.last + 1) for stretch in stretches]
     if len(stretches) == 1 and len(records[0]) == len(record):
         return records, []

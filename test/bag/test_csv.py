@@ -90,3 +90,15 @@ def test_a_file_that_is_not_there_or_no_text(tmp_path):
     (tmp_path / "c.csv").mkdir()
     with pytest.raises(BagError, match="Is a directory"):
         read_experiments(tmp_path / "c.csv")
+
+
+def test_a_controller_at_rest_is_refused_unless_a_part_is_named(tmp_path):
+    rng = np.random.default_rng(1)
+    lines = ["time,measurement,command"]
+    for k, y in enumerate(0.02 * rng.standard_normal(600)):
+        lines.append(f"{0.5 * k},{y},{-0.6 * y}")
+    path = write(tmp_path / "a.csv", "\n".join(lines))
+    with pytest.raises(BagError, match=r"stands out of the noise.*--start"):
+        read_experiments(path)
+    (record,) = read_experiments(path, Selection(start=0.0)).experiments
+    assert len(record) == 600
