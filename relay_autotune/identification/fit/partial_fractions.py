@@ -196,7 +196,9 @@ def _recursions(
 
 def _recursion(p: Any, changes: FloatArray, decay: Numbers, drive: Numbers) -> Numbers:
     """Return ``x_k = exp(p (t_k - t_(k-1))) x_(k-1) + drive_k``, shape (m,)."""
-    if changes.size <= _FEW_CHANGES:
+    span = abs(p.real) * abs(float(changes[-1] - changes[0])) if changes.size else 0.0
+    if changes.size <= _FEW_CHANGES * (1.0 + span / _BLOCK):
+        # Fewer to a block than what a block costs, as with a fast pole and a busy input.
         x = drive.tolist()
         for k, a in enumerate(decay.tolist(), start=1):
             x[k] += a * x[k - 1]
