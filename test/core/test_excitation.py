@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from relay_autotune.autotune import analyse
 from relay_autotune.excitation import find_experiments
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
@@ -113,6 +114,13 @@ def test_a_staircase_under_a_controller():
 
 def test_a_loop_at_rest_is_no_experiment():
     assert spans(controlled(lambda t: 0.0)) == []
+
+
+def test_a_loop_at_rest_gives_no_gains_even_where_it_is_asked_to():
+    """Its command follows the noise: read as its cause, that is a model of the controller."""
+    found = analyse(controlled(lambda t: 0.0, samples=800))
+    assert not found.gains
+    assert found.reason
 
 
 def test_a_command_that_moves_nothing_is_no_experiment():
