@@ -5,8 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from relay_autotune.identification.combinations import point_of
+from relay_autotune.identification.intervals import is_logarithmic
 from relay_autotune.identification.result import Identification, Rival, ultimate_std
+
+FloatArray = NDArray[np.float64]
+
+# How far a value of a rival may stray for the first order to stand for it: of a logarithm, and
+# of a dead time or a zero, in radians at the ultimate frequency.
+_FARTHEST_RATIO = 2.0
+_FARTHEST_PHASE = 1.0
 
 
 def averaged_point(
@@ -35,7 +46,8 @@ def averaged_point(
         point = point_of(rival.model) if rival.parameters else (math.nan, math.nan)
         if not math.isfinite(point[0]) or point[0] * own[0] < 0.0:
             continue
-        theirs = ultimate_std(rival.build, rival.values, rival.covariance, *point)
+        covariance = _within_reach(rival, point[1])
+        theirs = ultimate_std(rival.build, rival.values, covariance, *point)
         if not all(math.isfinite(s) for s in theirs):
             continue
         total += rival.support
@@ -44,3 +56,26 @@ def averaged_point(
     if not total > 0.0:
         return stds
     return math.sqrt(sums[0] / total), math.sqrt(sums[1] / total)
+
+
+def _within_reach(rival: Rival, frequency: float) -> FloatArray:
+    """Return the covariance of a rival's values as far as the first order goes.
+
+    A lag or a zero far below the sampling period can hardly be told from dead time. To first
+    order the two may then differ by more than the whole record, with a standard deviation S
+    where the value is next to nothing; K_u, a curved function of both, would inherit that. A
+    value is therefore taken to be known beforehand to within a limit L, many times what the data
+    leave of one that they show:  ``(S^-1 + L^-1)^-1 = L (S + L)^-1 S``.
+
+    :param rival: with a covariance.
+    :param frequency: w_u [rad/s].
+    """
+    phase = _FARTHEST_PHASE / frequency
+    limits = [
+        _FARTHEST_RATIO * abs(value) if is_logarithmic(name) else phase
+        for name, value in zip(rival.parameters, rival.values, strict=True)
+    ]
+    size = np.maximum(np.array(limits), 1e-12 * phase)
+    scaled = rival.covariance / np.outer(size, size)
+    kept = np.linalg.solve(scaled + np.eye(size.size), scaled)
+    return np.asarray(0.5 * (kept + kept.T) * np.outer(size, size))
