@@ -213,6 +213,42 @@ def test_the_foxglove_layout_shows_each_of_its_panels_once() -> None:
     assert sorted(leaves(layout)) == sorted(panels())
 
 
+# What each panel knows, from the sources of Lichtblick, whose panels are those of Foxglove Studio.
+TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
+PANEL_KEYS = {
+    "Plot": {
+        *("paths", "showLegend", "legendDisplay", "showPlotValuesInLegend", "showXAxisLabels"),
+        *("showYAxisLabels", "isSynced", "xAxisVal", "xAxisPath", "sidebarDimension"),
+    },
+    "RawMessages": {
+        *("topicPath", "diffEnabled", "diffMethod", "diffTopicPath", "showFullMessageForDiff"),
+        "expansion",
+    },
+    "DiagnosticSummary": {
+        *("minLevel", "pinnedIds", "hardwareIdFilter", "topicToRender", "sortByLevel"),
+    },
+    "RosOut": {"searchTerms", "minLogLevel"},
+    "CallService": {
+        *("serviceName", "requestPayload", "layout", "buttonText", "buttonTooltip"),
+        "buttonColor",
+    },
+}
+PATH_KEYS = {"value", "label", "enabled", "color", "timestampMethod", "showLine"}
+
+
+def test_the_foxglove_layout_has_what_its_program_demands() -> None:
+    layout = json.loads((ROOT / "config/foxglove.json").read_text())
+    # An import without one of these is refused.
+    assert {"configById", "globalVariables", "playbackConfig", "layout"} <= set(layout)
+    for name, panel in panels().items():
+        assert set(panel) - TITLES <= PANEL_KEYS[name.partition("!")[0]], name
+        assert len({panel.get(title) for title in TITLES}) == 1, name
+        for path in panel.get("paths", []):
+            assert set(path) == PATH_KEYS
+        if panel.get("xAxisVal") == "currentCustom":
+            assert panel["xAxisPath"]["enabled"]
+
+
 def test_topics_and_fields_of_the_foxglove_layout_exist() -> None:
     plotted = 0
     for name, panel in panels().items():
@@ -249,7 +285,15 @@ def test_topics_and_fields_of_the_plotjuggler_layout_exist() -> None:
         topics.add(f"/{topic}")
     for selected in root.iter("selected_topics"):
         assert set(selected.attrib["value"].split(";")) == topics
+    # Others than these are passed over in silence, and a plot without its element is empty.
+    for plot in root.iter("plot"):
+        assert plot.attrib["mode"] in ("TimeSeries", "XYPlot")
+        assert plot.attrib["style"] in ("Lines", "LinesAndDots", "Dots", "Sticks", "Steps")
+    assert all(area.find("plot") is not None for area in root.iter("DockArea"))
+    # What streams in is kept so long [s]; a tune takes minutes, and the default is 30 s.
+    assert 300 <= int(root.find("streaming_buffer_size").attrib["value"]) < 999
     for splitter in root.iter("DockSplitter"):
+        assert splitter.attrib["orientation"] in ("-", "|")
         parts = [part for part in splitter if part.tag in ("DockArea", "DockSplitter")]
         assert int(splitter.attrib["count"]) == len(parts)
         assert len(splitter.attrib["sizes"].split(";")) == len(parts)
