@@ -31,6 +31,8 @@ NOISE_STD = 0.05
 SEED = 1
 BASELINE, REST = 2.0, 40.0
 AMPLITUDE = 1.0
+# So many simulated seconds in a second, which leaves a fit the time of a cycle.
+SPEED = 40.0
 PAGE_TITLE = "Relay test of a simulated process"
 
 _DEADLINE = 50.0
@@ -81,6 +83,7 @@ def _run(output: Path, domain: int) -> tuple[Path, Any]:
     plant = {
         "mode": "lockstep",
         "sample_period": PERIOD,
+        "lockstep_speed": SPEED,
         "structure": TRUTH.structure,
         "gain": TRUTH.gain,
         "time_constants": f"[{TRUTH.time_constants[0].real}]",
@@ -97,6 +100,7 @@ def _run(output: Path, domain: int) -> tuple[Path, Any]:
     }
     print("The process, which only plant_node knows:")
     print(f"  {process_text(TRUTH)}, noise {NOISE_STD} y, sampled every {PERIOD} s, in lockstep")
+    print(f"  at {SPEED:g} times real time")
     print("Three processes in a ROS domain of their own:")
     started: list[_Started] = []
     try:
@@ -174,6 +178,7 @@ def _show_cycles(onlooker: Any) -> None:
     while not onlooker.experiments or len(shown) < len(onlooker.cycles):
         onlooker.wait(lambda: onlooker.experiments or len(onlooker.cycles) > len(shown))
         for cycle in onlooker.cycles[len(shown) :]:
+            _wait_for_fit(onlooker, cycle)
             fits = [m for m in onlooker.models if not m.final]
             so_far = f"{fits[-1].ultimate_gain:.3f}" if fits else ""
             if fits and math.isfinite(fits[-1].ultimate_gain_std):
@@ -187,6 +192,23 @@ def _show_cycles(onlooker: Any) -> None:
             shown.append(cycle)
     end = onlooker.experiments[-1]
     print(f"  {end.reason}")
+
+
+def _wait_for_fit(onlooker: Any, cycle: Any) -> None:
+    """Wait for a model that knows a cycle, or for the next cycle, or the end."""
+    begin = _seconds(cycle.header.stamp)
+    end = begin + cycle.time[-1]
+    onlooker.wait(
+        lambda: (
+            onlooker.experiments
+            or onlooker.cycles[-1].index > cycle.index
+            or any(_seconds(m.header.stamp) >= end - PERIOD for m in onlooker.models)
+        )
+    )
+
+
+def _seconds(stamp: Any) -> float:
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def _finish(output: Path, live: Any) -> int:

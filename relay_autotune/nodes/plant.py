@@ -110,6 +110,14 @@ PARAMETERS = (
         choices=MODES,
     ),
     NodeParameter(
+        "lockstep_speed",
+        0.0,
+        "",
+        "Most simulated seconds in a second, in lockstep; 0: as many as the commands come.",
+        0.0,
+        1e4,
+    ),
+    NodeParameter(
         "speed", 1.0, "", "Simulated seconds in a second, in the mode clock.", 1e-3, 1e4
     ),
 )
@@ -264,6 +272,9 @@ class PlantNode(ServedNode):
         if values["mode"] == "lockstep":
             self.favoured = self._command
             self._waiting = True
+            speed = values["lockstep_speed"]
+            self._pause = self._period / speed if speed > 0.0 else 0.0
+            self._next = 0.0
             self._value = self._process.measure(0.0)
             self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=self._steady)
         elif values["mode"] == "clock":
@@ -338,6 +349,10 @@ class PlantNode(ServedNode):
         if self._waiting:
             self._waiting = False
             time.sleep(QUIET_AFTER_GO)
+        if self._pause:
+            now = time.monotonic()
+            time.sleep(max(self._next - now, 0.0))
+            self._next = max(self._next, now) + self._pause
         self._samples += 1
         self._value = self._process.measure(self._samples * self._period)
         self._publish(self._value)
