@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import replace
 
-from relay_autotune.cycles import next_cycle
+from relay_autotune.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.experiment.levels import Levels, clear_swing
 from relay_autotune.experiment.no_return import is_growing, why_no_return
 from relay_autotune.experiment.relay_law import Patience, Relay
@@ -34,6 +34,14 @@ _SHIFT = 0.7
 
 # Once a whole cycle was seen, this part of the patience is enough.
 _PATIENCE_IN_CYCLES = 0.4
+
+# What is so many times as far away as the oscillation went has run away, whatever the patience;
+# for so many samples, since a sensor has spikes.
+_RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
+
+# An oscillation shows in the samples' standard deviation, which must be so many times that of the
+# noise; a relay without a process switches on noise alone, too, and its cycles agree at last.
+_ABOVE_NOISE = 1.5
 
 _SIGNS = {1: "positive", -1: "negative"}
 
@@ -103,6 +111,8 @@ class Oscillation:
         self.switches = 0
         """Number of switches so far."""
         self._shifts = 0
+        self._furthest = math.inf
+        self._away = 0
         self._begin()
 
     @property
@@ -126,12 +136,18 @@ class Oscillation:
             self._on_the_way.append((due, relay.is_high, begins))
         elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
+        elif self._runs_away(y):
+            self._end(Outcome.FAILED, self._why_lost(t, y))
         waiting = self._on_the_way
         while waiting and waiting[0][0] <= t + _ROUNDING * self._samples.interval:
             _, self._is_high, begins = waiting.popleft()
             if begins:
                 self._begin_cycle()
         return self.command
+
+    def _runs_away(self, y: float) -> bool:
+        self._away = self._away + 1 if abs(y - self._setpoint) > self._furthest else 0
+        return self._away >= _RUNAWAY_SAMPLES
 
     def _begin(self) -> None:
         t, y = self._samples.time[-1], self._samples.measurement[-1]
@@ -177,21 +193,21 @@ class Oscillation:
                 f"unstable process of which the relay cannot get hold; give a larger amplitude",
             )
         elif self._until_converged and cycle.converged:
-            self._end(
-                Outcome.COMPLETED,
+            self._complete(
                 f"{len(self.cycles)} cycles, of which the last {p.min_cycles} agree within "
                 f"{p.cycle_tolerance:g} of half period and amplitude, noise and sample interval "
                 f"allowed for",
             )
         elif len(self.cycles) >= p.max_cycles:
-            self._end(
-                Outcome.COMPLETED,
+            self._complete(
                 f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} do not agree "
                 f"within {p.cycle_tolerance:g} of half period and amplitude"
                 if self._until_converged
                 else f"max_cycles, {p.max_cycles}, reached",
             )
         else:
+            swing = max(c.peak_max - c.peak_min for c in self.cycles)
+            self._furthest = 0.5 * _RUNAWAY * swing
             self._bear_load()
 
     def _has_grown(self) -> bool:
@@ -255,6 +271,21 @@ class Oscillation:
 
     # The end.
 
+    def _complete(self, reason: str) -> None:
+        """Complete, unless the last cycles cannot be told from noise."""
+        last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
+        spread = float(self._samples.columns(last_cycles[0], last_cycles[-1])[1].std())
+        noise = self._rest.noise_std
+        if spread >= _ABOVE_NOISE * noise:
+            self._end(Outcome.COMPLETED, reason)
+            return
+        self._end(
+            Outcome.FAILED,
+            f"no oscillation after {count_cycles(self.cycles)}, only noise: the measurement's "
+            f"standard deviation is {spread:.3g}, that of its noise at rest {noise:.3g}; give a "
+            f"larger amplitude, or check that the actuator follows its command",
+        )
+
     def _end(self, outcome: Outcome, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self.cycles)
         if outcome is Outcome.COMPLETED and disturbed:
@@ -289,16 +320,18 @@ class Oscillation:
                 # What it needs now is half of the patience that is used up.
                 self._patient_from = t - 0.5 * self._limit
                 return
+        self._end(Outcome.FAILED, self._why_lost(t, y))
+
+    def _why_lost(self, t: float, y: float) -> str:
         stay = [k for k, s in enumerate(self._samples.time) if s >= self._relay.since]
         time, measurement, _ = self._samples.columns(stay[0], len(self._samples))
         towards = self.sign if self._relay.is_high else -self.sign
         why = why_no_return(time, towards * measurement, self._rest.noise_std)
-        self._end(
-            Outcome.FAILED,
+        return (
             f"no oscillation after {count_cycles(self.cycles)}: the measurement is {y:g} and did "
             f"not come back to {self._setpoint:g} -/+ {self._hysteresis:g} within "
             f"{t - self._relay.since:.3g} s; {why} (process_gain_sign was taken as "
-            f"{_SIGNS[self.sign]})",
+            f"{_SIGNS[self.sign]})"
         )
 
 

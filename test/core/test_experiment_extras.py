@@ -215,6 +215,44 @@ def test_an_unstable_process_that_the_relay_cannot_hold_fails():
     assert tune.record().command[-1] == 0.0
 
 
+@pytest.mark.parametrize("found", [False, True])
+def test_cycles_of_a_relay_on_noise_alone_do_not_complete_it(found):
+    tune = searching() if found else experiment(process_gain_sign=1)
+    rng = np.random.default_rng(3)
+    model = TransferFunction.fopdt(1.0, 1.0, 0.5)
+    plant, period, command = Plant(model), 0.05, 0.0
+    for k in range(200_000):
+        # The actuator sticks, once the kick was answered.
+        acting = command if tune.switches == 0 else 0.0
+        y = plant.advance(period * k, acting) + 0.02 * rng.standard_normal()
+        command = tune.step(period * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.FAILED, tune.reason
+    assert "noise" in tune.reason or "did not come back" in tune.reason
+
+
+def test_what_runs_away_is_given_up_long_before_the_patience_is_over():
+    model = TransferFunction.unstable_fopdt(1.0, 1.0, 0.2)
+    tune = experiment(process_gain_sign=1)
+    plant, period, command = Plant(model), 0.02, 0.0
+    stuck = None
+    for k in range(20_000):
+        y = plant.advance(period * k, command if stuck is None else stuck)
+        command = tune.step(period * k, y)
+        if tune.cycle_count == 2 and stuck is None:
+            stuck = command
+            # A sensor's spike is no runaway.
+            tune.step(period * (k + 0.5), 1e3)
+            assert not tune.finished
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.FAILED
+    swing = max(c.peak_max - c.peak_min for c in tune.cycles)
+    assert abs(y - tune.settings.setpoint) < 20.0 * swing
+    assert "moved away" in tune.reason
+
+
 # What is commanded after the end.
 
 
