@@ -1,311 +1,223 @@
 """Experiments on random processes with noise, disturbances and faults, without DDS.
 
-    python3 benchmarks/simulated_experiments.py [--experiments N] [--quick]
+    python3 benchmarks/simulated_experiments.py [--seeds A:B] [--file FILE] [--summary] [--quick]
 
-Each draws a process of a known structure, a sample period, a noise, and what happens: nothing,
-a disturbance (load, drift, coarse sensor, sticking or limited valve, lost samples), or a fault
-(NaN, silence, a frozen sensor, a limit, a clock that goes backwards, a wrong sign, an actuator
-that is stuck, an abort). The silent sensor's watchdog is the node's and is played here.
-The exit status is 1 if a target is missed.
+Each draws a process of a known structure, a sample period, a noise, and what happens: nothing, a
+disturbance (load, drift, coarse sensor, sticking valve, lost samples), or a fault (NaN, silence, a
+frozen sensor, a limit, a clock that goes backwards, a wrong sign, an actuator that is stuck, an
+abort). Gains are those of the default method and rule. With --file each outcome is written to a
+line of that file, and a run that was broken off is gone on with; --summary only shows what the
+file holds. A file holds outcomes of one state of the code. The exit status is 1 if a target is
+missed.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import math
 import sys
 import time as wall
-from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TextIO
 
-from markdown import table
-
-from relay_autotune import threads  # noqa: F401  before numpy
+from random_experiments import Experiment, with_delay
 
 # isort: split
-import numpy as np
+from simulated_summary import summary
 
-from relay_autotune.actuator import Actuator
-from relay_autotune.autotune import analyse
-from relay_autotune.cycles import cycles_of
-from relay_autotune.disturbance import without_disturbance
-from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Identification, identify
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
-from relay_autotune.relay import ExperimentParameters, RelayExperiment, SafePolicy
-from relay_autotune.simulation import exact_limit_cycle
-from relay_autotune.tuning import DesignOptions, DesignTask, Gains, design, ensemble
-from relay_autotune.tuning.analysis import is_stable
+import relay_autotune
+from relay_autotune.autotune import Analysis, analyse
+from relay_autotune.identification import Known
+from relay_autotune.record import Outcome
+from relay_autotune.tuning import DesignOptions, Gains
+from relay_autotune.tuning.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.ultimate import ultimate_point
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 EXPERIMENTS = 10_000
-SAFE = -0.125
-MOST_REFUSED = 5.0
-PER_CYCLE = (40, 200)
-LARGEST_RATIO = 0.2
-SAMPLES = 30_000
-
-NOTHING = ("undisturbed",)
-DISTURBANCES = ("load", "drift", "coarse sensor", "sticking valve", "lost samples")
-FAULTS = (
-    "not a number",
-    "silent sensor",
-    "frozen sensor",
-    "measurement limit",
-    "deviation",
-    "time backwards",
-    "wrong sign",
-    "stuck actuator",
-    "abort",
-    "time over",
-)
+QUICK = 4
+NORMAL = 1.96
 
 
 @dataclass
-class Counts:
-    """What came of the experiments with one thing that happened."""
+class Result:
+    """What came of one experiment.
 
-    run: int = 0
-    completed: int = 0
-    ended: int = 0
-    refused: int = 0
-    gains_without_completion: int = 0
-    late: int = 0
-    unstable: int = 0
-    no_cause: int = 0
-
-
-def random_process(rng: np.random.Generator) -> TransferFunction:
-    """Return a process of a known structure, its slowest time constant about 1 s."""
-    kind = rng.integers(6)
-    gain = float(np.exp(rng.uniform(-2.0, 2.0))) * (1.0 if rng.uniform() < 0.7 else -1.0)
-    tau = float(np.exp(rng.uniform(-0.7, 0.7)))
-    dead = float(np.exp(rng.uniform(math.log(0.05), math.log(3.0))))
-    build = TransferFunction.from_structure
-    if kind == 0:
-        return build("fopdt", gain=gain, time_constants=[tau], dead_time=dead)
-    if kind == 1:
-        return build(
-            "sopdt", gain=gain, time_constants=[tau, tau * rng.uniform(0.1, 0.9)], dead_time=dead
-        )
-    if kind == 2:
-        return build(
-            "lag_n", gain=gain, time_constants=[tau], order=int(rng.integers(2, 6)), dead_time=dead
-        )
-    if kind == 3:
-        lags = [tau, tau * rng.uniform(0.2, 0.8), tau * rng.uniform(0.05, 0.2)]
-        return build("three_lags", gain=gain, time_constants=lags, dead_time=dead)
-    if kind == 4:
-        return build("ipdt", gain=gain, dead_time=dead)
-    return build("integrator_lag", gain=gain, time_constants=[tau], dead_time=dead)
-
-
-class Experiment:
-    """One experiment and what happens in it.
-
-    :param happening: one of the names above.
-    :param seed: of everything random.
+    :param seed: of the experiment.
+    :param state: of the code.
+    :param happening: what happened in it.
+    :param structure: of the true process.
+    :param ratio: noise-to-signal ratio.
+    :param per_cycle: samples in a cycle.
+    :param finds_amplitude: True if the amplitude was not given.
+    :param outcome: of the experiment.
+    :param cycles: whole cycles.
+    :param delay: samples from the cause of the end to the safe command; -1: there was no cause.
+    :param late: see :class:`Experiment`.
+    :param unsafe: see :class:`Experiment`.
+    :param gains: whether there are gains.
+    :param reason: why it did not complete, or why there are no gains.
+    :param found: structure of the model.
+    :param stable: whether the loop on the true process is stable.
+    :param ms: its Ms with the loop's own delay; NaN: none.
+    :param asked: what the gains' reason says of Ms; NaN: none.
+    :param gain_error: relative error of K_u; NaN: no model.
+    :param gain_std: its standard deviation, relative.
+    :param frequency_error: relative error of w_u.
+    :param frequency_std: its standard deviation, relative.
+    :param seconds: what it took.
     """
 
-    def __init__(self, happening: str, seed: int) -> None:
-        rng = self.rng = np.random.default_rng((seed, 7))
-        self.happening = happening
-        self.model = random_process(rng)
-        settings = RelaySettings(0.0, 0.0, 1.0, reverse_acting=self.model.gain < 0.0)
-        cycle = exact_limit_cycle(self.model, settings, tolerance=1e-4)
-        self.period = cycle.period / int(rng.integers(*PER_CYCLE))
-        self.swing = 0.5 * (cycle.peak_max - cycle.peak_min)
-        # N2 of Wang et al.: mean absolute noise over mean absolute signal.
-        ratio = rng.uniform(0.0, LARGEST_RATIO)
-        self.noise = ratio * 0.6 * self.swing / math.sqrt(2.0 / math.pi)
-        self.kick = 60 * self.period
-        self.cause_at = math.inf
-        acting: dict[str, float] = {"noise_std": self.noise}
-        begin = 75 * self.period + 2.0 * cycle.period
-        end = begin + 2.0 * cycle.period
-        self.moment = float(rng.uniform(60 * self.period if happening in FAULTS else begin, end))
-        if happening == "load":
-            acting |= {"load_time": self.moment, "load_size": float(rng.uniform(-0.5, 0.5))}
-        if happening == "drift":
-            acting["drift"] = float(rng.uniform(-0.1, 0.1)) * self.swing / cycle.period
-        if happening == "coarse sensor":
-            acting["quantisation"] = float(rng.uniform(0.02, 0.25)) * self.swing
-        band = float(rng.uniform(0.02, 0.15)) if happening == "sticking valve" else 0.0
-        self.plant = VirtualProcess(
-            self.model,
-            actuator=Actuator(0.0, stiction=band, dead_band=band),
-            disturbances=Disturbances(**acting),
-            seed=seed,
-        )
-        given: dict[str, float | int] = {}
-        if happening == "measurement limit":
-            given = {
-                "measurement_min": -0.5 * self.swing - 3 * self.noise,
-                "measurement_max": 0.5 * self.swing + 3 * self.noise,
-            }
-        if happening == "deviation":
-            given = {"max_deviation": 0.5 * self.swing + 3.0 * self.noise}
-        if happening == "wrong sign":
-            given = {"process_gain_sign": -1 if self.model.gain > 0.0 else 1}
-        if happening == "time over":
-            given = {"max_duration": self.moment}
-        self.tune = RelayExperiment(
-            ExperimentParameters(amplitude=1.0, **given),  # type: ignore[arg-type]
-            0.0,
-            policy=SafePolicy(command=SAFE),
-        )
-        self.late = False
+    seed: int
+    state: str
+    happening: str
+    structure: str
+    ratio: float
+    per_cycle: int
+    finds_amplitude: bool
+    outcome: str = ""
+    cycles: int = 0
+    delay: int = -1
+    late: bool = False
+    unsafe: bool = False
+    gains: bool = False
+    reason: str = ""
+    found: str = ""
+    stable: bool = True
+    ms: float = math.nan
+    asked: float = math.nan
+    gain_error: float = math.nan
+    gain_std: float = math.nan
+    frequency_error: float = math.nan
+    frequency_std: float = math.nan
+    seconds: float = 0.0
 
-    def run(self) -> None:
-        """Run it to its end; notes whether the safe command came within one sample."""
-        tune, plant, period = self.tune, self.plant, self.period
-        frozen = stuck = math.nan
-        happening, lost = self.happening, self.rng.uniform(0.05, 0.3)
-        for k in range(SAMPLES):
-            t = k * period
-            y = plant.measure(t)
-            now = t >= self.moment
-            if happening == "lost samples" and self.rng.uniform() < lost:
-                continue
-            if now and happening == "silent sensor":
-                # The watchdog of the node, on its steady clock.
-                command = tune.abort("no measurement", t)
-                self.late = command != SAFE
-                return
-            if now and happening == "abort":
-                self.late = tune.abort("on request", t) != SAFE
-                return
-            if now and happening == "frozen sensor":
-                frozen = y if math.isnan(frozen) else frozen
-                y = frozen
-            if now and happening == "not a number":
-                y = math.nan if self.rng.uniform() < 0.5 else math.inf
-            if now and happening == "time backwards" and k > 0:
-                t -= 1.5 * period
-            command = tune.step(t, y)
-            if tune.finished:
-                expected = 0.0 if tune.outcome is Outcome.COMPLETED else SAFE
-                self.late = command != expected
-                return
-            bad = not math.isfinite(y) or not (
-                tune.parameters.measurement_min <= y <= tune.parameters.measurement_max
-            )
-            if bad or (now and happening in ("time backwards", "time over")):
-                # The cause was there, and the tune went on.
-                self.late = True
-            if now and happening == "stuck actuator":
-                stuck = command if math.isnan(stuck) else stuck
-                command = stuck
-            plant.command(command)
+
+def state_of_code() -> str:
+    """Return a digest of the code that is run."""
+    digest = hashlib.sha256()
+    package = Path(relay_autotune.__file__).parent
+    core = [p for p in package.rglob("*.py") if not {"nodes", "cli", "bag", "report"} & {*p.parts}]
+    for path in (*sorted(core), *sorted(Path(__file__).parent.glob("*_experiments.py"))):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def run(seed: int, state: str) -> Result:
+    """Run one experiment and judge it."""
+    began = wall.perf_counter()
+    experiment = Experiment(seed)
+    experiment.run()
+    tune = experiment.tune
+    result = Result(
+        seed=seed,
+        state=state,
+        happening=experiment.happening,
+        structure=experiment.model.structure,
+        ratio=experiment.expected.ratio,
+        per_cycle=experiment.per_cycle,
+        finds_amplitude=experiment.finds_amplitude,
+        outcome=tune.outcome.name.lower(),
+        cycles=tune.cycle_count,
+        late=experiment.late,
+        unsafe=experiment.unsafe,
+        reason="" if tune.outcome is Outcome.COMPLETED else tune.reason,
+    )
+    if experiment.caused_at >= 0:
+        result.delay = experiment.ended_at - experiment.caused_at
+    if tune.outcome is Outcome.COMPLETED:
+        judge(result, experiment, analyse(tune.record(), alone=True))
+    elif tune.sample_count:
+        # What identifier_node would publish; one structure is enough to see that there is none.
+        known = Known(structure="fopdt")
+        result.gains = analyse(tune.record(), known=known, alone=True).best_gains is not None
+    result.seconds = wall.perf_counter() - began
+    return result
+
+
+def judge(result: Result, experiment: Experiment, found: Analysis) -> None:
+    """Compare what was found with the true process."""
+    model = experiment.model
+    if found.model is not None:
+        truth, it = ultimate_point(model), found.model
+        result.found = it.structure
+        if truth is not None and math.isfinite(it.ultimate_gain):
+            result.gain_error = it.ultimate_gain / truth.gain - 1.0
+            result.gain_std = abs(it.ultimate_gain_std / it.ultimate_gain)
+            result.frequency_error = it.ultimate_frequency / truth.frequency - 1.0
+            result.frequency_std = it.ultimate_frequency_std / it.ultimate_frequency
+    gains = found.best_gains
+    result.gains = gains is not None
+    result.reason = found.reason
+    if gains is None:
+        return
+    sampled = with_delay(model, found.added_delay)
+    result.stable = is_stable(gains, model) and is_stable(gains, sampled)
+    result.asked = promised_ms(gains)
+    if result.stable:
+        grid = frequencies(*gains.characteristic(sampled))
+        peak, _ = sensitivity_peaks(lambda s: gains(s) * sampled(s), grid)
+        result.ms = max(peak, 1.0)
+
+
+def promised_ms(gains: Gains) -> float:
+    """Return the bound on Ms for which gains were designed, 1.4 unless no controller keeps it."""
+    words = gains.reason.replace(",", "").split()
+    bounds = [words[k + 2] for k in range(len(words) - 2) if words[k : k + 2] == ["Ms", "<="]]
+    return float(bounds[0]) if bounds else DesignOptions().ms
+
+
+def read(file: Path) -> list[Result]:
+    """Return the outcomes that a file holds."""
+    names = {field.name for field in fields(Result)}
+    found = []
+    for line in file.read_text().splitlines():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            # The run was broken off as it wrote this line.
+            continue
+        found.append(Result(**{name: row[name] for name in names}))
+    return found
 
 
 def main() -> int:
-    """Run the experiments and print the table."""
+    """Run the experiments and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--experiments", type=int, default=EXPERIMENTS)
+    parser.add_argument(
+        "--seeds", default=f"0:{EXPERIMENTS}", metavar="A:B", help="B not included"
+    )
+    parser.add_argument("--file", type=Path, help="outcomes, a line each; gone on with")
+    parser.add_argument("--summary", action="store_true", help="only show what the file holds")
     parser.add_argument("--quick", action="store_true", help="a few experiments, never fails")
     asked = parser.parse_args()
-    total = 4 if asked.quick else asked.experiments
-    happenings = (*NOTHING * 8, *DISTURBANCES, *FAULTS)
-    counts: dict[str, Counts] = {}
-    reasons: Counter[str] = Counter()
-    began = wall.monotonic()
-    for seed in range(total):
-        happening = happenings[seed % len(happenings)]
-        count = counts.setdefault(happening, Counts())
-        experiment = Experiment(happening, seed)
-        experiment.run()
-        judge(experiment, count, reasons)
-    rows = [
-        (
-            name,
-            c.run,
-            c.completed,
-            c.ended,
-            c.refused,
-            c.gains_without_completion,
-            c.late,
-            c.unstable,
-        )
-        for name, c in sorted(counts.items(), key=lambda item: happenings.index(item[0]))
-    ]
-    headings = (
-        *("what happens", "experiments", "completed", "aborted or failed"),
-        *(
-            "completed, no gains",
-            "gains without completion",
-            "safe command late",
-            "unstable loops",
-        ),
-    )
-    print(table(headings, rows))
-    quiet = counts.get("undisturbed", Counts())
-    not_served = 100.0 * (quiet.run - quiet.completed + quiet.refused) / max(quiet.run, 1)
-    late = sum(c.late for c in counts.values())
-    unstable = sum(c.unstable for c in counts.values())
-    gains = sum(c.gains_without_completion for c in counts.values())
-    print(
-        f"\n{total} experiments in {wall.monotonic() - began:.0f} s. Gains from an experiment "
-        f"that was not completed: {gains} (target 0). Safe command later than one sample: {late} "
-        f"(target 0). Recommended loops unstable on the true process: {unstable} (target 0). "
-        f"Undisturbed experiments without gains: {not_served:.1f} % (target {MOST_REFUSED:g} %)."
-    )
-    for reason, number in reasons.most_common(8):
-        print(f"{number} x {reason}", file=sys.stderr)
-    missed = gains or late or unstable or not_served > MOST_REFUSED
-    return 1 if missed and not asked.quick else 0
-
-
-def judge(experiment: Experiment, count: Counts, reasons: Counter[str]) -> None:
-    """Count what came of an experiment."""
-    tune = experiment.tune
-    count.run += 1
-    count.late += experiment.late
-    if tune.outcome is Outcome.COMPLETED:
-        count.completed += 1
-    else:
-        count.ended += 1
-        if experiment.happening not in FAULTS:
-            reasons[
-                f"{experiment.happening}, {experiment.model.structure}: {tune.reason[:150]}"
-            ] += 1
-    if not tune.sample_count:
-        return
-    if tune.outcome is not Outcome.COMPLETED:
-        # What identifier_node would publish.
-        count.gains_without_completion += analyse(tune.record()).best_gains is not None
-        return
-    try:
-        gains, found = recommended(tune.record())
-    except (RelayAutotuneError, ValueError, np.linalg.LinAlgError) as error:
-        count.refused += 1
-        reasons[f"{experiment.model.structure} refused: {str(error)[:150]}"] += 1
-        return
-    if not is_stable(gains, experiment.model):
-        count.unstable += 1
-        true = ultimate_point(experiment.model).gain
-        reasons[
-            f"unstable: {experiment.happening}, {experiment.model.structure}, K_u {true:.3g}, "
-            f"found {found.structure} with {found.ultimate_gain:.3g}"
-        ] += 1
-
-
-def recommended(record: Record) -> tuple[Gains, Identification]:
-    """Return the gains of the rule `robust` and the model, without all other methods and rules.
-
-    :param record: a completed experiment.
-    :raises RelayAutotuneError: if there is no model, or no gains.
-    """
-
-    def fit(part: Record) -> Identification:
-        return identify(part, "waveform")
-
-    found = without_disturbance(fit(record), record, cycles_of(record), fit)
-    models = ensemble(found, rng=np.random.default_rng(0))
-    task = DesignTask(model=found.model, options=DesignOptions(), models=models)
-    return design(task, "robust"), found
+    first, last = (0, QUICK) if asked.quick else map(int, asked.seeds.split(":"))
+    done = read(asked.file) if asked.file and asked.file.exists() else []
+    if not asked.summary:
+        state = state_of_code()
+        others = {r.state for r in done} - {state}
+        if others:
+            print(
+                f"simulated_experiments: {asked.file} holds outcomes of another state of the "
+                f"code, {', '.join(sorted(others))}; this is {state}: begin another file",
+                file=sys.stderr,
+            )
+            return 2
+        known = {r.seed for r in done}
+        output: TextIO | None = asked.file.open("a") if asked.file else None
+        for seed in range(first, last):
+            if seed in known:
+                continue
+            result = run(seed, state)
+            done.append(result)
+            if output is not None:
+                output.write(json.dumps(asdict(result)) + "\n")
+                output.flush()
+    text, met = summary(done)
+    print(text)
+    return 0 if met or asked.quick else 1
 
 
 if __name__ == "__main__":
