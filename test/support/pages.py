@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,8 @@ PAGES = (*GUIDE, ROOT / "CONTRIBUTING.md", ROOT / "bags/README.md")
 
 _FENCE = re.compile(
     r"(?:^<!-- (?P<note>[^\n]*?) -->\n\n)?"
-    r"^```(?P<language>\w+)\n(?P<text>.*?)^```$",
+    # Within a list a block is indented.
+    r"^(?P<indent> *)```(?P<language>\w+)\n(?P<text>.*?)^(?P=indent)```$",
     re.DOTALL | re.MULTILINE,
 )
 
@@ -40,7 +42,12 @@ class Block:
 def blocks(*languages: str, pages: tuple[Path, ...] = PAGES) -> list[Block]:
     """Return the fenced blocks in some languages."""
     return [
-        Block(str(page.relative_to(ROOT)), found["language"], found["note"] or "", found["text"])
+        Block(
+            str(page.relative_to(ROOT)),
+            found["language"],
+            found["note"] or "",
+            textwrap.dedent(found["text"]),
+        )
         for page in pages
         for found in _FENCE.finditer(page.read_text())
         if found["language"] in languages
@@ -64,6 +71,28 @@ def sessions(text: str) -> list[tuple[list[str], str]]:
     parts = re.split(r"^\$ (.*)\n", text, flags=re.MULTILINE)
     assert parts[0] == "", f"a console block begins with a command, found {parts[0]!r}"
     return [(shlex.split(c), shown) for c, shown in zip(parts[1::2], parts[2::2], strict=True)]
+
+
+def every_command(*pages: Path) -> list[list[str]]:
+    """Return the words of each command on some pages: in blocks and in the text."""
+    found = [w for b in blocks("sh", pages=pages) for w in commands(b.text)]
+    found += [w for b in blocks("console", pages=pages) for w, _ in sessions(b.text)]
+    for page in pages:
+        found += [shlex.split(s) for s in spans(page) if re.match(r"[.\w]+ [^ ]", s)]
+    return parts_of(found)
+
+
+def parts_of(lines: list[list[str]]) -> list[list[str]]:
+    """Take lines apart as the shell does, without the variables that are set for one command."""
+    parts: list[list[str]] = []
+    for words in lines:
+        parts.append([])
+        for word in words:
+            if word in ("&&", "|"):
+                parts.append([])
+            elif parts[-1] or not re.match(r"[A-Z_]+=", word):
+                parts[-1].append(word)
+    return parts
 
 
 def matches(shown: str, output: str) -> bool:
