@@ -8,6 +8,7 @@ import numpy as np
 
 from relay_autotune.errors import TuningError
 from relay_autotune.tuning.ensemble import ensemble_peaks
+from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.task import DesignTask
 
@@ -42,7 +43,7 @@ def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
         controller, _ = rule(replace(task, models=()))
     except TuningError:
         return None
-    models = [task.in_loop(model) for model in (task.model, *task.models)]
+    models = ModelSet([task.in_loop(model) for model in (task.model, *task.models)])
     own, *others = ensemble_peaks(controller, models).ms
     # Between a finite order statistic and an infinite one lies nothing.
     low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")
