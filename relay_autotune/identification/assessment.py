@@ -42,7 +42,7 @@ def assess(models: Sequence[Identification], record: Record) -> tuple[Identifica
         replace(
             found,
             fit=_fit(found, record, rest),
-            validation=_validated(found.model, seen, rest),
+            validation=_validated(found.model, seen, record),
             integrated_error=_error_from(models[0], found),
         )
         for found in models
@@ -108,11 +108,11 @@ def _averaged(record: Record) -> Fold | None:
         return None
 
 
-def _validated(model: TransferFunction, seen: Fold | None, rest: float) -> Validation | None:
+def _validated(model: TransferFunction, seen: Fold | None, record: Record) -> Validation | None:
     if seen is None:
         return None
     try:
-        return validate_fold(model, seen, rest)
+        return validate_fold(model, seen, steady_state(record, seen.settings))
     except IdentificationError as error:
         return Validation(reason=str(error))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError
 from relay_autotune.identification.cycle.fold import Fold, as_switched, fold
-from relay_autotune.identification.cycle.steady_state import steady_state
+from relay_autotune.identification.cycle.steady_state import SteadyState, steady_state
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Record, RelaySettings
 from relay_autotune.response import response
@@ -80,15 +80,16 @@ def validate(model: TransferFunction, record: Record) -> Validation:
     :raises IdentificationError: if the record holds no whole cycle of a relay test.
     """
     seen = fold(record)
-    return validate_fold(model, seen, steady_state(record, seen.settings).value)
+    return validate_fold(model, seen, steady_state(record, seen.settings))
 
 
-def validate_fold(model: TransferFunction, seen: Fold, rest: float) -> Validation:
+def validate_fold(model: TransferFunction, seen: Fold, rest: SteadyState) -> Validation:
     """Compare a model's limit cycle with an averaged period; see :func:`validate`.
 
     :param model: any model.
     :param seen: the averaged period.
-    :param rest: measurement at rest under the baseline [y].
+    :param rest: measurement under the baseline; where it was not measured, and the process comes
+        to rest at all, what the model and the means over the period make of it.
     """
     settings = as_switched(seen)
     high, low, middle = seen.period_high, seen.period_low, seen.settings.setpoint
@@ -103,7 +104,8 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: float) -> Validatio
     if model.process_sign * (-1 if settings.reverse_acting else 1) < 0:
         return Validation(reason="the model's gain is against the direction of the relay")
     try:
-        cycle, modelled = _limit_cycle(model, settings, rest, _KICK * size)
+        point = rest.value if rest.measured else _rest_by(model, seen, rest.value)
+        cycle, modelled = _limit_cycle(model, settings, point, _KICK * size)
     except ModelError as error:
         return Validation(reason=str(error))
     weight = np.repeat([high, low], _POINTS)
@@ -117,6 +119,17 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: float) -> Validatio
         peak_min=(cycle.peak_min - middle - float(np.min(peaks))) / size,
         shape=math.sqrt(max(power - (seen.curve_std / size) ** 2, 0.0)),
     )
+
+
+def _rest_by(model: TransferFunction, seen: Fold, otherwise: float) -> float:
+    """Return the mean over a period less the gain times the mean command, from the baseline."""
+    if model.integrators or any(t.real <= 0.0 for t in model.time_constants):
+        return otherwise
+    high, low = seen.period_high, seen.period_low
+    weight = np.repeat([high, low], _POINTS)
+    mean = seen.settings.setpoint + float(np.average(seen(_instants(high, low)), weights=weight))
+    swing = seen.settings.amplitude * (high - low) / seen.period
+    return mean - model.gain * (seen.settings.bias + swing)
 
 
 def _limit_cycle(

@@ -9,6 +9,7 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.cycle.fold import fold
 from relay_autotune.identification.validation import integrated_error, validate
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
@@ -43,6 +44,25 @@ def test_the_true_model_reproduces_its_record(model, relay):
     assert found.reason == ""
     assert found.worst < 0.02
     assert found.shape < 5e-3
+
+
+def test_a_thermostat_of_unknown_rest():
+    """Where nothing was recorded at rest, the set-point may lie far from it."""
+    relay = RelaySettings(26.0, 2.5, 2.5, 0.0, 0.5)
+    model = TransferFunction.fopdt(2.0, 10.0, 3.0)
+    run = simulate_relay(
+        model, relay, cycles=8, operating_point=25.0, time=np.linspace(20.0, 110.0, 1200)
+    )
+    whole = run.record(noise_std=0.0)
+    record = Record(whole.time, whole.measurement, whole.command)
+    assert abs(asymmetry_of(record)) > 0.05
+    assert validate(model, record).worst < 0.02
+
+
+def asymmetry_of(record: Record) -> float:
+    """Return how unequal the halves are, relative to the period."""
+    seen = fold(record)
+    return (seen.period_high - seen.period_low) / seen.period
 
 
 def test_a_true_model_is_not_blamed_for_the_noise():
