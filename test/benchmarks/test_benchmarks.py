@@ -20,6 +20,7 @@ QUICK = {
     "latency": ("--quick",),
     "fault_table": ("--quick",),
     "simulated_experiments": ("--quick",),
+    "endurance": ("--quick",),
     "confident": ("--quick",),
     "chang_studies": ("--quick",),
     "structure_choice": ("--quick",),
