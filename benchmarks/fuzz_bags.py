@@ -1,10 +1,10 @@
 """Damage bags at random and read them: `python3 benchmarks/fuzz_bags.py [--quick] [--count N]`.
 
 Seeds of every kind (chunks plain, zstd and lz4; without chunks, index or summary; compressed as a
-whole; our own experiments; types of every shape) are flipped, cut, spliced, lengthened, and their
-lengths, offsets, counts and texts replaced. Each is read as `replay` reads it in a process that is
-watched: a crash, an error that is not one of ours, more than 5 s or more than 1 GB is a find, and
-its bag is kept.
+whole, or message by message; our own experiments; types of every shape) are flipped, cut, spliced
+and lengthened, and their lengths, offsets, counts and texts replaced. Each is read as `replay`
+reads it in a process that is watched: a crash, an error that is not one of ours, more than 5 s
+(twice, since the machine may have been busy) or more than 1 GB is a find, and its bag is kept.
 """
 
 from __future__ import annotations
@@ -232,9 +232,12 @@ def main() -> int:
         # The first answer waits for the imports.
         reader.ask(options.first, 120.0)
         for number in range(options.first, options.first + count):
-            begin = time.monotonic()
-            said, used = reader.ask(number, 60.0 if outcomes.total() == 0 else 3.0 * SECONDS)
-            took = time.monotonic() - begin
+            for _ in range(2):
+                begin = time.monotonic()
+                said, used = reader.ask(number, 60.0 if outcomes.total() == 0 else 3.0 * SECONDS)
+                took = time.monotonic() - begin
+                if took <= SECONDS:
+                    break
             slowest, grew = max(slowest, took), used > MEGABYTES and most <= MEGABYTES
             most = max(most, used)
             if said not in EXPECTED or took > SECONDS or grew:

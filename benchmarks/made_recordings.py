@@ -78,11 +78,18 @@ def seeds() -> list[bytes]:
     ]
     made = [_small(**chosen) for chosen in options]
     made.append(zstandard.ZstdCompressor().compress(made[0]))
+    made.append(_small(each=True, compression=CompressionType.NONE, chunk_size=3000))
     stored = sorted((REPOSITORY / "bags").glob("*relay*/*.mcap"))
     return made + [path.read_bytes() for path in stored]
 
 
-def _small(**options: Any) -> bytes:
+def _small(*, each: bool = False, **options: Any) -> bytes:
+    """Return a recording of four topics.
+
+    :param each: compress its messages one by one, as rosbag2 can.
+    :param options: of the mcap package's writer.
+    """
+    squeeze = zstandard.ZstdCompressor().compress if each else bytes
     stream = io.BytesIO()
     writer = Writer(stream, **options)
     writer.start("ros2", "benchmark")
@@ -104,7 +111,7 @@ def _small(**options: Any) -> bytes:
     for k in range(60):
         for topic, make in content.items():
             stamp = START + k * 10**8
-            writer.add_message(ids[topic], stamp + 1000, make(k), stamp, k)
+            writer.add_message(ids[topic], stamp + 1000, squeeze(make(k)), stamp, k)
     writer.finish()
     return stream.getvalue()
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import struct
 import zlib
 
-from relay_autotune.bag.limits import LARGEST_WINDOW, missing_package
+from relay_autotune.bag.limits import LARGEST_WINDOW
 from relay_autotune.bag.mcap_records import DamageError, text, unsigned
+from relay_autotune.bag.packages import expanding_package
 
 # Times of the first and the last message, size of the content, its checksum.
 _HEAD = struct.Struct("<QQQI")
@@ -55,10 +56,7 @@ def _expand(data: memoryview, compression: str, size: int, *, whole: bool) -> by
 
 
 def _whole_zstd(data: memoryview, size: int) -> bytes:
-    try:
-        import zstandard
-    except ImportError:
-        raise missing_package("zstandard") from None
+    zstandard = expanding_package("zstandard")
     if size == 0:
         return b""
     try:
@@ -72,10 +70,7 @@ def _whole_zstd(data: memoryview, size: int) -> bytes:
 
 
 def _part_of_zstd(data: memoryview, size: int) -> bytes:
-    try:
-        import zstandard
-    except ImportError:
-        raise missing_package("zstandard") from None
+    zstandard = expanding_package("zstandard")
     try:
         decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
         with decompressor.stream_reader(data) as stream:
@@ -85,11 +80,8 @@ def _part_of_zstd(data: memoryview, size: int) -> bytes:
 
 
 def _expand_lz4(data: memoryview, size: int) -> bytes:
+    frame = expanding_package("lz4.frame")
     try:
-        import lz4.frame
-    except ImportError:
-        raise missing_package("lz4") from None
-    try:
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+        return bytes(frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
     except (RuntimeError, EOFError, MemoryError) as error:
         raise DamageError(f"a chunk cannot be decompressed ({error})") from None

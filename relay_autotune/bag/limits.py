@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from relay_autotune.errors import BagError
-
 # Bytes of a chunk, or of one message outside of chunks; --max-chunk changes it.
 LARGEST_CHUNK = 256 << 20
 
@@ -28,15 +26,6 @@ MOST_STEPS = 5_000
 
 # Bytes of the index at the end of a file.
 LARGEST_SUMMARY = 256 << 20
-
-
-def missing_package(package: str) -> BagError:
-    """Return the error for a compressed recording without the package that expands it."""
-    return BagError(
-        f"the recording is compressed; to read it install the Python package {package}, "
-        f"with: pip install {package}"
-    )
-
 
 # Messages of a topic for which memory is set aside because the file says that it has them.
 MOST_EXPECTED = 1 << 27

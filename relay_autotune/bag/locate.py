@@ -42,7 +42,9 @@ _LONGEST_RUN = 1 << 16
 class Messages:
     """Messages of one channel within a run of records.
 
-    :param content: the records.
+    :param content: the records, or what they hold.
+    :param order: where each one's record begins in the run, which tells the order of messages of
+        several channels; shape (n,).
     :param log_time: when each was recorded [ns], shape (n,).
     :param publish_time: when each was sent [ns]; 0: unknown; shape (n,).
     :param begin: where each serialized message begins in the content, shape (n,).
@@ -50,6 +52,7 @@ class Messages:
     """
 
     content: Content
+    order: IntArray
     log_time: IntArray
     publish_time: IntArray
     begin: IntArray
@@ -173,9 +176,8 @@ def messages_at(
     )
     if bool(wrong.any()):
         raise DamageError("an index does not lead to a message of its channel")
-    return Messages(
-        content, nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"]), begin, end
-    )
+    times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
+    return Messages(content, offsets, *times, begin, end)
 
 
 def messages_by_channel(

@@ -14,6 +14,7 @@ from typing import Self
 
 import numpy as np
 
+from relay_autotune.bag.compressed_messages import Expander, are_compressed
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.locate import (
     Content,
@@ -77,6 +78,7 @@ class McapFile:
         self.metadata = layout.declared.metadata
         self.notes = [*self._source.notes, *layout.notes]
         self._layout = layout
+        self._refused: set[int] = set()
         self._counts = layout.declared.message_counts
 
     def __enter__(self) -> Self:
@@ -134,8 +136,25 @@ class McapFile:
         for pieces in self._batches(frozenset(channels)):
             for size, found in self._messages(pieces):
                 for channel, messages in found.items():
-                    yield channel, before, messages
+                    for part in self._expanded(channel, messages):
+                        yield channel, before, part
                 before += size + _SMALLEST_RECORD
+
+    def _expanded(self, channel: int, messages: Messages) -> Iterator[Messages]:
+        """Yield messages as they were before rosbag2 compressed them, if it did."""
+        if not are_compressed(messages):
+            yield messages
+            return
+        expander = Expander(self._largest)
+        yield from expander.expand(messages)
+        if expander.first_refusal and channel not in self._refused:
+            self._refused.add(channel)
+            declared = self.channels.get(channel)
+            self._note(
+                f"{self.path.name} has compressed messages of "
+                f"{declared.topic if declared else channel} that cannot be expanded, the first "
+                f"of them because {expander.first_refusal}; they are left out"
+            )
 
     def _batches(self, wanted: frozenset[int]) -> Iterator[list[_Piece]]:
         """Yield the segments that may hold messages of some channels, small ones together."""

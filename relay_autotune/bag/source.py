@@ -15,13 +15,13 @@ from relay_autotune.bag.limits import (
     LARGEST_WINDOW,
     MOST_EXPANSION,
     UNSUSPICIOUS,
-    missing_package,
 )
 from relay_autotune.bag.mcap_records import RECORD, DamageError
+from relay_autotune.bag.packages import expanding_package
 from relay_autotune.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 # Of each range that is announced at most so much is fetched before it is read.
 _ANNOUNCED = 64 << 10
@@ -53,7 +53,7 @@ class Source:
         except OSError as error:
             raise BagError(f"cannot read {path}: {error.strerror or error}") from error
         try:
-            if self.read(0, len(_ZSTD_MAGIC)) == _ZSTD_MAGIC:
+            if self.read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
                 self._expand()
             self.look_again()
             self._check_start()
@@ -119,10 +119,7 @@ class Source:
 
     def _expand(self) -> None:
         """Put what a file that is compressed as a whole holds into a temporary file."""
-        try:
-            import zstandard
-        except ImportError:
-            raise missing_package("zstandard") from None
+        zstandard = expanding_package("zstandard")
         compressed = os.fstat(self._file.fileno()).st_size
         most = max(UNSUSPICIOUS, MOST_EXPANSION * compressed)
         # Closed, and thereby deleted, by close().
@@ -159,11 +156,9 @@ class Source:
         self._file = expanded
 
     def _piece(self, stream: BinaryIO) -> bytes:
-        import zstandard
-
         try:
             return stream.read(1 << 20)
-        except zstandard.ZstdError as error:
+        except expanding_package("zstandard").ZstdError as error:
             # What came before is a recording that ends there.
             self.notes.append(f"{self.path.name} cannot be expanded to its end ({error})")
             return b""

@@ -99,8 +99,9 @@ class SignalReader:
         if self._unfit:
             if values.size == 0:
                 raise BagError(
-                    f"none of the {self._unfit} messages of {self._name} fits its definition; "
-                    f"if they are compressed one by one, convert the bag with: ros2 bag convert"
+                    f"none of the {self._unfit} messages of {self._name} fits its definition; if "
+                    f"they are compressed one by one, and not by zstd, convert the bag with: "
+                    f"ros2 bag convert"
                 )
             notes.append(
                 f"{self._unfit} of {self._unfit + values.size} messages of {self._name} do not "

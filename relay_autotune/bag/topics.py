@@ -132,7 +132,7 @@ class Topics:
         for key, before, messages in self._messages(wanted):
             name, path = wanted[key]
             values, good = _values(path, messages)
-            order = (messages.begin + before)[good]
+            order = (messages.order + before)[good]
             times = (messages.log_time[good], messages.publish_time[good])
             parts.setdefault(name, []).append((order, *times, values[good].astype(np.float64)))
         return {
@@ -218,7 +218,7 @@ class Topics:
             last = before
             if channels:
                 for channel, position, messages in file.read(channels):
-                    last = before + position + len(messages.content) + 1
+                    last = max(last, before + position + int(messages.order.max(initial=0)) + 1)
                     yield (number, channel), before + position, messages
                     if self.progress is not None:
                         self.progress(done + min(position, file.size), total)

@@ -16,7 +16,6 @@ from mcap.writer import CompressionType, Writer
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import encode_float64
-from relay_autotune.errors import BagError
 
 COUNT = 400
 
@@ -187,20 +186,6 @@ def test_a_file_that_shrinks_while_it_is_read(tmp_path):
         found = Topics(path, [file]).signals(["/x"])["/x"].signal
         assert 0 < len(found) < COUNT
         assert file.notes
-
-
-def test_messages_that_are_compressed_one_by_one_are_told(tmp_path):
-    path = tmp_path / "bag.mcap"
-    squeeze = zstandard.ZstdCompressor().compress
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
-        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
-        x = writer.register_channel("/x", "cdr", schema)
-        writer.add_message(x, START, squeeze(encode_float64(1.0)), START)
-        writer.finish()
-    with pytest.raises(BagError, match="compressed one by one, convert the bag with: ros2 bag"):
-        read(path)
 
 
 def without_summary(data):
