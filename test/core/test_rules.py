@@ -444,3 +444,11 @@ def test_gains_are_finite_and_scale(gain, tau, ratio, rule, structure, controlle
         [unit.kc, unit.ti, unit.td, unit.tf, unit.b],
         rtol=1e-5,
     )
+
+
+@pytest.mark.parametrize("rule", ["imc", "imc_chang", "itae", "thyagarajan"])
+def test_a_lag_that_stands_for_an_integrator_is_no_fopdt(rule):
+    """Its time constant is that of the record, and lambda with it: a loop that never settles."""
+    stands = _T.fopdt(3e4, 6e5, 7.5)
+    with pytest.raises(TuningError, match="found ipdt"):
+        design(task(_T.ipdt(0.05, 7.5), stands), rule)

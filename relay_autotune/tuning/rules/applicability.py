@@ -57,7 +57,8 @@ def fopdt_of(rule: str, task: DesignTask) -> Fopdt:
     """Return the FOPDT process on which a rule designs: the model, or else the simple one.
 
     :param rule: name of the rule.
-    :raises TuningError: if the model is no stable FOPDT and none that stands for it is known.
+    :raises TuningError: if the model is no stable FOPDT and none that stands for it is known. For
+        a process that integrates none does: its time constant would be that of the record.
     """
     delay = task.options.added_delay
     model, note = task.model, ""
@@ -67,7 +68,7 @@ def fopdt_of(rule: str, task: DesignTask) -> Fopdt:
                 f"the rule {rule} is for a stable FOPDT process, found {named(model)}, which is "
                 "unstable: use robust or unstable"
             )
-        if task.simple is None or not is_first_order(task.simple):
+        if model.integrators or task.simple is None or not is_first_order(task.simple):
             raise TuningError(
                 f"the rule {rule} is for a stable FOPDT process, found {named(model)}: use a "
                 "rule for that structure, or robust"
