@@ -36,6 +36,9 @@ HAPPENINGS = (*(NOTHING,) * 8, *DISTURBANCES, *FAULTS)
 HOLDABLE = ("measurement limit", "deviation", "abort", "time over")
 
 PER_CYCLE = (40, 200)
+IDEAL_CYCLES = 5
+# In standard deviations of the noise, as the node chooses it.
+HYSTERESIS = 3.0
 LARGEST_RATIO = 0.2
 FOUND_SHARE = 0.2
 GIVEN_SIGN_SHARE = 0.3
@@ -117,7 +120,7 @@ class Oscillation:
     @property
     def swing(self) -> float:
         """Half the distance of the peaks [y]."""
-        return 0.5 * (self.cycle.peak_max - self.cycle.peak_min)
+        return _half_swing(self.cycle)
 
 
 def oscillation(model: TransferFunction, ratio: float) -> Oscillation:
@@ -127,20 +130,32 @@ def oscillation(model: TransferFunction, ratio: float) -> Oscillation:
     :param ratio: the wanted noise-to-signal ratio.
     :raises ModelError: if there is no limit cycle with the hysteresis that the noise asks for.
     """
-    parameters = ExperimentParameters(amplitude=1.0)
-    noise = 0.0
-    for _ in range(3):
-        settings = RelaySettings(
-            *(0.0, 0.0, 1.0, parameters.relay_bias, 3.0 * noise),
-            reverse_acting=model.process_sign < 0,
-        )
-        cycle = simulate_relay(model, settings, cycles=10).cycles[-1]
-        time = cycle.start + cycle.period * np.arange(200) / 200
-        run = simulate_relay(model, settings, cycles=10, time=time)
-        mean = float(np.mean(np.abs(run.measurement)))
-        found = Oscillation(cycle, noise, MEAN_NOISE * noise / mean)
-        noise = ratio * mean / MEAN_NOISE
-    return found
+    # The noise asks for hysteresis, and that makes the swing larger, but leaves its shape.
+    free = _ideal(model, 0.0)
+    share = ratio / MEAN_NOISE * _mean(model, 0.0, free) / _half_swing(free)
+    noise = share * _half_swing(_ideal(model, share * _half_swing(free)))
+    cycle = _ideal(model, noise)
+    return Oscillation(cycle, noise, MEAN_NOISE * noise / _mean(model, noise, cycle))
+
+
+def _ideal(model: TransferFunction, noise: float) -> Cycle:
+    return simulate_relay(model, _settings(model, noise), cycles=IDEAL_CYCLES).cycles[-1]
+
+
+def _mean(model: TransferFunction, noise: float, cycle: Cycle) -> float:
+    time = cycle.start + cycle.period * np.arange(200) / 200
+    run = simulate_relay(model, _settings(model, noise), cycles=IDEAL_CYCLES, time=time)
+    return float(np.mean(np.abs(run.measurement)))
+
+
+def _settings(model: TransferFunction, noise: float) -> RelaySettings:
+    bias = ExperimentParameters(amplitude=1.0).relay_bias
+    reverse = model.process_sign < 0
+    return RelaySettings(0.0, 0.0, 1.0, bias, HYSTERESIS * noise, reverse_acting=reverse)
+
+
+def _half_swing(cycle: Cycle) -> float:
+    return 0.5 * (cycle.peak_max - cycle.peak_min)
 
 
 class Experiment:
