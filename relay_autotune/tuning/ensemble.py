@@ -15,12 +15,12 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.margins import frequencies
 from relay_autotune.tuning.model_set import ModelSet
-from relay_autotune.tuning.search import allowed_outside
 from relay_autotune.tuning.stability import (
     at_infinity,
     closed_loop_unstable_poles,
     winding,
 )
+from relay_autotune.tuning.surroundings import allowed_outside
 
 FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]

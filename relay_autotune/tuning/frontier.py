@@ -37,6 +37,9 @@ from relay_autotune.ultimate import unstable_at_small_gain
 
 FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
+IntArray = NDArray[np.integer[Any]]
+
+_ALL = slice(None)
 
 # Times the crossover: from where on the proportional and derivative action make the loop.
 _BEYOND = 3.0
@@ -80,9 +83,10 @@ class Responses:
         self, models: Sequence[TransferFunction], grid: FloatArray, crossover: float
     ) -> None:
         self._set, self._sign = ModelSet(models), models[0].process_sign
+        self.count = len(models)
         self.grid = grid
         self.crossover = crossover
-        self.inverse = self._evaluate(grid)
+        self._keep(self._evaluate(grid))
         self._poles = np.array([unstable_at_small_gain(m) for m in models])
         # Their loops pass -1 at w = 0 as the gain grows.
         self._at_rest = np.array(
@@ -92,6 +96,10 @@ class Responses:
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
         values = self._sign / self._set(grid.astype(np.float64)).T
         return np.ascontiguousarray(values.astype(np.result_type(grid, np.complex64)))
+
+    def _keep(self, inverse: ComplexArray) -> None:
+        self._smallest = np.abs(inverse).min(axis=0)
+        self.inverse = inverse
 
     def add(self, frequencies: FloatArray) -> None:
         """Add frequencies to the grid, with neighbours on either side.
@@ -103,10 +111,16 @@ class Responses:
         grid = np.concatenate((self.grid, near))
         order = np.argsort(grid)
         inverse = np.concatenate((self.inverse, self._evaluate(near)), axis=1)
-        self.grid, self.inverse = grid[order], inverse[:, order]
+        self.grid = grid[order]
+        self._keep(inverse[:, order])
 
     def largest_ki(
-        self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
+        self,
+        bounds: Bounds,
+        kp: FloatArray,
+        td: FloatArray,
+        tf: FloatArray,
+        of: IntArray | slice = _ALL,
     ) -> tuple[FloatArray, FloatArray]:
         """Return the largest integral gains that the bounds leave, and how far they may fall.
 
@@ -114,22 +128,24 @@ class Responses:
         :param kp: proportional gains, positive, shape (k,).
         :param td: derivative times [s], shape (k,).
         :param tf: time constants of the filter [s], shape (k,).
+        :param of: which models, m of them.
         :return: upper and lower ends of the range, shape (k, m), for the controllers in each
             model; an upper end not positive: none is allowed; infinite: any above the lower.
         """
         column = self._felt(bounds, kp, td, tf)
-        w, inverse = self.grid[column], self.inverse[None, :, column]
+        w, inverse = self.grid[column], self.inverse[of][None, :, column]
         if np.any(tf):
             s = 1j * w * tf[:, None]
             inverse = (1.0 + s + 0.5 * s * s)[:, None, :] * inverse
-        x, y = inverse.real, inverse.imag
+        # Arithmetic on the parts is faster where they lie together.
+        x, y = np.ascontiguousarray(inverse.real), np.ascontiguousarray(inverse.imag)
         reach = kp[:, None, None] + x
         height = (kp * td)[:, None, None] * w + y
-        count = self._poles + _gained(x, reach, height)
+        count = self._poles[of] + _gained(x, reach, height)
         begun = np.where(reach[..., 0] > 0.0, np.where(height[..., 0] > 0.0, -1, 1), 0)
-        count = count + np.where(self._at_rest, begun, 0)
+        count = count + np.where(self._at_rest[of], begun, 0)
         stable = np.where(count == 0, _first_crossing(reach, w * height, kp), 0.0)
-        return _largest_ki(bounds, kp, td, w, inverse, stable)
+        return _largest_ki(bounds, kp, td, w, (x, y), stable)
 
     def _felt(
         self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
@@ -140,7 +156,7 @@ class Responses:
         """
         w = self.grid
         largest = (kp[:, None] * np.hypot(1.0, td[:, None] * w)).max(axis=0)
-        smallest = np.abs(self.inverse).min(axis=0) * np.sqrt(1.0 + 0.25 * (w * tf.min()) ** 4)
+        smallest = self._smallest * np.sqrt(1.0 + 0.25 * (w * tf.min()) ** 4)
         room = min(c - r for c, r in bounds.circles)
         return np.asarray((w < _BEYOND * self.crossover) | (2.0 * largest > room * smallest))
 
@@ -167,15 +183,15 @@ def _largest_ki(
     kp: FloatArray,
     td: FloatArray,
     w: FloatArray,
-    inverse: ComplexArray,
+    parts: tuple[FloatArray, FloatArray],
     stable: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the envelope of the ellipses: upper and lower ends of the range, shape (k, m).
 
-    :param inverse: 1/(F G), shape (k or 1, m, n).
+    :param parts: real and imaginary part of 1/(F G), shape (k or 1, m, n).
     :param stable: integral gains up to which the loop is stable, shape (k, m).
     """
-    x, y = inverse.real, inverse.imag
+    x, y = parts
     square = x * x + y * y
     p = kp[:, None, None]
     lead = (kp * td)[:, None, None] * w
@@ -240,21 +256,26 @@ def _highest_gap(
     :param start: shape (k, m); infinite: above all intervals.
     :return: upper and lower ends, shape (k, m); an upper one not positive: there is none.
     """
-    value = start
+    value, ends = start.copy(), np.zeros(start.shape)
+    active = np.ones(start.shape, dtype=bool)
     while True:
-        lower, below = value, np.zeros(value.shape)
-        for _, low, high in edges:
-            under = low < value[..., None]
-            inside = under & (high >= value[..., None])
+        # Only those that moved are looked at again.
+        at, here = value[active], [(low[active], high[active]) for _, low, high in edges]
+        lower, below = at, np.zeros(at.shape)
+        for low, high in here:
+            under = low < at[:, None]
+            inside = under & (high >= at[:, None])
             found = np.where(inside, low, math.inf).min(axis=-1, initial=math.inf)
             lower = np.minimum(lower, found)
             below = np.maximum(below, np.where(under, high, 0.0).max(axis=-1, initial=0.0))
-        covered = lower < value
-        narrow = ~covered & (below > _NARROW * value)
-        moved = (covered | narrow) & (value > 0.0)
+        ends[active] = below
+        covered = lower < at
+        narrow = ~covered & (below > _NARROW * at)
+        moved = (covered | narrow) & (at > 0.0)
         if not np.any(moved):
-            return value, below
-        value = np.where(moved, np.where(narrow, below, lower), value)
+            return value, ends
+        value[active] = np.where(moved, np.where(narrow, below, lower), at)
+        active[active] = moved
 
 
 def _least(values: FloatArray, x: FloatArray) -> FloatArray:

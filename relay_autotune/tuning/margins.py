@@ -19,7 +19,8 @@ Loop = Callable[[ComplexArray], ComplexArray]
 # Local maxima that are refined; the largest on the grid need not be the largest.
 _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
-_BISECTIONS = 50
+# Each round narrows a cell to a sixteenth.
+_ROUNDS, _PARTS = 13, 16
 # Below this magnitude a loop is not felt, whatever its phase.
 _FELT = 0.05
 _MOST_TURNS = 800.0 * math.pi
@@ -89,29 +90,34 @@ def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[floa
     sensitivity = 1.0 / np.abs(1.0 + values)
     log_grid = np.log(grid)
 
-    def peak(on_grid: FloatArray, numerator: Loop) -> tuple[float, float]:
-        inner = (
-            np.flatnonzero((on_grid[1:-1] >= on_grid[:-2]) & (on_grid[1:-1] >= on_grid[2:])) + 1
-        )
-        at = np.append(inner[np.argsort(-on_grid[inner])[:_PEAKS]], np.argmax(on_grid))
-        low, high = log_grid[np.maximum(at - 1, 0)], log_grid[np.minimum(at + 1, grid.size - 1)]
-        rows = np.arange(at.size)
-        best, where = float(on_grid.max()), float(grid[np.argmax(on_grid)])
-        for _ in range(_ZOOMS):
-            x = np.linspace(low, high, _ZOOM_POINTS, axis=1)
-            near = loop(1j * np.exp(x).ravel())
-            size = np.abs(numerator(near) / (1.0 + near)).reshape(x.shape)
-            k = np.argmax(size, axis=1)
-            if size.max() > best:
-                row = int(np.argmax(size.max(axis=1)))
-                best, where = float(size.max()), math.exp(x[row, k[row]])
-            low = x[rows, np.maximum(k - 1, 0)]
-            high = x[rows, np.minimum(k + 1, _ZOOM_POINTS - 1)]
-        return best, where
+    sizes = (sensitivity, sensitivity * np.abs(values))
+    best = [float(size.max()) for size in sizes]
+    where = [float(grid[np.argmax(size)]) for size in sizes]
+    # Both are sought at the same time, the peaks of the one in the rows above those of the other.
+    tops = [_tops(size) for size in sizes]
+    at, first = np.concatenate(tops), tops[0].size
+    low, high = log_grid[np.maximum(at - 1, 0)], log_grid[np.minimum(at + 1, grid.size - 1)]
+    rows = np.arange(at.size)
+    for _ in range(_ZOOMS):
+        x = np.linspace(low, high, _ZOOM_POINTS, axis=1)
+        near = loop(1j * np.exp(x).ravel()).reshape(x.shape)
+        numerator = near.copy()
+        numerator[:first] = 1.0
+        size = np.abs(numerator / (1.0 + near))
+        k = np.argmax(size, axis=1)
+        for which, part in enumerate((slice(first), slice(first, None))):
+            row = part.indices(at.size)[0] + int(np.argmax(size[part].max(axis=1)))
+            if size[row, k[row]] > best[which]:
+                best[which], where[which] = float(size[row, k[row]]), math.exp(x[row, k[row]])
+        low = x[rows, np.maximum(k - 1, 0)]
+        high = x[rows, np.minimum(k + 1, _ZOOM_POINTS - 1)]
+    return (best[0], where[0]), (best[1], where[1])
 
-    return peak(sensitivity, lambda v: 0.0 * v + 1.0), peak(
-        sensitivity * np.abs(values), lambda v: v
-    )
+
+def _tops(values: FloatArray) -> NDArray[np.intp]:
+    """Return where the largest local maxima are, and the largest value."""
+    inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    return np.append(inner[np.argsort(-values[inner])[:_PEAKS]], np.argmax(values))
 
 
 def _changes(values: FloatArray) -> NDArray[np.intp]:
@@ -122,13 +128,17 @@ def _changes(values: FloatArray) -> NDArray[np.intp]:
 def _roots(
     function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return a root in each cell whose ends differ in sign, by halving all cells at once."""
+    """Return a root in each cell whose ends differ in sign, by dividing all cells at once."""
     low, high = np.log(low), np.log(high)
-    sign = np.sign(function(np.exp(low)))
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        same = np.sign(function(np.exp(middle))) == sign
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    if not low.size:
+        return low
+    above, rows = np.sign(function(np.exp(low))), np.arange(low.size)
+    for _ in range(_ROUNDS):
+        ends = np.linspace(low, high, _PARTS + 1, axis=1)
+        signs = np.sign(function(np.exp(ends[:, 1:-1]).ravel())).reshape(low.size, -1)
+        changed = np.column_stack((signs != above[:, None], np.ones(low.size, dtype=bool)))
+        first = np.argmax(changed, axis=1)
+        low, high = ends[rows, first], ends[rows, first + 1]
     return np.asarray(np.exp(0.5 * (low + high)))
 
 

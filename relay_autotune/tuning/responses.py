@@ -10,7 +10,6 @@ so that a slow tail costs nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +22,6 @@ from relay_autotune.tuning.control_law import ControlLaw
 
 FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
-Transform = Callable[[ComplexArray], ComplexArray]
 
 _POINTS = 4096
 _MOST_POINTS = 1 << 18
@@ -50,24 +48,33 @@ class StepResponse:
     command: FloatArray
 
 
-def invert(transform: Transform, duration: float, points: int, jump: float = 0.0) -> FloatArray:
+def abscissae(duration: float, points: int) -> ComplexArray:
+    """Return where :func:`inverted` needs a Laplace transform [rad/s], shape (points + 1,).
+
+    :param duration: s.
+    :param points: instants at which the function is wanted.
+    """
+    return _DECAY / (2.0 * duration) + 1j * np.arange(points + 1) * (math.pi / duration)
+
+
+def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatArray:
     """Return the function of a Laplace transform at equally spaced times from 0 on.
 
-    :param transform: as a function of s, without a pole right of the imaginary axis.
-    :param duration: s.
-    :param points: instants, the last one a step before ``duration``.
+    :param values: of the transform at :func:`abscissae`, shape (points + 1,); it has no pole
+        right of the imaginary axis.
+    :param duration: s; the last instant is a step before it.
     :param jump: value just after t = 0.
     :return: shape (points,).
     """
-    step = duration / points
-    sigma = _DECAY / (2.0 * duration)
-    s = sigma + 1j * np.arange(points + 1) * (math.pi / duration)
-    decay = 20.0 / duration
+    points = values.size - 1
+    step, decay = duration / points, 20.0 / duration
     time = np.arange(points) * step
+    if jump:
+        values = values - jump / (abscissae(duration, points) + decay)
     # Lanczos' factors take away the ringing that the cut at the last frequency leaves.
-    values = (transform(s) - jump / (s + decay)) * np.sinc(np.arange(points + 1) / points)
-    smooth = np.fft.irfft(values)[:points] * np.exp(sigma * time) / step
-    return np.asarray(smooth + jump * np.exp(-decay * time))
+    values = values * np.sinc(np.arange(points + 1) / points)
+    found = np.fft.irfft(values)[:points] * np.exp(_DECAY / (2.0 * duration) * time) / step
+    return np.asarray(found + jump * np.exp(-decay * time) if jump else found)
 
 
 @dataclass(frozen=True)
@@ -86,19 +93,9 @@ class ClosedLoopTransforms:
         g = self.model(s)
         return np.asarray(g / (1.0 + self.law(s) * g))
 
-    def command_from_load(self, s: ComplexArray) -> ComplexArray:
-        """Return ``-C G/(1 + C G)``."""
-        loop = self.law(s) * self.model(s)
-        return np.asarray(-loop / (1.0 + loop))
-
     def measurement_from_setpoint(self, s: ComplexArray) -> ComplexArray:
         """Return ``G F/(1 + C G)``, F from set-point to command."""
         return np.asarray(self.measurement_from_load(s) * self.law.from_setpoint(s))
-
-    def command_from_setpoint(self, s: ComplexArray) -> ComplexArray:
-        """Return ``F/(1 + C G)``."""
-        loop = self.law(s) * self.model(s)
-        return np.asarray(self.law.from_setpoint(s) / (1.0 + loop))
 
     def first_command(self) -> float:
         """Return the command just after a unit step of the set-point [u]."""
@@ -146,17 +143,18 @@ def step_responses(
     :param points: instants.
     """
     to = ClosedLoopTransforms(law, model)
+    s = abscissae(duration, points)
+    # At the same frequencies all four are made of the same three.
+    g, c, f = model(s), law(s), law.from_setpoint(s)
+    rest = 1.0 + c * g
     time = np.arange(points) * (duration / points)
 
-    def step(of: Transform, jump: float = 0.0) -> FloatArray:
-        return invert(lambda s: of(s) / s, duration, points, jump)
+    def step(values: ComplexArray, jump: float = 0.0) -> FloatArray:
+        return inverted(values / s, duration, jump)
 
-    first = to.first_command()
     return (
-        StepResponse(
-            time, step(to.measurement_from_setpoint), step(to.command_from_setpoint, first)
-        ),
-        StepResponse(time, step(to.measurement_from_load), step(to.command_from_load)),
+        StepResponse(time, step(g / rest * f), step(f / rest, to.first_command())),
+        StepResponse(time, step(g / rest), step(-c * g / rest)),
     )
 
 

@@ -27,11 +27,11 @@ from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.load_cost import load_iaes
 from relay_autotune.tuning.margins import frequencies, peaks
 from relay_autotune.tuning.noise import filter_for
+from relay_autotune.tuning.surroundings import Surroundings
 from relay_autotune.ultimate import ultimate_point
 
 FloatArray = NDArray[np.floating[Any]]
 
-_SHARE = 0.95
 # Proportional gains are scanned over this part of the stable range, from its upper end.
 _DEPTH = 1e4
 _GAINS = {False: 64, True: 32}
@@ -105,14 +105,14 @@ class Search:
         return Responses((self.model,), design_grid(self.model, self.frequency), self.frequency)
 
     @cached_property
-    def around(self) -> Responses | None:
-        """Responses of the models around the process."""
+    def around(self) -> Surroundings | None:
+        """The models around the process."""
         if not self.models:
             return None
         grid = self.responses.grid
         # Single precision is twice as fast and more than an ensemble needs.
         some = grid[grid > 0.03 * self.frequency][::2].astype(np.float32)
-        return Responses(self.models, some, self.frequency)
+        return Surroundings(Responses(self.models, some, self.frequency))
 
     def optimum(self, bounds: Bounds, *, derivative: bool) -> Optimum | None:
         """Return the controller of least IAE, or None where none keeps the bounds.
@@ -364,16 +364,11 @@ class Search:
         some = upper > least
         if self.around is None or not some.any():
             return upper, lower
-        gains = (x[some].astype(np.float32) for x in (kp, td, tf))
-        highs, lows = self.around.largest_ki(bounds, *gains)
-        outside = allowed_outside(len(self.models))
-        largest = np.minimum(upper[some], np.sort(highs, axis=1)[:, outside])
-        within = ((highs >= largest[:, None]) & (lows < largest[:, None])).sum(axis=1)
-        enough = within >= len(self.models) - outside
-        upper = np.where(some, upper, -math.inf)
-        upper[some] = np.where(enough, largest, -math.inf)
-        lower = lower.copy()
-        lower[some] = np.maximum(lower[some], np.sort(lows, axis=1)[:, -1 - outside])
+        kp, td, tf = (x[some].astype(np.float32) for x in (kp, td, tf))
+        least = np.broadcast_to(least, upper.shape)[some]
+        ends = self.around.limits(bounds, kp, td, tf, upper[some], least)
+        upper, lower = np.where(some, upper, -math.inf), lower.copy()
+        upper[some], lower[some] = ends[0], np.maximum(lower[some], ends[1])
         return upper, lower
 
     def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
@@ -385,8 +380,3 @@ class Search:
 
     def _iaes(self, c: Candidates) -> FloatArray:
         return load_iaes(self.model, c.kp, c.ki, c.td, c.tf, self.frequency)
-
-
-def allowed_outside(count: int) -> int:
-    """Return how many of so many models may exceed a bound."""
-    return int((1.0 - _SHARE) * count + 1e-9)

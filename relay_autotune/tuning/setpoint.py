@@ -9,7 +9,7 @@ import numpy as np
 
 from relay_autotune.models import TransferFunction
 from relay_autotune.tuning.gains import Controller
-from relay_autotune.tuning.responses import ClosedLoopTransforms, invert
+from relay_autotune.tuning.responses import ClosedLoopTransforms, abscissae, inverted
 
 _WEIGHTS = np.linspace(0.0, 1.0, 101)
 _POINTS = 2048
@@ -37,12 +37,10 @@ def with_setpoint_weight(
         reset += 1.0 / abs(controller.i * model.gain)
     duration = _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
     to = ClosedLoopTransforms(controller, model)
-    proportional = invert(
-        lambda s: controller.kc * to.measurement_from_load(s) / s, duration, _POINTS
-    )
-    integral = invert(
-        lambda s: controller.i * to.measurement_from_load(s) / s**2, duration, _POINTS
-    )
+    at = abscissae(duration, _POINTS)
+    through = to.measurement_from_load(at) / at
+    proportional = inverted(controller.kc * through, duration)
+    integral = inverted(controller.i * through / at, duration)
     highest = np.array([float((integral + b * proportional).max()) for b in _WEIGHTS])
     overshoot = np.maximum(highest - 1.0, 0.0)
     allowed = max(_OVERSHOOT, float(overshoot.min()) + _SPARE)

@@ -1,0 +1,75 @@
+"""What the models around a process leave of its range of integral gains."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.tuning.frontier import Bounds, Responses
+
+FloatArray = NDArray[np.floating[Any]]
+
+_SHARE = 0.95
+# So many times the models that may exceed a bound are asked first.
+_FIRST = 3
+
+
+def allowed_outside(count: int) -> int:
+    """Return how many of so many models may exceed a bound."""
+    return int((1.0 - _SHARE) * count + 1e-9)
+
+
+class Surroundings:
+    """Models around a process, on all but 5 % of which bounds have to hold.
+
+    :param responses: of the models.
+    """
+
+    def __init__(self, responses: Responses) -> None:
+        self._responses = responses
+        # Those that left the least range for the controllers before come first.
+        self._order = np.arange(responses.count)
+
+    def limits(
+        self,
+        bounds: Bounds,
+        kp: FloatArray,
+        td: FloatArray,
+        tf: FloatArray,
+        upper: FloatArray,
+        least: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the largest integral gains and the least, shape (k,).
+
+        :param bounds: on the sensitivities.
+        :param kp: proportional gains, positive, shape (k,).
+        :param td: derivative times [s], shape (k,).
+        :param tf: time constants of the filter [s], shape (k,).
+        :param upper: the largest integral gain on the process itself, shape (k,).
+        :param least: what it has to exceed to be of interest, shape (k,).
+        :return: the largest is -inf where there is none, or none of interest.
+        """
+        count = self._order.size
+        outside = allowed_outside(count)
+        split = _FIRST * (outside + 1)
+        first, rest = self._order[:split], self._order[split:]
+        highs, lows = self._responses.largest_ki(bounds, kp, td, tf, first)
+        # The other models can only lower it.
+        useful = np.minimum(upper, np.sort(highs, axis=1)[:, outside]) > least
+        largest, lowest = np.full(upper.shape, -math.inf), np.zeros(upper.shape)
+        if not useful.any():
+            return largest, lowest
+        highs, lows = highs[useful], lows[useful]
+        if rest.size:
+            few = kp[useful], td[useful], tf[useful]
+            more = self._responses.largest_ki(bounds, *few, rest)
+            highs, lows = (np.hstack(both) for both in zip((highs, lows), more, strict=True))
+            self._order = self._order[np.argsort(highs[0], kind="stable")]
+        ends = np.minimum(upper[useful], np.sort(highs, axis=1)[:, outside])
+        within = ((highs >= ends[:, None]) & (lows < ends[:, None])).sum(axis=1)
+        largest[useful] = np.where(within >= count - outside, ends, -math.inf)
+        lowest[useful] = np.sort(lows, axis=1)[:, -1 - outside]
+        return largest, lowest
