@@ -8,9 +8,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.schema import first_line
 from relay_autotune.errors import BagError
 
-FLOAT64 = "std_msgs/msg/Float64"
 EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
 CYCLE = "relay_autotune_msgs/msg/RelayCycle"
 
@@ -95,7 +95,7 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
     except (UnicodeDecodeError, TypesysError, KeyError, ValueError, RecursionError) as error:
         raise BagError(
             f"the definition of {channel.type} in the recording makes no sense: "
-            f"{_first_line(error)}"
+            f"{first_line(error)}"
         ) from None
     messages = []
     for data in payload:
@@ -103,7 +103,7 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
             decoded = _decoded(store, channel.type, data)
         except (SerdeError, KeyError, ValueError, IndexError, struct.error, MemoryError) as error:
             raise BagError(
-                f"a message of {channel.topic} does not fit its definition: {_first_line(error)}"
+                f"a message of {channel.topic} does not fit its definition: {first_line(error)}"
             ) from None
         messages.append(_with_defaults(decoded, DEFAULTS.get(channel.type, {})))
     return messages
@@ -133,8 +133,3 @@ def _with_defaults(message: Any, defaults: Mapping[str, Any]) -> SimpleNamespace
         else:
             fields.setdefault(name, default)
     return SimpleNamespace(**fields)
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from relay_autotune.errors import BagError
 
 SEPARATOR = "=" * 80
 
+FLOAT64 = "std_msgs/msg/Float64"
+
 # Known without any installed package, so that a CSV becomes a bag on a machine without ROS.
 _BUILT_IN = {
-    "std_msgs/msg/Float64": (
+    FLOAT64: (
         "float64 data\n",
         "RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a",
     )
@@ -65,29 +68,27 @@ def find_definition(type_name: str, prefixes: Sequence[Path] | None = None) -> D
     return Definition("\n".join(parts), _type_hash(type_name, where))
 
 
-def _split(type_name: str) -> tuple[str, str, str]:
+def _installed(type_name: str, suffix: str, prefixes: Sequence[Path]) -> Iterator[str]:
+    """Yield what the files of a type hold, nearest overlay first."""
     parts = type_name.split("/")
     if len(parts) != 3 or not all(re.fullmatch(r"\w+", part) for part in parts):
         raise BagError(
             f"{type_name!r} is no message type; expected a name like std_msgs/msg/Float64"
         )
-    return parts[0], parts[1], parts[2]
+    for prefix in prefixes:
+        path = prefix.joinpath("share", *parts).with_suffix(suffix)
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            yield path.read_text(encoding="utf-8")
 
 
 def _message_text(type_name: str, prefixes: Sequence[Path]) -> str:
-    package, kind, name = _split(type_name)
-    for prefix in prefixes:
-        path = prefix / "share" / package / kind / f"{name}.msg"
-        try:
-            text = path.read_text(encoding="utf-8")
-        except OSError:
-            continue
+    for text in _installed(type_name, ".msg", prefixes):
         return text if text.endswith("\n") else text + "\n"
     if type_name in _BUILT_IN:
         return _BUILT_IN[type_name][0]
     raise BagError(
         f"the definition of {type_name} is not installed in any of the {len(prefixes)} prefixes "
-        f"of AMENT_PREFIX_PATH; build {package} and source its install folder"
+        f"of AMENT_PREFIX_PATH; build {type_name.split('/')[0]} and source its install folder"
     )
 
 
@@ -111,12 +112,8 @@ def _dependencies(type_name: str, text: str) -> list[str]:
 
 
 def _type_hash(type_name: str, prefixes: Sequence[Path]) -> str:
-    package, kind, name = _split(type_name)
-    for prefix in prefixes:
-        path = prefix / "share" / package / kind / f"{name}.json"
-        try:
-            hashes = json.loads(path.read_text(encoding="utf-8"))["type_hashes"]
+    for text in _installed(type_name, ".json", prefixes):
+        with contextlib.suppress(ValueError, KeyError, TypeError, StopIteration):
+            hashes = json.loads(text)["type_hashes"]
             return next(str(h["hash_string"]) for h in hashes if h["type_name"] == type_name)
-        except (OSError, ValueError, KeyError, TypeError, StopIteration):
-            continue
     return _BUILT_IN.get(type_name, ("", ""))[1]

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.bag.decode import CYCLE, EXPERIMENT, FLOAT64
+from relay_autotune.bag.decode import CYCLE, EXPERIMENT
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import EXPERIMENT_METADATA
 from relay_autotune.errors import BagError, RecordError

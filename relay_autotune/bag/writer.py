@@ -8,11 +8,10 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import relay_autotune
-from relay_autotune.bag.definitions import Definition, find_definition
+from relay_autotune.bag.definitions import FLOAT64, Definition, find_definition
 from relay_autotune.bag.metadata import (
     Qos,
     TopicSummary,
@@ -24,8 +23,6 @@ from relay_autotune.errors import BagError
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
-
-FLOAT64 = "std_msgs/msg/Float64"
 
 # Name of the metadata record that says which topics of a bag are the loop's.
 EXPERIMENT_METADATA = "relay_autotune"
@@ -179,12 +176,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     @property
