@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from relay_autotune.errors import RecordError
+from relay_autotune.experiment.early_end import Finding
 from relay_autotune.record import Cycle, FloatArray, Outcome, Record, RelaySettings
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from relay_autotune.tuning import Gains
 
 NANOSECONDS = 1_000_000_000
+_PREDICTED = ("ms", "ms_low", "ms_high")
 
 
 def float64_array(values: ArrayLike) -> array.array[float]:
@@ -251,6 +253,7 @@ def fill_transfer_function(
     experiment_id: str = "",
     final: bool = True,
     stamp_ns: int = 0,
+    finding: Finding | None = None,
 ) -> None:
     """Write an identified model into a `TransferFunction` message.
 
@@ -259,6 +262,7 @@ def fill_transfer_function(
     :param experiment_id: the id of the experiment it comes from.
     :param final: True once the experiment has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
+    :param finding: of a running experiment, with the predicted Ms; None: it is not predicted.
     """
     from relay_autotune.identification.validation import DIFFERENCES
 
@@ -312,6 +316,20 @@ def fill_transfer_function(
         setattr(message, f"combination_{name}", numbers)
     message.advice = [str(text) for text in identification.advice]
     message.support = float(identification.support)
+    for name in _PREDICTED:
+        setattr(message, name, math.nan if finding is None else float(getattr(finding, name)))
+
+
+def finding_from_message(message: Any) -> Finding:
+    """Read what a `TransferFunction` message says of a running experiment.
+
+    :param message: the message.
+    """
+    return Finding(
+        message.ultimate_gain,
+        message.ultimate_gain_std,
+        **{name: getattr(message, name) for name in _PREDICTED},
+    )
 
 
 def transfer_function_from_message(message: Any) -> TransferFunction:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -10,6 +12,7 @@ from rclpy.parameter import Parameter
 
 from relay_autotune.autotune import Analysis, analyse, analyse_jointly, check_names
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification import DEFAULT_METHOD, METHODS, ONLY_JOINT
 from relay_autotune.messages import (
     fill_gains,
@@ -25,6 +28,7 @@ from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
 from relay_autotune.nodes.signs_of_life import SignsOfLife
 from relay_autotune.record import Outcome, Record
+from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
@@ -65,6 +69,7 @@ class IdentifierNode(ServedNode):
         self._earlier: Record | None = None
         self._fit_asked_for = False
         self._progress: Any = None
+        self._running, self._running_fit = "", RunningFit()
         self._signs = SignsOfLife(self)
         self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
         self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
@@ -85,7 +90,8 @@ class IdentifierNode(ServedNode):
         )
 
     def _on_cycle(self, message: Any) -> None:
-        if message.experiment_id == self._ended:
+        if message.experiment_id in (self._ended, self._running):
+            # It has ended, or its progress tells more than its cycles.
             return
         if message.experiment_id != self._cycles_of:
             self._cycles_of = message.experiment_id
@@ -99,6 +105,8 @@ class IdentifierNode(ServedNode):
         """Take an experiment that is under way, to be fitted once nothing else waits."""
         if message.experiment_id == self._ended:
             return
+        if message.experiment_id != self._running:
+            self._running, self._running_fit = message.experiment_id, RunningFit()
         waiting, self._progress = self._progress, message
         if waiting is None:
             self.defer_until_idle(self._fit_progress)
@@ -112,7 +120,10 @@ class IdentifierNode(ServedNode):
         except RelayAutotuneError as error:
             self.get_logger().warning(f"progress of {message.experiment_id}: {error}")
             return
-        analysis = self._analyse(record, final=False)
+        analysis = self._guarded(
+            record,
+            partial(self._running_fit.fit, record, self._task(), *_sought(message)),
+        )
         if analysis is not None and analysis.model is not None:
             self._publish_model(analysis, final=False)
 
@@ -194,21 +205,22 @@ class IdentifierNode(ServedNode):
         response.recommended = found.recommended or 0
         return response
 
-    def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
+    def _task(self) -> Task:
         values = values_of(self, PARAMETERS)
+        return Task(values["method"], values["rule"], known_from(values), options_from(values))
+
+    def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
         earlier = self._earlier
         if final and record.outcome == Outcome.COMPLETED:
             self._earlier = record
-        asked = {
-            "method": values["method"],
-            "rule": values["rule"],
-            "known": known_from(values),
-            "options": options_from(values),
-        }
+        asked = vars(self._task())
+        if final and asked["method"] in ONLY_JOINT and earlier is not None:
+            return self._guarded(record, partial(analyse_jointly, (record, earlier), **asked))
+        return self._guarded(record, partial(analyse, record, final=final, **asked))
+
+    def _guarded(self, record: Record, analysis: Callable[[], Analysis]) -> Analysis | None:
         try:
-            if final and values["method"] in ONLY_JOINT and earlier is not None:
-                return analyse_jointly((record, earlier), **asked)
-            return analyse(record, final=final, **asked)
+            return analysis()
         except Exception as error:  # noqa: BLE001  one bad record must not end the node
             self.get_logger().error(
                 f"experiment {record.experiment_id} could not be analysed: "
@@ -226,6 +238,7 @@ class IdentifierNode(ServedNode):
             experiment_id=analysis.record.experiment_id,
             final=final,
             stamp_ns=_last_stamp(analysis.record),
+            finding=None if final else analysis.finding,
         )
         self._models.publish(message)
         if final:
@@ -244,6 +257,11 @@ class IdentifierNode(ServedNode):
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+
+def _sought(progress: Any) -> tuple[str, float]:
+    """Return what ends an experiment, and how narrow its interval has to be."""
+    return progress.sought or ULTIMATE_GAIN, progress.sought_width
 
 
 def _last_stamp(record: Record) -> int:

@@ -18,7 +18,9 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.relay_parameters import ExperimentParameters
+from relay_autotune.messages import finding_from_message
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -41,7 +43,6 @@ from relay_autotune.nodes.reports import (
     cycle_message,
     experiment_message,
     state_values,
-    why_enough,
 )
 from relay_autotune.nodes.session import Session
 from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
@@ -221,7 +222,9 @@ class RelayNode(ServedNode):
             identity, self.get_parameter("record_directory").value
         )
         session.record_with(sample)
-        session.tells_switches = not converged and not self._on_setpoint
+        if not converged and not self._on_setpoint:
+            sought = self.get_parameter("confident_of").value
+            session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
         # Numbers of several publishers cannot be told apart.
         self._counted = self._ends.measurement.get_publisher_count() == 1
         self._counter.begin()
@@ -238,8 +241,8 @@ class RelayNode(ServedNode):
         for index in range(session.published_cycles, session.experiment.cycle_count):
             self.defer(partial(self._publish_cycle, session, index))
         session.published_cycles = session.experiment.cycle_count
-        session.published_switches = session.experiment.switches
-        if session.tells_switches:
+        if (early := session.early) is not None and early.is_due(session.experiment):
+            early.look(session.experiment)
             self.defer(lambda: self._ends.progress.publish(experiment_message(session)))
 
     def _publish_cycle(self, session: Session, index: int) -> None:
@@ -288,12 +291,9 @@ class RelayNode(ServedNode):
         if session is None or name != "transfer_function" or message.experiment_id != session.id:
             return
         self._action.tell(session.experiment)
-        if self.get_parameter("stop_when").value == "confident":
-            self._end_if_confident(session, message)
-
-    def _end_if_confident(self, session: Session, model: Any) -> None:
-        reason = why_enough(session, model, self.get_parameter("confidence").value)
-        if reason:
+        if session.early is None:
+            return
+        if reason := session.early.judge(session.experiment, finding_from_message(message)):
             self._send_safe(command := session.experiment.conclude(reason))
             self._leave(session, command)
 

@@ -56,6 +56,8 @@ def experiment_message(session: Session, *, arrays: bool = True) -> Any:
         message.noise_std = math.nan
     if session.sample_count:
         set_stamp(message.header.stamp, session.start_ns)
+    if session.early is not None:
+        message.sought, message.sought_width = session.early.sought, session.early.wanted
     return message
 
 
@@ -113,21 +115,3 @@ def state_values(session: Session, lost: int) -> dict[str, object]:
         "lost samples": lost,
         "clock drift [s]": session.clocks.drift,
     }
-
-
-def why_enough(session: Session, model: Any, wanted: float) -> str:
-    """Return why a tune has found out what it should, "" if it has not.
-
-    :param session: the tune.
-    :param model: the newest `TransferFunction` message of it.
-    :param wanted: half width of the 95 % interval of K_u, as a fraction of it.
-    """
-    gain = abs(model.ultimate_gain)
-    found = 1.96 * model.ultimate_gain_std / gain if gain > 0.0 else math.nan
-    experiment = session.experiment
-    if not found <= wanted or experiment.switches < 2:
-        return ""
-    return (
-        f"after {experiment.switches} switches, {experiment.cycle_count} whole cycles, the 95 % "
-        f"interval of K_u is within {found:.3g} of it, as narrow as asked, {wanted:g}"
-    )

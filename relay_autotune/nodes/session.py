@@ -12,6 +12,7 @@ import numpy as np
 # numpy loads this with its first median, which would be 20 ms in the middle of a tune.
 import numpy.ma
 
+from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.sensor_watch import ClockWatch
 from relay_autotune.messages import start_seconds
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
@@ -43,9 +44,9 @@ class Session:
         self.experiment = experiment
         self.id = experiment_id
         self.start_ns = 0
-        self.published_cycles = self.published_switches = 0
-        self.tells_switches = False
-        """True if each switch is news, too."""
+        self.published_cycles = 0
+        self.early: EarlyEnd | None = None
+        """What ends it once it has told enough; None: nothing does."""
         self.lost_samples = 0
         self._step = experiment.step
         self._period = sample_period
@@ -79,11 +80,11 @@ class Session:
 
     @property
     def has_news(self) -> bool:
-        """True if there is a cycle, or a switch where these are told, that was not published."""
+        """True if a cycle was not published, or it is time to look whether to end."""
         experiment = self.experiment
         if experiment.cycle_count != self.published_cycles:
             return True
-        return self.tells_switches and experiment.switches != self.published_switches
+        return self.early is not None and self.early.is_due(experiment)
 
     def now_ns(self) -> int:
         """Return the present time on the clock of the experiment [ns]."""

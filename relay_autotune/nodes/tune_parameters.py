@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
 from relay_autotune.experiment.relay_parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.nodes.live_types import COMMAND_TYPES, FLOAT64
 from relay_autotune.nodes.parameters import Entry, NodeParameter
@@ -52,14 +53,21 @@ NODE_PARAMETERS = (
         "converged",
         "",
         "converged: a tune ends when min_cycles cycles agree; confident: when the 95 % interval "
-        "of K_u from identifier_node is narrow enough.",
+        "of confident_of from identifier_node is narrow enough.",
         choices=("converged", "confident"),
     ),
     NodeParameter(
-        "confidence",
-        0.02,
+        "confident_of",
+        ULTIMATE_GAIN,
         "",
-        "Half width of that interval as a fraction of K_u, for stop_when confident.",
+        "For stop_when confident: ultimate_gain, K_u; ms, the Ms that the gains would have.",
+        choices=SOUGHT,
+    ),
+    NodeParameter(
+        "confidence",
+        0.0135,
+        "",
+        "Half width of that interval as a fraction of the value, for stop_when confident.",
         1e-4,
         1.0,
     ),
