@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--wait", type=finite, default=5.0, metavar="S",
-        help="how long to look for the nodes [s] (%(default)s)",
+        help="how long the nodes may take to be there and ready [s] (%(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--report", metavar="FILE",
@@ -118,12 +118,17 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         say(PROGRAM, str(error))
         return USAGE
     with client:
+        deadline = time.monotonic() + options.wait
         client.find(options.wait, needs_identifier=not (options.dry_run or options.record_only))
-        client.ask(options.amplitude, options.dry_run)
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
-        _follow(client, shown, interrupted)
+        while True:
+            client.ask(options.amplitude, options.dry_run)
+            _follow(client, shown, interrupted)
+            if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
+                break
+            time.sleep(_TICK)
         shown.clear()
         # Nothing moves any more: whoever does not want to wait for the rest may leave.
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -29,6 +29,12 @@ from relay_autotune_msgs.msg import RelayExperiment
 
 # A relay_node that is not seen for so long during a tune is taken for gone [s].
 _GONE = 3.0
+# How reasons begin that nodes which have just started give, until they have found each other.
+_NOT_YET = (
+    "no measurement has come yet",
+    "no command would arrive",
+    "use_sim_time is true, but no time",
+)
 
 
 class TuneClient:
@@ -153,6 +159,12 @@ class TuneClient:
     def succeeded(self) -> bool:
         """Whether the goal was reached."""
         return bool(self._answer.result().status == GoalStatus.STATUS_SUCCEEDED)
+
+    @property
+    def not_ready_yet(self) -> bool:
+        """Whether the request was refused for something that may come by itself."""
+        refused = not self.succeeded and not self.result.experiment.experiment_id
+        return refused and self.result.reason.startswith(_NOT_YET)
 
     @property
     def cancelled(self) -> bool:

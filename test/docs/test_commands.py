@@ -33,7 +33,10 @@ VERBS = {
     "bag play": {"--rate"},
     "pkg prefix": {"--share"},
 }
-OTHERS = {".", "cd", "colcon", "echo", "export", "make", "pip", "python3", "rosdep", "sed"}
+OTHERS = {
+    *(".", "cd", "colcon", "echo", "export", "kill", "make", "pip", "python3", "rosdep", "sed"),
+    *("tank.json", "tune.json"),  # what follows the arrow of a line, a file
+}
 # Single words, and what only looks like a command.
 NO_COMMANDS = re.compile(r"tune \.\.\.|\w+ \d|[a-z]+ [^-].* is ")
 

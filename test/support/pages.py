@@ -88,11 +88,11 @@ def parts_of(lines: list[list[str]]) -> list[list[str]]:
     for words in lines:
         parts.append([])
         for word in words:
-            if word in ("&&", "|"):
+            if word in ("&&", "|", "&", ">"):
                 parts.append([])
             elif parts[-1] or not re.match(r"[A-Z_]+=", word):
                 parts[-1].append(word)
-    return parts
+    return [words for words in parts if words]
 
 
 def matches(shown: str, output: str) -> bool:
