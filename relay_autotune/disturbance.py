@@ -12,9 +12,10 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification
 from relay_autotune.record import Cycle, PiecewiseConstant, Record
 
-# A fit is looked at again if its residual is larger than so many times the noise, and than this
-# part of the measurement's spread; its record's end alone is better if it fits so much better.
-_MORE_THAN_NOISE = 2.0
+# A fit is looked at again if its residual is larger than so many times the noise, which is known to
+# 10 % from the 50 samples before the test, and than this part of the measurement's spread; its
+# record's end alone is better if what it leaves beyond the noise is so much less.
+_MORE_THAN_NOISE = 1.3
 _MORE_THAN_SPREAD = 0.02
 _BETTER = 0.5
 
@@ -34,6 +35,12 @@ def fits_badly(found: Identification, record: Record) -> bool:
     if residual <= _MORE_THAN_SPREAD * float(np.std(record.measurement)):
         return False
     return math.isnan(noise) or residual > _MORE_THAN_NOISE * noise
+
+
+def _unexplained(found: Identification, record: Record) -> float:
+    """Return what a model leaves beyond the noise, as a root mean square [y]."""
+    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
+    return math.sqrt(max(found.fit.residual_rms**2 - noise**2, 0.0))
 
 
 def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
@@ -87,7 +94,7 @@ def without_disturbance(
         alone = identify(end)
     except RelayAutotuneError:
         return found
-    if not alone.fit.residual_rms < _BETTER * found.fit.residual_rms:
+    if not _unexplained(alone, record) < _BETTER * _unexplained(found, record):
         return found
     left_out = len(record) - len(end)
     fitted = alone.fitted
