@@ -12,9 +12,9 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification
 from relay_autotune.record import Cycle, PiecewiseConstant, Record
 
-# A fit is looked at again if its residual is larger than so many times the noise, which is known to
-# 10 % from the 50 samples before the test, and than this part of the measurement's spread; its
-# record's end alone is better if what it leaves beyond the noise is so much less.
+# A fit is looked at again if its residual is larger than so many times the noise, known to 10 %
+# from the 50 samples before the test, and than this part of the measurement's spread; its record's
+# end alone is better if what it leaves beyond the noise is so much less.
 _MORE_THAN_NOISE = 1.3
 _MORE_THAN_SPREAD = 0.02
 _BETTER = 0.5
