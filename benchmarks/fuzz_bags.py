@@ -3,8 +3,9 @@
 Seeds of every kind (chunks plain, zstd and lz4; without chunks, index or summary; compressed as a
 whole, or message by message; our own experiments; types of every shape) are flipped, cut, spliced
 and lengthened, and their lengths, offsets, counts and texts replaced. Each is read as `replay`
-reads it in a process that is watched: a crash, an error that is not one of ours, more than 5 s
-(twice, since the machine may have been busy) or more than 1 GB is a find, and its bag is kept.
+reads it in a process that is watched: a crash, an error or a warning that is not one of ours, more
+than 5 s (twice, since the machine may have been busy) or more than 1 GB is a find, and its bag is
+kept.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import struct
 import sys
 import tempfile
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
@@ -157,6 +159,8 @@ def read(path: Path, number: int) -> str:
 
 def worker(connection: Connection, path: Path) -> None:
     """Read one bag after the other; tell what came of each, and the memory taken so far."""
+    # A warning of numpy would be a line on a command's standard error that nobody understands.
+    warnings.simplefilter("error", RuntimeWarning)
     bags = seeds()
     read_experiments_once(path, bags)
     while True:

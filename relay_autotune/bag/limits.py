@@ -29,3 +29,6 @@ LARGEST_SUMMARY = 256 << 20
 
 # Messages of a topic for which memory is set aside because the file says that it has them.
 MOST_EXPECTED = 1 << 27
+
+# No quantity of a process is beyond it, in whatever unit; its square is still a number.
+LARGEST_VALUE = 1e100

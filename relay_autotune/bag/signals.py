@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from relay_autotune.bag.limits import LARGEST_VALUE
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.messages import start_seconds
 from relay_autotune.record import FloatArray, IntArray, PiecewiseConstant, Record
@@ -38,7 +39,8 @@ def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
     :param measurement: what the loop measured.
     :param command: what it commanded; each value holds until the next.
     :param dated: whether the times are since the epoch.
-    :raises BagError: if one of them is empty, constant or not finite, or they do not overlap.
+    :raises BagError: if one of them is empty, constant, not finite or absurdly large, or they
+        do not overlap.
     """
     _check(measurement, "measurement")
     _check(command, "command")
@@ -130,13 +132,15 @@ def cut(record: Record, low: int, high: int) -> Record:
 def _check(signal: Signal, role: str) -> None:
     if len(signal) == 0:
         raise BagError(f"the {role} {signal.name} holds no value")
-    wrong = np.flatnonzero(~np.isfinite(signal.values))
+    # What is no number compares as False.
+    wrong = np.flatnonzero(~(np.abs(signal.values) <= LARGEST_VALUE))
     if wrong.size:
         where = (signal.time_ns[wrong[0]] - signal.time_ns[0]) / 1e9
         raise BagError(
             f"the {role} {signal.name} is {signal.values[wrong[0]]} at {where:g} s "
-            f"({wrong.size} of {len(signal)} values are not finite); "
-            f"leave such a stretch out of the recording"
+            f"({wrong.size} of {len(signal)} values are not finite, or beyond "
+            f"{LARGEST_VALUE:g}, which no quantity is); leave such a stretch out of the "
+            f"recording"
         )
     if bool(np.all(signal.values == signal.values[0])):
         what = "is constant" if role == "measurement" else "never changes"

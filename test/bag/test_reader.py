@@ -534,6 +534,7 @@ def test_the_same_topic_twice_is_refused(tmp_path):
         (RAMP, [2.0] * 9, r"the command /u never changes \(2 in all of 9 values\)"),
         ([*RAMP, float("nan")], SQUARE, r"the measurement /y is nan at 10 s \(1 of 101"),
         (RAMP, [0.0, float("inf")], r"the command /u is inf at 0.1 s"),
+        ([*RAMP, -1e300], SQUARE, r"the measurement /y is -1e\+300 at 10 s .*beyond 1e\+100"),
         ([], SQUARE, "the measurement /y holds no value"),
     ],
 )
