@@ -18,18 +18,11 @@ from relay_autotune.identification.cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Rival
 from relay_autotune.identification.validation import Validation
 from relay_autotune.models import TransferFunction
+from relay_autotune.notation import unit_of
 from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.tuning import Gains, ensemble
 
 FloatArray = NDArray[np.float64]
-
-UNITS = {
-    "gain": "y/u",
-    "natural_frequency": "rad/s",
-    "damping": "",
-    "ultimate_gain": "u/y",
-    "ultimate_frequency": "rad/s",
-}
 
 
 @dataclass(frozen=True)
@@ -253,17 +246,6 @@ def model_case(found: Identification, truth: TransferFunction | None) -> ModelCa
     )
 
 
-def unit_of(parameter: str, model: TransferFunction) -> str:
-    """Return the unit of a model's parameter.
-
-    :param parameter: its name.
-    :param model: the transfer function, whose integrators the gain's unit depends on.
-    """
-    if parameter == "gain" and model.integrators > 0:
-        return "y/(u s)" if model.integrators == 1 else f"y/(u s^{model.integrators})"
-    return UNITS.get(parameter, "s")
-
-
 def true_value(parameter: str, model: TransferFunction, truth: TransferFunction | None) -> float:
     """Return what a parameter is in truth, NaN where that is not known or not comparable.
 
@@ -308,9 +290,16 @@ def ultimate_estimates(
         return ()
     true = ultimate_point(truth) if truth is not None else None
     rows = (
-        ("ultimate_gain", gain, gain_std, math.nan if true is None else true.gain),
-        ("ultimate_frequency", frequency, frequency_std, true.frequency if true else math.nan),
+        ("ultimate_gain", gain, gain_std, math.nan if true is None else true.gain, "u/y"),
+        (
+            "ultimate_frequency",
+            frequency,
+            frequency_std,
+            math.nan if true is None else true.frequency,
+            "rad/s",
+        ),
     )
     return tuple(
-        Estimate(n, v, v - 1.96 * std, v + 1.96 * std, UNITS[n], truth=t) for n, v, std, t in rows
+        Estimate(n, v, v - 1.96 * std, v + 1.96 * std, unit, truth=t)
+        for n, v, std, t, unit in rows
     )

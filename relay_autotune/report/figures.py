@@ -166,8 +166,9 @@ PLATES = (
         draw_nyquist,
         _without_gains,
         "The loop of recommended controller and process. Its distance from the point -1 is the "
-        "robustness: the dashed circle touches it, and its radius is 1/Ms. Good: the band stays "
-        "away from the circle's centre. Bad: it comes within half a unit of -1.",
+        "robustness: the dashed circle touches it, and its radius is 1/Ms. The square and the "
+        "triangle are where gain and phase margin are read. Good: the band stays away from the "
+        "circle's centre. Bad: it comes within half a unit of -1.",
         lambda _: (5.3, 4.6),
         wide=False,
     ),
@@ -187,8 +188,8 @@ PLATES = (
         draw_closed_loop,
         _without_gains,
         "A step of the set-point, then one of the load at the process input, on the identified "
-        "model. Good: one small overshoot and a quick return. Bad: ringing, or a load error "
-        "that lingers.",
+        "model and on some of those within its uncertainty. Good: one small overshoot and a quick "
+        "return, on all of them. Bad: ringing, or a load error that lingers.",
         lambda _: (4.6, 5.0),
     ),
     Plate(

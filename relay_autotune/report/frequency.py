@@ -13,8 +13,10 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import (
     BLUE,
+    GREEN,
     INK,
     MUTED,
+    ORANGE,
     PAPER,
     SKY,
     VERMILLION,
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.path import Path
+
+    from relay_autotune.tuning import Gains
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -43,7 +47,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     :param figure: empty, to be drawn into.
     :param narrow: True if it is for a narrow screen.
     """
-    from matplotlib.patches import Circle, PathPatch
+    from matplotlib.patches import PathPatch
 
     gains, found = case.best_gains, case.model
     assert gains is not None
@@ -51,12 +55,13 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     axes = figure.subplots()
     loop = gains.loop(in_loop(case, found.model))
     w = _loop_frequencies(loop)
-    circle = Circle((-1.0, 0.0), 1.0 / gains.ms, fill=False, ec=VERMILLION, lw=1.5, ls=(0, (5, 2)))
-    circle.set_label(f"Ms = {gains.ms:.2f}")
-    axes.add_patch(circle)
-    unit = Circle((0.0, 0.0), 1.0, fill=False, ec=MUTED, lw=0.9, ls=(0, (1, 2)))
-    unit.set_label("unit circle")
-    axes.add_patch(unit)
+    turn = np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
+    near_point = -1.0 + turn / gains.ms
+    axes.plot(
+        near_point.real, near_point.imag, color=VERMILLION, lw=1.5, ls=(0, (5, 2)),
+        label=f"Ms = {gains.ms:.2f}",
+    )  # fmt: skip
+    axes.plot(turn.real, turn.imag, color=MUTED, lw=0.9, ls=(0, (1, 2)), label="unit circle")
     limits = (-2.3, 1.3), (-2.3, 1.3)
     if case.models_around:
         grid = w[:: max(1, w.size // 140)]
@@ -72,12 +77,35 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
         controller = gains(1j * measured) * np.exp(-1j * measured * case.added_delay)
         at = controller * np.array([p.value for p in case.points])
         axes.plot(at.real, at.imag, "D", ms=5, mfc=PAPER, mec=INK, mew=1.3, label="measured")
+    _margins(axes, gains, values)
     axes.plot([-1.0], [0.0], "+", ms=11, mew=2.0, color=INK)
     axes.annotate("-1", (-1.0, 0.0), (-4, 5), textcoords="offset points", ha="right", color=INK)
     axes.set(xlim=limits[0], ylim=limits[1], aspect="equal")
     axes.set(xlabel="real part", ylabel="imaginary part")
     legend(figure, columns=2 if narrow else 3)
     finish(figure)
+
+
+def _margins(axes: Axes, gains: Gains, loop: ComplexArray) -> None:
+    """Mark where the loop crosses the real axis and the unit circle.
+
+    :param axes: of the Nyquist figure.
+    :param gains: with their margins.
+    :param loop: its values, shape (f,), whose side of the axis the second crossing takes.
+    """
+    if math.isfinite(gains.gain_margin) and gains.gain_margin > 0.0:
+        axes.plot(
+            [-1.0 / gains.gain_margin], [0.0], "s", ms=6.5, color=GREEN, zorder=3,
+            label=f"gain margin {gains.gain_margin:.2f}",
+        )  # fmt: skip
+    if math.isfinite(gains.phase_margin) and gains.phase_margin < math.pi:
+        lead = np.exp(1j * gains.phase_margin * np.array((1.0, -1.0)))
+        at = min(-lead, key=lambda z: float(np.min(np.abs(loop - z))))
+        axes.plot([0.0, at.real], [0.0, at.imag], color=ORANGE, lw=1.2, zorder=2)
+        axes.plot(
+            [at.real], [at.imag], "^", ms=7.5, color=ORANGE, zorder=3,
+            label=f"phase margin {math.degrees(gains.phase_margin):.0f}°",
+        )  # fmt: skip
 
 
 def _loop_frequencies(loop: TransferFunction) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.models import TransferFunction
 from relay_autotune.report.case import Case, in_loop
-from relay_autotune.report.style import BLUE, INK, MUTED, VERMILLION, finish, in_steps
+from relay_autotune.report.style import BLUE, INK, MUTED, SKY, VERMILLION, finish, in_steps, legend
 from relay_autotune.tuning import Gains
 from relay_autotune.tuning.closed_loop import ClosedLoop, simulate_closed_loop
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 _SAMPLES = 500
+# Of the models within the uncertainty, so many are simulated.
+_SHOWN = 10
 
 
 def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
@@ -33,8 +35,15 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     model = in_loop(case, case.model.model)
     half = _half(case.best_gains, model)
     run = _run(case.best_gains, model, half)
+    for other in case.models_around[:: max(1, len(case.models_around) // _SHOWN)]:
+        around = _run(case.best_gains, in_loop(case, other), half)
+        if around is not None:
+            above.plot(
+                around.time, around.measurement, color=SKY, lw=1.0, alpha=0.8,
+                label="models within the uncertainty",
+            )  # fmt: skip
     if run is not None:
-        above.plot(run.time, run.measurement, color=VERMILLION, lw=2.0)
+        above.plot(run.time, run.measurement, color=VERMILLION, lw=2.0, label="the model")
         below.plot(*in_steps(run.time, run.command), color=BLUE, lw=1.5)
     _steps(above, half)
     below.axvline(half, color=MUTED, lw=0.9, ls=(0, (1, 2)))
@@ -47,6 +56,11 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     split = "\n" if narrow else " "
     above.set_ylabel(f"measurement,{split}deviation [y]")
     below.set(ylabel="command,\ndeviation [u]", xlabel="time [s]")
+    # A loop that is not stable on a model far out is not worth the scale of all others.
+    low, high = above.get_ylim()
+    above.set_ylim(max(low, -1.0), min(high, 2.5))
+    if case.models_around:
+        legend(figure, columns=2)
     finish(figure)
 
 

@@ -27,7 +27,6 @@ from relay_autotune.report.findings import (
 )
 from relay_autotune.report.style import COLOURS, inline
 
-_NOTHING = Markup()
 # Of the page itself, in dark mode; those of figures come from COLOURS.
 _NIGHT = (
     "--page: #101318; --card: #171b21; --line: #2c343d; --text: #e8ebee; --soft: #9fabb7; "
@@ -95,6 +94,7 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
         "digits": digits,
         "degrees": math.degrees,
         "signed": lambda value: f"{value:+.2f}",
+        "percent": lambda share: digits(100.0 * share, 2) if share * 100.0 >= 0.05 else "0",
         "known": math.isfinite,
         "process_text": process_text,
         "mathml": lambda model: Markup(process_mathml(model)),
@@ -143,6 +143,7 @@ def _drawn(plate: Plate, case: Case, prefix: str, *, alone: bool) -> _Drawn:
         ids = f"{anchor}-{'narrow' if narrow else 'broad'}"
         return Markup(inline(plate.figure(case, narrow=narrow), ids, label))
 
-    slim = svg(narrow=True) if plate.wide else _NOTHING
     only = alone and not plate.wide
-    return _Drawn(anchor, plate.title, reading, plate.wide, only, svg(narrow=False), slim)
+    return _Drawn(
+        anchor, plate.title, reading, plate.wide, only, svg(narrow=False), svg(narrow=True)
+    )
