@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.cycles import limit_cycle
-from relay_autotune.notation import date_text, digits, process_text
+from relay_autotune.notation import date_text, digits, process_text, unit_of
 from relay_autotune.record import Outcome, Record
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ _WIDTH = 99
 _RIVALS = 3
 _INDENT = "  "
 _LABEL = 16
-
-_UNITS = {"gain": "y/u", "ultimate_gain": "u/y"}
 
 
 def table(bag: str, analyses: Sequence[Analysis]) -> str:
@@ -104,7 +102,7 @@ def identification_lines(found: Identification) -> list[str]:
         end = digits(high) if np.isfinite(high) else "any"
         interval = f"95 %: {digits(low)} to {end}" if np.isfinite(low) else ""
         doubt = "   not determined" if label in found.undetermined else ""
-        unit = _UNITS.get(label, "s")
+        unit = unit_of(label, found.model)
         lines.append(_row(label.replace("_", " "), value, unit, interval + doubt))
     for label, value, std, unit in (
         ("ultimate gain", found.ultimate_gain, found.ultimate_gain_std, "u/y"),

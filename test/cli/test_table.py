@@ -26,3 +26,31 @@ def test_no_model_is_wider_than_the_page(model):
     text = " ".join(" ".join(lines).split())
     assert f"({model.structure}, waveform)" in text
     assert "(lag_complex, 12 % of the support)" in text
+
+
+def test_every_parameter_has_its_own_unit():
+    """A frequency and a damping are no times, and an integrator's gain is a rate."""
+    oscillator = TransferFunction.oscillator(2.0, 0.5, 0.4, 0.1)
+    names = ("gain", "natural_frequency", "damping", "dead_time")
+    values = np.array((2.0, 0.5, 0.4, 0.1))
+    lines = identification_lines(
+        Identification(
+            *("waveform", oscillator, lambda _: oscillator, names, values, np.eye(4)),
+            *(0.9 * values, 1.1 * values),
+        )
+    )
+    told = {" ".join(line.split()) for line in lines}
+    assert {
+        "gain 2.000 y/u 95 %: 1.800 to 2.200",
+        "natural frequency 0.5000 rad/s 95 %: 0.4500 to 0.5500",
+        "damping 0.4000 95 %: 0.3600 to 0.4400",
+        "dead time 0.1000 s 95 %: 0.09000 to 0.1100",
+    } <= told
+    tank = TransferFunction.ipdt(2.0, 0.1)
+    lines = identification_lines(
+        Identification(
+            *("waveform", tank, lambda _: tank, ("gain",), np.array((2.0,)), np.eye(1)),
+            *(np.array((1.9,)), np.array((2.1,))),
+        )
+    )
+    assert "gain 2.000 y/(u s) 95 %: 1.900 to 2.100" in {" ".join(line.split()) for line in lines}
