@@ -2,7 +2,7 @@
 
 Usage, after `. ./env.sh`:
 
-    python3 benchmarks/endurance.py [--seconds 600] [--rate 1000] [--load 2] [--quick]
+    python3 benchmarks/endurance.py [--seconds 600] [--rate 1000] [--load 2] [--nice 0] [--quick]
 
 The installed plant_node, relay_node and identifier_node form a loop; a bare rclpy node, which
 publishes what it receives, listens to the same measurement. Processes that only spin load the two
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import array
-import contextlib
 import os
 import signal
 import subprocess
@@ -31,9 +30,10 @@ import numpy as np
 import rclpy
 from markdown import table
 from numpy.typing import NDArray
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
@@ -74,7 +74,9 @@ TUNE = {
 
 def echo(file: Path) -> None:
     """Be the bare node; keep when each sample was taken and when it was answered."""
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    ended: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: ended.append(number))
     node = Node("echo", namespace="bare")
     publisher = node.create_publisher(Float64, "command", QOS)
     source, sent, number = (array.array("q") for _ in range(3))
@@ -86,8 +88,10 @@ def echo(file: Path) -> None:
         number.append(info["publication_sequence_number"])
 
     node.create_subscription(Float64, "/tuned/measurement", answer, QOS)
-    with contextlib.suppress(ExternalShutdownException, KeyboardInterrupt):
-        rclpy.spin(node)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not ended:
+        executor.spin_once(timeout_sec=0.1)
     np.savez(file, source=source, sent=sent, number=number)
 
 
@@ -116,7 +120,9 @@ class Watched:
 class Bench:
     """Starts the processes, runs the tune and keeps what is to be known."""
 
-    def __init__(self, rate: float, load: int, folder: Path, environment: dict[str, str]) -> None:
+    def __init__(
+        self, rate: float, load: int, nice: int, folder: Path, environment: dict[str, str]
+    ) -> None:
         self.rate, self.folder = rate, folder
         self.watched = Watched()
         rclpy.init()
@@ -137,7 +143,7 @@ class Bench:
             "relay": _node("relay_node", tune),
             "identifier": _node("identifier_node", {}),
             "plant": _node("plant_node", plant),
-            **{f"load {k}": [*this, "spin"] for k in range(load)},
+            **{f"load {k}": [*this, "spin", "--nice", str(nice)] for k in range(load)},
         }
         self.processes = {
             name: subprocess.Popen(command, env=environment) for name, command in commands.items()
@@ -277,6 +283,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=600.0, help="of the tune [s]")
     parser.add_argument("--rate", type=float, default=1000.0, help="measurements a second")
     parser.add_argument("--load", type=int, default=2, help="spinning processes")
+    parser.add_argument("--nice", type=int, default=0, help="niceness of the spinning processes")
     parser.add_argument("--quick", action="store_true", help="a few seconds, only to see it run")
     parser.add_argument("--role", choices=("echo", "spin"), help=argparse.SUPPRESS)
     parser.add_argument("--file", type=Path, help=argparse.SUPPRESS)
@@ -285,6 +292,7 @@ def main() -> int:
         echo(options.file)
         return 0
     if options.role == "spin":
+        os.nice(options.nice)
         spin()
     from ros_domain import free_domain
 
@@ -294,7 +302,7 @@ def main() -> int:
     with free_domain() as domain, tempfile.TemporaryDirectory() as folder:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        bench = Bench(options.rate, options.load, Path(folder), dict(os.environ))
+        bench = Bench(options.rate, options.load, options.nice, Path(folder), dict(os.environ))
         try:
             bench.run(options.seconds)
         finally:

@@ -21,6 +21,8 @@ _MOST_TRIALS = 12
 _CLOSE = 0.02
 _SETTLED = 1e-2
 _FAR = 8.0
+# Logarithm of a gain beyond which products of it are no numbers.
+_LARGEST = 300.0
 _FURTHER = 4.0
 _NARROW = 0.3
 # Of the way to a place far above, a straight line says nothing.
@@ -141,7 +143,7 @@ def _hold(
 
     def unpacked(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         c = x[:k].copy()
-        c[0] = sign * math.exp(min(c[0], 700.0))
+        c[0] = sign * math.exp(min(c[0], _LARGEST))
         c[1:own] *= c[0]
         return x[k:], c
 
@@ -162,6 +164,8 @@ def _hold(
         if not (math.isfinite(miss) and bool(np.all(np.isfinite(gradient)))):
             return None
         previous, cost = cost, float(residual @ residual)
+        if not math.isfinite(cost):
+            return None
         small = abs(miss) <= 1e-6 * (abs(target) or 1.0)
         if small and abs(previous - cost) <= _SETTLED * cost / residual.size:
             return theta, coefficients, cost
