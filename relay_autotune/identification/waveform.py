@@ -43,6 +43,8 @@ from relay_autotune.record import Input, Record
 
 FloatArray = NDArray[np.float64]
 
+# So many samples at two values alone are no measurement, however coarse.
+_ENOUGH_FOR_TWO = 20
 _LEAST_SAMPLES = 12
 _MOST_FOR_CHOICE = 16_384
 # Beyond, what is not known of a process is not hidden in noise.
@@ -275,6 +277,12 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
         raise IdentificationError(
             f"the measurement is constant at {y[0]:g} although the command changes: check the "
             "sensor, the actuator and that both topics belong to one loop"
+        )
+    if y.size >= _ENOUGH_FOR_TWO and np.all((y == y.min()) | (y == y.max())):
+        raise IdentificationError(
+            f"the measurement takes two values only, {y.min():g} and {y.max():g}, as a relay's "
+            "command does: check that the two are not the wrong way round, or raise the amplitude "
+            "above the sensor's step"
         )
 
 

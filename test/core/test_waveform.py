@@ -206,6 +206,7 @@ def test_whether_a_slow_process_integrates_is_said_to_be_open():
     [
         (np.arange(100.0), np.zeros(100), "command never changes"),
         (np.full(100, 7.0), np.arange(100) // 50 * 1.0, "constant at 7"),
+        (np.arange(100) // 20 % 2 * 5.0, np.sin(np.arange(100)), "the wrong way round"),
         (
             np.random.default_rng(0).standard_normal(100),
             np.arange(100) // 50 * 1.0,
