@@ -53,12 +53,12 @@ class Path:
         fits = end - begin >= _ENCAPSULATION
         # A message shorter than that may lie at the very end.
         kinds = every_byte(content, "<u2")[begin if fits.all() else np.where(fits, begin, 0)]
-        little, big = (kinds == 0x0100) & fits, (kinds == 0x0000) & fits
+        little = (kinds == 0x0100) & fits
         if bool(little.all()):
             return self._of_one_order(content, begin, end, "<")
         values = np.zeros(begin.size)
         good = np.zeros(begin.size, dtype=np.bool_)
-        for order, chosen in (("<", little), (">", big)):
+        for order, chosen in (("<", little), (">", (kinds == 0x0000) & fits)):
             at = np.flatnonzero(chosen)
             if at.size:
                 values[at], good[at] = self._of_one_order(content, begin[at], end[at], order)

@@ -164,20 +164,18 @@ def messages_at(
     """
     heads = _heads(content, offsets)
     length = heads["length"].astype(np.int64)
-    begin = offsets + (RECORD.size + MESSAGE_HEAD_SIZE)
-    end = offsets + RECORD.size + length
+    body = offsets + RECORD.size
     wrong = (
         (heads["opcode"] != MESSAGE)
         | (heads["channel"] != channel)
         # A length beyond the signed range is negative here.
         | (length < MESSAGE_HEAD_SIZE)
-        | (length > len(content))
-        | (end > (len(content) if limit is None else limit))
+        | (length > (len(content) if limit is None else limit) - body)
     )
     if bool(wrong.any()):
         raise DamageError("an index does not lead to a message of its channel")
     times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
-    return Messages(content, offsets, *times, begin, end)
+    return Messages(content, offsets, *times, body + MESSAGE_HEAD_SIZE, body + length)
 
 
 def messages_by_channel(
@@ -203,7 +201,9 @@ def messages_by_channel(
 def nanoseconds(values: NDArray[np.uint64]) -> IntArray:
     """Return times as signed numbers; one beyond their range is no time of any clock."""
     signed = values.astype(np.int64)
-    signed[signed < 0] = np.iinfo(np.int64).max
+    beyond = signed < 0
+    if bool(beyond.any()):
+        signed[beyond] = np.iinfo(np.int64).max
     return signed
 
 
