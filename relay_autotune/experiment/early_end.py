@@ -73,9 +73,10 @@ class Finding:
 class EarlyEnd:
     """End an experiment once an interval is as narrow as asked.
 
-    Between the switches of the relay it is looked at again when the time since the kick has
-    grown by a share that depends on how far the interval still is from what is asked; so the
-    looks, each a fit of the whole record, cost the same for any sampling rate.
+    It is looked at again when the time since the kick has grown by a share that depends on how
+    far the interval still is from what is asked, or at a switch of the relay where it has grown
+    by the least share; so the looks, each a fit of the whole record, cost no more the longer it
+    lasts or the faster it is sampled.
 
     :param sought: which interval, one of ``SOUGHT``.
     :param wanted: half its width, as a fraction of the value.
@@ -84,23 +85,24 @@ class EarlyEnd:
     def __init__(self, sought: str, wanted: float) -> None:
         self.sought, self.wanted = sought, wanted
         self._switches = 0
-        self._next = 0.0
+        self._last = 0.0
         self._waits = False
         self._growth = _MOST_GROWTH
 
     def is_due(self, running: Running) -> bool:
         """Return True if the experiment is to be looked at.
 
-        That is at each switch from the first half cycle on; in between, once the last look was
-        answered and enough time has gone by.
+        That is from the first half cycle on; in between switches, once the last look was answered
+        and enough time has gone by.
 
         :param running: the experiment.
         """
         if running.switches < _LEAST_SWITCHES:
             return False
+        since = running.elapsed - running.kicked_at
         if running.switches != self._switches:
-            return True
-        return not self._waits and running.elapsed - running.kicked_at >= self._next
+            return since >= _LEAST_GROWTH * self._last
+        return not self._waits and since >= self._growth * self._last
 
     def look(self, running: Running) -> None:
         """Note that the experiment is looked at now.
@@ -108,7 +110,7 @@ class EarlyEnd:
         :param running: the experiment.
         """
         self._switches = running.switches
-        self._next = (running.elapsed - running.kicked_at) * self._growth
+        self._last = running.elapsed - running.kicked_at
         self._waits = True
 
     def judge(self, running: Running, found: Finding) -> str:
@@ -119,10 +121,8 @@ class EarlyEnd:
         """
         width = found.width(self.sought)
         ratio = width / self.wanted if width > 0.0 else math.inf
-        last = self._next / self._growth
         growth = ratio ** (1.0 / _STEEPNESS) if ratio > 1.0 else 1.0
         self._growth = min(max(growth, _LEAST_GROWTH), _MOST_GROWTH)
-        self._next = last * self._growth
         self._waits = False
         if not width <= self.wanted or running.switches < _LEAST_SWITCHES:
             return ""

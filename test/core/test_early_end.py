@@ -37,10 +37,18 @@ def _known_to(width: float) -> Finding:
     return Finding(ultimate_gain=-4.0, ultimate_gain_std=4.0 * width / 1.96)
 
 
-def test_it_is_looked_at_at_each_switch_from_the_first_half_cycle_on():
+def test_it_is_looked_at_at_switches_from_the_first_half_cycle_on():
     early = EarlyEnd(ULTIMATE_GAIN, 0.02)
-    for switches, due in ((0, False), (1, False), (2, True), (3, True)):
-        running = Progress(switches=switches)
+    for switches, elapsed, due in (
+        (0, 8.0, False),
+        (1, 9.0, False),
+        (2, 10.0, True),
+        # A relay that chatters tells nothing new.
+        (3, 10.1, False),
+        (4, 10.2, True),
+        (5, 12.0, True),
+    ):
+        running = Progress(switches=switches, elapsed=elapsed)
         assert early.is_due(running) is due
         if due:
             early.look(running)

@@ -20,7 +20,7 @@ from relay_autotune.nodes.identifier import PARAMETERS, IdentifierNode
 from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
 from relay_autotune.record import RelaySettings
 from relay_autotune.simulation import simulate_relay
-from relay_autotune_msgs.msg import RelayExperiment
+from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 PROCESS = TransferFunction.lag_n(2.0, 3.0, 2, 1.0)
 NOTHING = {entry.name: entry.default for entry in KNOWN_PARAMETERS}
@@ -81,3 +81,29 @@ def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
     assert not refused.successful
     assert "not zero" in refused.reason
     assert {entry.name for entry in KNOWN_PARAMETERS} <= {entry.name for entry in PARAMETERS}
+
+
+def test_progress_is_answered_with_what_is_sought(
+    node: IdentifierNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(node._models, "publish", told.append)
+    monkeypatch.setattr(node, "defer_until_idle", lambda work: work())
+    progress = experiment(0.0)
+    progress.outcome = RelayExperiment.UNKNOWN
+    progress.sought, progress.sought_width = "ms", 0.02
+    node._on_progress(progress)
+    (model,) = told
+    assert not model.final
+    # Without noise all is known, and the gains keep the Ms that they are designed for.
+    assert model.ms == pytest.approx(1.4, rel=0.01)
+    assert model.ms_low <= model.ms <= model.ms_high < 1.42
+    # Its cycles, which come besides, tell nothing more.
+    cycle = RelayCycle(experiment_id=progress.experiment_id)
+    node._on_cycle(cycle)
+    assert len(told) == 1
+
+    progress.sought = "ultimate_gain"
+    node._on_progress(progress)
+    assert told[-1].ultimate_gain_std < 0.01 * told[-1].ultimate_gain
+    assert math.isnan(told[-1].ms)
