@@ -90,7 +90,8 @@ class TuneClient:
         """
         deadline = time.monotonic() + patience
         if not self._wait(self._client.server_is_ready, deadline):
-            others = ", ".join(self._owners("/tune")) or "none"
+            # This client itself is in the graph under the name that it looks for.
+            others = ", ".join(n for n in self._owners("/tune") if n != self.name) or "none"
             raise LoopError(
                 f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
                 f"{others}. Start it, or name another with --namespace and --node"

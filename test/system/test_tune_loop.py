@@ -108,6 +108,7 @@ def test_without_a_relay_node_it_says_so_in_one_line(rig: Rig) -> None:
     status, output, said = run(rig, "--namespace", "tank", "--wait", "0.2")
     assert (status, output) == (1, "")
     assert said.startswith("tune_loop: no relay_node /tank/relay_node within 0.2 s")
+    assert "nodes that offer a tune: none." in said
     assert said.count("\n") == 1
     status, output, said = run(rig, "--report", "page.doc")
     assert (status, output) == (2, "")
