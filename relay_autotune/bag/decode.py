@@ -44,6 +44,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "command": (),
         "cycle_start": (),
         "lost_samples": 0,
+        "sought": "",
+        "sought_width": 0.0,
     },
     CYCLE: {
         "header": _HEADER,

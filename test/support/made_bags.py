@@ -83,6 +83,8 @@ def blank_experiment() -> SimpleNamespace:
         command=[],
         cycle_start=[],
         lost_samples=0,
+        sought="",
+        sought_width=0.0,
     )
 
 
