@@ -1,0 +1,105 @@
+"""What a record can tell of K_u at best: the Cramer-Rao bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from processes import true_point
+
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Record
+from relay_autotune.response import response
+
+FloatArray = NDArray[np.float64]
+
+_STEP = 1e-5
+# A direction of which the samples tell less than this part of what they tell of the best one.
+_UNSEEN = 1e-13
+_FELT = 1e-9
+
+
+def relative_bounds(
+    model: TransferFunction, record: Record, noise_std: float, times: FloatArray
+) -> FloatArray:
+    """Return the least standard deviation of K_u over K_u that any unbiased estimate can have.
+
+    With J the derivatives of the samples up to each time by the parameters of the true structure
+    and by an offset, and g that of K_u,  sqrt(g (J'J/s^2)^-1 g').
+
+    :param model: the true process, its structure known; equal lags are one parameter.
+    :param record: its commands and the times of its samples.
+    :param noise_std: of white Gaussian noise, s [y].
+    :param times: shape (m,) [s].
+    :return: shape (m,); infinite where the samples do not show K_u.
+    """
+    build, values = _parameters(model)
+    gain = true_point(model).gain
+    rows, gradient = [], []
+    u = record.input()
+    for i, value in enumerate(values):
+        ends = [values.copy(), values.copy()]
+        ends[0][i] += _STEP * value
+        ends[1][i] -= _STEP * value
+        up, down = build(ends[0]), build(ends[1])
+        change = response(up, record.time, u) - response(down, record.time, u)
+        rows.append(change / (2.0 * _STEP * abs(value)))
+        gains = true_point(up).gain - true_point(down).gain
+        gradient.append(gains / (2.0 * _STEP * abs(value) * gain))
+    jacobian = np.array([*rows, np.ones(record.time.size)])
+    size = np.linalg.norm(jacobian, axis=1)
+    jacobian, g = jacobian / size[:, None] / noise_std, np.array([*gradient, 0.0]) / size
+    found = []
+    for t in times:
+        part = jacobian[:, : int(np.searchsorted(record.time, t, side="right"))]
+        information, directions = np.linalg.eigh(part @ part.T)
+        along = directions.T @ g
+        seen = information > _UNSEEN * information.max()
+        hidden = np.abs(along[~seen]).max(initial=0.0) > _FELT * np.abs(along).max()
+        variance = float(np.sum(along[seen] ** 2 / information[seen]))
+        found.append(math.inf if hidden else math.sqrt(variance))
+    return np.array(found)
+
+
+def _parameters(
+    model: TransferFunction,
+) -> tuple[Callable[[FloatArray], TransferFunction], FloatArray]:
+    """Return the transfer function of any values of the true structure, and the true values."""
+    order, delay, gain = model.order, model.dead_time, model.gain
+    constants, zeros = model.time_constants, [z.real for z in model.zeros]
+    lags = [t.real for t in constants if t.imag == 0.0]
+    build = TransferFunction
+    match model.structure:
+        case "lag_n":
+            return lambda v: build.lag_n(v[0], v[1], order, v[2]), np.array((gain, lags[0], delay))
+        case "lag_n_zero":
+            return (
+                lambda v: build.lag_n_zero(v[0], v[1], order, v[2], v[3]),
+                np.array((gain, lags[0], zeros[0], delay)),
+            )
+        case "lag_complex":
+            pair = next(t for t in constants if t.imag != 0.0)
+            return (
+                lambda v: build.lag_complex(v[0], v[1], v[2], v[3], v[4]),
+                np.array((gain, lags[0], 1.0 / abs(pair), pair.real / abs(pair), delay)),
+            )
+        case "fopdt":
+            return lambda v: build.fopdt(v[0], v[1], v[2]), np.array((gain, lags[0], delay))
+        case "sopdt":
+            return (
+                lambda v: build.sopdt(v[0], (v[1], v[2]), v[3]),
+                np.array((gain, lags[0], lags[1], delay)),
+            )
+        case "unstable_fopdt":
+            return (
+                lambda v: build.unstable_fopdt(v[0], v[1], v[2]),
+                np.array((abs(gain), abs(lags[0]), delay)),
+            )
+        case "integrator_inverse":
+            return (
+                lambda v: build.integrator_inverse(v[0], v[1], v[2], v[3]),
+                np.array((gain, -zeros[0], lags[0], delay)),
+            )
+    raise ValueError(f"no parameters of a {model.structure} are known here")
