@@ -14,6 +14,8 @@ from rclpy.node import Node
 # The guard looks so often [s], and at the graph every so many looks.
 LOOK_EVERY = 0.05
 _GRAPH_EVERY = 4
+# What the middleware says of a publisher whose node it has not heard of yet.
+_UNKNOWN = "NODE_NAME_UNKNOWN"
 
 # An actuator that is too slow for the time limit is seen by so many of its last stays in which it
 # never came to the level it was told.
@@ -110,9 +112,9 @@ def second_publisher(node: Node, topic: str) -> str:
     others = {
         f"{end.node_namespace.rstrip('/')}/{end.node_name}"
         for end in node.get_publishers_info_by_topic(topic)
-        if (end.node_namespace, end.node_name) != me
+        if (end.node_namespace, end.node_name) != me and _UNKNOWN not in end.node_name
     }
-    who = ", ".join(sorted(others)) or "another publisher of this node's name"
+    who = ", ".join(sorted(others)) or "another node"
     return f"{topic} is also published by {who}: two of them would fight for the actuator"
 
 
