@@ -2,103 +2,126 @@
 
 Usage, after `. ./env.sh`:
 
-    python3 benchmarks/fault_table.py [--runs 200] [--quick]
+    python3 benchmarks/fault_table.py [--runs 200] [--minutes 60] [--workers 2] [--quick]
 
-One relay_node serves all runs, as in test/system/test_faults.py, from which the faults come. A
-run has passed if the tune ended with the expected reason and outcome, the safe command is the
-last one and stays, and no gains came. The time is from the cause to the safe command's arrival
-here; it holds what a fault takes to show, such as the watchdog's time. Exit status 1 if one fails.
+The faults and the loop are those of test/system/test_faults.py, see test/support/faults.py: a run
+has passed if the tune ended with the expected reason and outcome, the safe command is the last one
+and stays, and no gains came. One relay_node serves all runs of a worker but for those that end it.
+The time is from the cause to the safe command's arrival here; it holds what a fault takes to show,
+such as the watchdog's time. Exit status 1 if a run fails.
 """
 
 from __future__ import annotations
 
 import argparse
-import random
+import multiprocessing
+import signal
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 
+import numpy as np
 from markdown import table
 
 # The rig and the faults are those of the tests.
-TEST = Path(__file__).resolve().parents[1] / "test"
-sys.path[:0] = [str(TEST / "support"), str(TEST / "system")]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
 
-import numpy as np  # noqa: E402
-from loop_rig import Rig  # noqa: E402
-from ros_domain import free_domain  # noqa: E402
-from test_faults import DEFAULTS, FAULTS, RELAY, SAFE, Loop  # noqa: E402
+from faults import FAULTS
+from faulty_loop import Loop
+from loop_rig import Rig
+from ros_domain import free_domain
 
 RUNS = 200
 
 
-def one_run(loop: Loop, fault: str) -> float:
-    """Make a fault once and return the time to the safe command [s].
+@dataclass(frozen=True)
+class Run:
+    """What came of a fault.
 
-    :raises AssertionError: if anything is not as it must be.
+    :param fault: its name.
+    :param seconds: from the cause to the safe command.
+    :param problem: what was not as it must be; empty: nothing.
     """
-    cause, moment, parameters, said = FAULTS[fault]
-    loop.set(**{**DEFAULTS, **parameters})
-    loop.tune()
-    if moment == "oscillating":
-        loop.until_it_oscillates()
-        loop.rig.run_for(random.uniform(0.0, 0.4))
-    began = time.monotonic()
-    cause(loop)
-    if moment == "start":
-        # The command is still the safe one of the run before.
-        loop.ended()
-    loop.rig.until(lambda: loop.commands[-1].data == SAFE, "the safe command")
-    taken = time.monotonic() - began
-    ended = loop.ended()
-    assert said in ended.reason, ended.reason
-    assert not loop.gains
-    loop.reset()
-    count = len(loop.commands)
-    loop.rig.until(lambda: len(loop.commands) > count + 5, "commands after the tune")
-    assert {m.data for m in loop.commands[count:]} == {SAFE}
-    return taken
+
+    fault: str
+    seconds: float
+    problem: str = ""
+
+
+def work(names: list[str], runs: int, deadline: float) -> list[Run]:
+    """Make faults in turn, each so often, or until a deadline on the steady clock."""
+    found: list[Run] = []
+    with ExitStack() as stack:
+        loops: dict[str, Loop] = {}
+
+        def loop_of(kind: str) -> Loop:
+            if kind not in loops:
+                domain = stack.enter_context(free_domain())
+                folder = stack.enter_context(tempfile.TemporaryDirectory())
+                rig = Rig(domain, Path(folder))
+                stack.callback(rig.close)
+                loops[kind] = Loop(rig, kind)
+                rig.identifier()
+            return loops[kind]
+
+        for count in range(runs):
+            for name in names:
+                if time.monotonic() > deadline:
+                    return found
+                loop = loop_of(FAULTS[name].kind)
+                try:
+                    taken = FAULTS[name].course(loop, Random(f"{name} {count}"))
+                except AssertionError as error:
+                    problem = str(error).partition("\n")[0] or "not as it must be"
+                    found.append(Run(name, np.nan, problem))
+                    print(f"{name}, run {count}: {error}", file=sys.stderr, flush=True)
+                    # The next one begins with a relay of its own.
+                    if loop.process is not None:
+                        loop.process.end()
+                        loop.process = None
+                else:
+                    found.append(Run(name, taken))
+    return found
+
+
+def end_in_order() -> None:
+    """Let a worker that is ended end the processes that it has started."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+
+
+def row(name: str, runs: list[Run]) -> tuple[object, ...]:
+    """Return a fault's row of the table."""
+    times = [run.seconds for run in runs if not run.problem]
+    shown = (f"{np.median(times):.2f}", f"{max(times):.2f}") if times else ("", "")
+    return (name, len(runs), len(times), *shown)
 
 
 def main() -> int:
     """Run the faults and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=RUNS, help="runs for each fault")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
+    parser.add_argument("--workers", type=int, default=2, help="loops at a time")
     parser.add_argument("--quick", action="store_true", help="one fault, once")
     asked = parser.parse_args()
-    random.seed(1)
-    rows, failures = [], 0
-    with free_domain() as domain, tempfile.TemporaryDirectory() as folder:
-        rig = Rig(domain, Path(folder))
-        try:
-            loop = Loop(rig)
-            rig.relay(**RELAY)
-            rig.identifier()
-            for fault in list(FAULTS)[:1] if asked.quick else FAULTS:
-                taken, failed = [], 0
-                for _ in range(1 if asked.quick else asked.runs):
-                    try:
-                        taken.append(one_run(loop, fault))
-                    except AssertionError as error:
-                        failed += 1
-                        print(f"{fault}: {str(error).splitlines()[0]}", file=sys.stderr)
-                failures += failed
-                times = np.array(taken or [float("inf")])
-                rows.append(
-                    (
-                        fault,
-                        len(taken) + failed,
-                        len(taken),
-                        f"{np.median(times):.2f}",
-                        f"{times.max():.2f}",
-                    )
-                )
-        finally:
-            rig.close()
+    deadline = time.monotonic() + 60.0 * asked.minutes
+    names = list(FAULTS)
+    if asked.quick:
+        found = work(names[2:3], 1, deadline)
+    else:
+        shares = [names[k :: asked.workers] for k in range(asked.workers)]
+        with multiprocessing.get_context("spawn").Pool(asked.workers, end_in_order) as pool:
+            parts = pool.starmap(work, [(share, asked.runs, deadline) for share in shares])
+        found = [run for part in parts for run in part]
+    by_name = {name: [run for run in found if run.fault == name] for name in names}
     headings = ("fault", "runs", "passed", "cause to safe command, median [s]", "longest [s]")
-    print(table(headings, rows))
-    return 1 if failures and not asked.quick else 0
+    print(table(headings, [row(name, runs) for name, runs in by_name.items() if runs]))
+    return 1 if any(run.problem for run in found) else 0
 
 
 if __name__ == "__main__":

@@ -79,6 +79,7 @@ class Rig:
         self.folder = folder
         self.records = folder / "records"
         self.processes: list[Process] = []
+        self.clients: dict[str, Any] = {}
         self.environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -147,11 +148,13 @@ class Rig:
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call a service and return its answer."""
-        client = self.node.create_client(kind, name)
+        # To find a service takes longer than to call it.
+        client = self.clients.get(name)
+        if client is None:
+            client = self.clients[name] = self.node.create_client(kind, name)
         self.until(client.service_is_ready, f"service {name}")
         future = client.call_async(request)
         self.until(future.done, f"answer of {name}")
-        self.node.destroy_client(client)
         return future.result()
 
     def ask_for_tune(self, **request: Any) -> Any:

@@ -1,0 +1,334 @@
+"""What can go wrong in a tune, each with the loop in which it is made and the reason expected."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from random import Random
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from faulty_loop import BASELINE, DEFAULTS, PERIOD, REST, SAFE, Loop
+from rclpy.action import ActionClient
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from relay_autotune_msgs.action import Tune
+
+BROKEN = """
+import sys
+from relay_autotune.nodes import relay
+step = relay.RelayExperiment.step
+def broken(self, time, measurement):
+    if self.sample_count == {count}:
+        raise ZeroDivisionError("a defect")
+    return step(self, time, measurement)
+relay.RelayExperiment.step = broken
+sys.exit(relay.main())
+"""
+
+
+Undo = Callable[[], object]
+Cause = Callable[[Loop, Random], "Undo | None"]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault.
+
+    :param course: makes it once, sees that all is as it must be, and returns the time from the
+        cause to the arrival of the safe command [s]; raises AssertionError otherwise.
+    :param kind: of the loop that it needs.
+    """
+
+    course: Callable[[Loop, Random], float]
+    kind: str = "plain"
+
+
+def in_a_tune(
+    cause: Cause, said: str, *, kind: str = "plain", at_start: bool = False, **parameters: Any
+) -> Fault:
+    """Return a fault that ends a tune with a reason.
+
+    :param cause: makes it; returns what undoes it, None: the loop's reset does.
+    :param said: what the reason has to contain.
+    :param kind: of the loop.
+    :param at_start: True: it is there from the start, False: from a random moment on.
+    :param parameters: of the relay, besides the usual ones.
+    """
+
+    def course(loop: Loop, random: Random) -> float:
+        have_relay(loop)
+        loop.set(**{**DEFAULTS, **parameters})
+        loop.tune()
+        if not at_start:
+            wait_for_a_moment(loop, random)
+        began = time.monotonic()
+        undo = cause(loop, random)
+        try:
+            taken = until_safe(loop, began)
+            loop.check_the_end(said)
+            loop.check_that_it_stays()
+        finally:
+            if undo is not None:
+                undo()
+        return taken
+
+    return Fault(course, kind)
+
+
+def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
+    """Return a fault with which the process of relay_node ends.
+
+    :param code: a Python text in the place of the executable; "": none.
+    :param number: signal that ends it; 0: it ends by itself.
+    :param said: what the reason has to contain.
+    :param status: its exit status.
+    """
+
+    def course(loop: Loop, random: Random) -> float:
+        replace_relay(loop, code.format(count=random.randint(60, 200)))
+        loop.tune()
+        process = loop.process
+        assert process is not None
+        if number:
+            wait_for_a_moment(loop, random)
+            began = time.monotonic()
+            process.signal(number)
+        else:
+            loop.rig.until(lambda: loop.commands[-1] != BASELINE, "a first step")
+            began = time.monotonic()
+        taken = until_safe(loop, began)
+        loop.check_the_end(said)
+        assert process.wait() == status
+        assert "Traceback" not in process.log
+        loop.process = None
+        loop.rig.run_for(0.05)
+        assert loop.commands[-1] == SAFE
+        return taken
+
+    return Fault(course)
+
+
+def have_relay(loop: Loop) -> None:
+    """Start a relay_node if there is none."""
+    if loop.process is None:
+        replace_relay(loop)
+
+
+def replace_relay(loop: Loop, code: str = "") -> None:
+    """Start a relay_node, or a Python text in its place, once there is none any more."""
+    if loop.process is not None:
+        loop.process.end()
+    node = loop.rig.node
+    loop.rig.until(
+        lambda: node.count_publishers("relay_experiment") == 0, "the end of the relay before"
+    )
+    loop.start(code)
+
+
+def wait_for_a_moment(loop: Loop, random: Random) -> None:
+    """Let the relay oscillate for a random time."""
+    loop.until_it_oscillates(random.randint(4, 9))
+    loop.rig.run_for(random.uniform(0.0, 0.1))
+
+
+def until_safe(loop: Loop, began: float) -> float:
+    """Wait for the safe command to end the tune; return the time since the cause [s]."""
+    # A command of before the start may be the same.
+    loop.rig.until(
+        lambda: loop.commands[-1] == SAFE and len(loop.commands) > 5, "the safe command"
+    )
+    return time.monotonic() - began
+
+
+def altered(change: Callable[[Loop, float], float | None]) -> Callable[[Loop, Random], None]:
+    """Return a cause that changes what the sensor says."""
+
+    def cause(loop: Loop, _: Random) -> None:
+        loop.alter = lambda y: change(loop, y)
+
+    return cause
+
+
+def frozen(loop: Loop, random: Random) -> None:
+    value = random.uniform(4.9, 5.1)
+    loop.alter = lambda _: value
+
+
+def wrong_sign(loop: Loop, _: Random) -> None:
+    loop.gain = -2.0
+
+
+def growing(loop: Loop, random: Random) -> None:
+    """Let each swing be larger than the one before, by the same factor."""
+    factor, seen, scale = random.uniform(1.2, 1.4), len(loop.commands), 1.0
+
+    def grown(y: float) -> float:
+        nonlocal seen, scale
+        switches = sum(a != b for a, b in itertools.pairwise(loop.commands[seen - 1 :]))
+        scale, seen = scale * factor**switches, len(loop.commands)
+        return REST + (y - REST) * scale
+
+    loop.alter = grown
+
+
+def clock_step(size: float) -> Callable[[Loop, Random], None]:
+    def cause(loop: Loop, random: Random) -> None:
+        loop.clock_error = size * random.uniform(1.0, 3.0)
+
+    return cause
+
+
+def second_publisher(loop: Loop, _: Random) -> Callable[[], None]:
+    other = loop.rig.node.create_publisher(Float64, "command", 10)
+    return lambda: loop.rig.node.destroy_publisher(other)
+
+
+def abort(loop: Loop, _: Random) -> None:
+    answer = loop.rig.call(Trigger, "relay_node/abort", Trigger.Request())
+    assert answer.success
+    assert "not acknowledged" not in answer.message
+
+
+def actuator(loop: Loop, random: Random) -> float:
+    """Tell the position of an actuator, which then stays where it is."""
+    stuck = False
+    publisher = loop.rig.node.create_publisher(Float64, "command_feedback", 10)
+
+    def feed() -> None:
+        if loop.commands:
+            publisher.publish(Float64(data=BASELINE - 0.35 if stuck else loop.commands[-1]))
+
+    timer = loop.rig.node.create_timer(0.01, feed)
+    try:
+        have_relay(loop)
+        loop.set(**DEFAULTS)
+        loop.rig.until(publisher.get_subscription_count, "the relay")
+        loop.rig.run_for(0.05)
+        loop.tune()
+        wait_for_a_moment(loop, random)
+        stuck, began = True, time.monotonic()
+        taken = until_safe(loop, began)
+        loop.check_the_end("the actuator does not follow")
+        loop.check_that_it_stays()
+    finally:
+        loop.rig.node.destroy_timer(timer)
+        loop.rig.node.destroy_publisher(publisher)
+    loop.rig.run_for(0.9)
+    return taken
+
+
+def controller(loop: Loop, random: Random, *, in_tune: bool) -> float:
+    """Play a controller that falls silent, in a tune or while it is passed through."""
+    wanted, speaking = random.uniform(1.2, 1.3), True
+    publisher = loop.rig.node.create_publisher(Float64, "controller_command", 10)
+    timer = loop.rig.node.create_timer(
+        PERIOD, lambda: publisher.publish(Float64(data=wanted)) if speaking else None
+    )
+    try:
+        have_relay(loop)
+        loop.set(**DEFAULTS)
+        # Idle, it is passed through untouched.
+        loop.rig.until(lambda: loop.commands and loop.commands[-1] == wanted, "the controller")
+        if in_tune:
+            loop.tune()
+            wait_for_a_moment(loop, random)
+            speaking, began = False, time.monotonic()
+            taken = until_safe(loop, began)
+            loop.check_the_end("no command on /controller_command for")
+        else:
+            loop.begin()
+            loop.rig.run_for(random.uniform(0.05, 0.2))
+            speaking, began = False, time.monotonic()
+            taken = until_safe(loop, began)
+            loop.rig.until(lambda: loop.is_said("has been silent"), "the diagnostics")
+        loop.check_that_it_stays()
+    finally:
+        loop.rig.node.destroy_timer(timer)
+        loop.rig.node.destroy_publisher(publisher)
+    return taken
+
+
+def cancelled(loop: Loop, random: Random) -> float:
+    """Cancel a goal of the action ~/tune."""
+    have_relay(loop)
+    loop.set(**DEFAULTS)
+    loop.begin()
+    client = ActionClient(loop.rig.node, Tune, "relay_node/tune")
+    loop.rig.until(client.server_is_ready, "the action")
+    loop.rig.until(lambda: loop.rig.ask_for_tune(dry_run=True).accepted, "a loop that is ready")
+    sent = client.send_goal_async(Tune.Goal())
+    loop.rig.until(sent.done, "the goal")
+    answer = sent.result().get_result_async()
+    wait_for_a_moment(loop, random)
+    began = time.monotonic()
+    sent.result().cancel_goal_async()
+    taken = until_safe(loop, began)
+    loop.check_the_end("cancelled")
+    loop.rig.until(answer.done, "the result")
+    assert answer.result().status == GoalStatus.STATUS_CANCELED
+    assert not answer.result().result.gains.experiment_id
+    loop.check_that_it_stays()
+    client.destroy()
+    return taken
+
+
+FAULTS = {
+    "silent sensor": in_a_tune(
+        altered(lambda _, y: None), "no measurement on /measurement for", measurement_timeout=1.2
+    ),
+    "frozen sensor": in_a_tune(frozen, "the sensor is frozen"),
+    "NaN from the sensor": in_a_tune(
+        altered(lambda _, y: math.nan), "is nan, expected a finite number"
+    ),
+    "infinity from the sensor": in_a_tune(
+        altered(lambda _, y: -math.inf), "is -inf, expected a finite number"
+    ),
+    "measurement limits": in_a_tune(
+        altered(lambda _, y: y + 100.0), "is outside its limits", measurement_max=50.0
+    ),
+    "largest deviation": in_a_tune(
+        altered(lambda _, y: y + 100.0), "max_deviation, 10", max_deviation=10.0
+    ),
+    "longest half cycle": in_a_tune(
+        altered(lambda loop, y: 4.9 + loop.noise()), "did not come back", max_half_cycle=0.7
+    ),
+    "longest experiment": in_a_tune(
+        lambda loop, random: None, "max_duration 1 s was over", at_start=True, max_duration=1.0
+    ),
+    "no response": in_a_tune(
+        altered(lambda loop, y: 5.0 + loop.noise()),
+        "was over while waiting",
+        at_start=True,
+        max_duration=0.5,
+    ),
+    "response that saturates": in_a_tune(
+        altered(lambda loop, y: min(y, 4.9) + 1e-2 * loop.noise()), "the response saturates"
+    ),
+    "gain of the wrong sign": in_a_tune(
+        wrong_sign, "process_gain_sign may be wrong", at_start=True
+    ),
+    "unstable growth": in_a_tune(growing, "the oscillation grows faster and faster"),
+    "step of the source's clock": in_a_tune(
+        clock_step(0.2), "a clock has stepped", kind="stamped"
+    ),
+    "source time that goes back": in_a_tune(
+        clock_step(-1.0), "time went backwards", kind="stamped"
+    ),
+    "/clock that goes back": in_a_tune(clock_step(-1.0), "time went backwards", kind="clock"),
+    "second publisher of command": in_a_tune(second_publisher, "/command is also published by "),
+    "controller silent in a tune": Fault(partial(controller, in_tune=True)),
+    "controller silent when idle": Fault(partial(controller, in_tune=False)),
+    "actuator that does not follow": Fault(actuator),
+    "abort": in_a_tune(abort, "aborted on request"),
+    "cancelled action": Fault(cancelled),
+    "SIGINT": with_the_node("", signal.SIGINT, "was stopped by SIGINT", 0),
+    "SIGTERM": with_the_node("", signal.SIGTERM, "was stopped by SIGTERM", 0),
+    "exception in a callback": with_the_node(BROKEN, 0, "ZeroDivisionError: a defect", 1),
+}

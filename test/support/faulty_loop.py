@@ -1,0 +1,225 @@
+"""A loop about a relay_node that is played by its user, fast enough for a fault in half a second.
+
+The process is of first order with dead time, and goes on while the machine is busy. The relay is a
+process of its own. The loop's three kinds differ in the message types, and in what tells the time
+of a sample.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from loop_rig import LATCHED, RELIABLE, Process, Rig
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float32, Float64, Float64MultiArray
+
+from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment
+
+BASELINE, SAFE, REST = 1.0, 0.75, 5.0
+PERIOD = 0.0025
+DEAD_TIME = 0.025
+TIME_CONSTANT = 0.05
+RELAY = {
+    "amplitude": 0.5,
+    "baseline": BASELINE,
+    "safe_command": SAFE,
+    "settle_time": 0.1,
+    # A busy machine may keep this loop waiting for seconds.
+    "measurement_timeout": 10.0,
+    "controller_timeout": 1.0,
+    "feedback_timeout": 0.4,
+    "max_cycles": 100,
+    "min_cycles": 100,
+    "process_gain_sign": 1,
+}
+# What a fault may change of the parameters, as it is without.
+DEFAULTS = {
+    "amplitude": 0.5,
+    "target_amplitude": 0.0,
+    "measurement_timeout": 10.0,
+    "measurement_max": math.inf,
+    "command_min": -math.inf,
+    "command_max": math.inf,
+    "command_rate": 0.0,
+    "max_deviation": 0.0,
+    "max_duration": 0.0,
+    "max_half_cycle": 0.0,
+}
+KINDS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    # A numeric field of a stamped message in, an array of ros2_control out.
+    "stamped": {
+        "measurement_type": "relay_autotune_msgs/msg/RelayCycle",
+        "measurement_field": "settings.setpoint",
+        "command_type": "std_msgs/msg/Float64MultiArray",
+    },
+    "clock": {"use_sim_time": True, "command_type": "std_msgs/msg/Float32"},
+}
+_COMMANDS: dict[str, tuple[Any, Callable[[Any], float]]] = {
+    "plain": (Float64, lambda message: message.data),
+    "stamped": (Float64MultiArray, lambda message: message.data[0]),
+    "clock": (Float32, lambda message: message.data),
+}
+_CLOCK_START = 100.0
+
+_TYPES = {
+    float: (ParameterType.PARAMETER_DOUBLE, "double_value"),
+    int: (ParameterType.PARAMETER_INTEGER, "integer_value"),
+    str: (ParameterType.PARAMETER_STRING, "string_value"),
+    bool: (ParameterType.PARAMETER_BOOL, "bool_value"),
+}
+
+
+class Loop:
+    """The process on the topics, and what the relay does to it.
+
+    :param rig: where the relay runs.
+    :param kind: one of `KINDS`.
+    """
+
+    def __init__(self, rig: Rig, kind: str = "plain") -> None:
+        self.rig, self.kind = rig, kind
+        self.commands: list[float] = []
+        self.experiments: list[Any] = rig.listen("relay_experiment", RelayExperiment)
+        self.gains = rig.listen("pi_gains", PidGains)
+        self.status = rig.listen("/diagnostics", DiagnosticArray, QoSProfile(depth=50))
+        command, value = _COMMANDS[kind]
+        rig.node.create_subscription(
+            command, "command", lambda m: self.commands.append(value(m)), RELIABLE
+        )
+        message = RelayCycle if kind == "stamped" else Float64
+        self.publisher = rig.node.create_publisher(message, "measurement", 100)
+        self.clock = rig.node.create_publisher(Clock, "/clock", 10) if kind == "clock" else None
+        self.process: Process | None = None
+        self.values = dict(DEFAULTS)
+        self.count = 0
+        self.reset()
+        self.timer = rig.node.create_timer(PERIOD, self.step)
+
+    # The process.
+
+    def reset(self) -> None:
+        """Bring the process to rest, and undo what a fault has changed of it."""
+        self.state, self.gain = 0.0, 2.0
+        self.alter: Callable[[float], float | None] = lambda y: y
+        self.clock_error = 0.0
+        self.now = time.monotonic()
+        self.on_the_way = deque([(self.now, 0.0)])
+
+    def step(self) -> None:
+        self.count += 1
+        before, self.now = self.now, time.monotonic()
+        command = self.commands[-1] if self.commands else BASELINE
+        if command == SAFE:
+            # The next tune begins at rest at the baseline.
+            command = BASELINE
+        self.on_the_way.append((self.now + DEAD_TIME, command - BASELINE))
+        while self.on_the_way[1][0] <= self.now:
+            self.on_the_way.popleft()
+        pushed = self.gain * self.on_the_way[0][1]
+        self.state += (pushed - self.state) * -math.expm1((before - self.now) / TIME_CONSTANT)
+        y = self.alter(REST + self.state + self.noise())
+        if y is not None:
+            self.publish(float(y))
+
+    def noise(self) -> float:
+        return 1e-4 * math.sin(7.0 * self.count**2)
+
+    def publish(self, value: float) -> None:
+        if self.clock is not None:
+            message = Clock()
+            now = _CLOCK_START + self.count * PERIOD + self.clock_error
+            message.clock.sec, message.clock.nanosec = divmod(round(now * 1e9), 1_000_000_000)
+            self.clock.publish(message)
+        if self.kind == "stamped":
+            stamped = RelayCycle()
+            stamped.settings.setpoint = value
+            ns = time.time_ns() + round(1e9 * self.clock_error)
+            stamp = stamped.header.stamp
+            stamp.sec, stamp.nanosec = divmod(ns, 1_000_000_000)
+            self.publisher.publish(stamped)
+        else:
+            self.publisher.publish(Float64(data=value))
+
+    # The relay.
+
+    def start(self, code: str = "") -> Process:
+        """Start a relay_node, or a Python text in its place."""
+        parameters = {**RELAY, **KINDS[self.kind]}
+        if code:
+            parameters["record_directory"] = str(self.rig.records)
+            self.process = self.rig.start_python("broken_relay", code, **parameters)
+        else:
+            self.process = self.rig.relay(**parameters)
+        self.values = dict(DEFAULTS)
+        return self.process
+
+    def set(self, **values: Any) -> None:
+        """Set parameters of the relay, where they are not so already."""
+        changed = {k: v for k, v in values.items() if self.values.get(k) != v}
+        if not changed:
+            return
+        parameters = []
+        for name, value in changed.items():
+            kind, field = _TYPES[type(value)]
+            parameters.append(
+                Parameter(name=name, value=ParameterValue(type=kind, **{field: value}))
+            )
+        request = SetParameters.Request(parameters=parameters)
+        for result in self.rig.call(SetParameters, "relay_node/set_parameters", request).results:
+            assert result.successful, result.reason
+        self.values.update(changed)
+
+    def begin(self) -> None:
+        """Bring all to the state before a tune, and remember what came before it."""
+        self.reset()
+        del self.experiments[:], self.status[:], self.commands[:-1]
+
+    def tune(self) -> Any:
+        self.begin()
+        return self.rig.tune()
+
+    def until_it_oscillates(self, switches: int = 5) -> None:
+        def switched() -> bool:
+            changes = sum(a != b for a, b in itertools.pairwise(self.commands))
+            # To the baseline and to the kick's level before the first switch.
+            return changes >= switches + 2
+
+        self.rig.until(lambda: switched() or self.experiments, "an oscillation")
+        assert not self.experiments, self.experiments[-1].reason
+
+    def ended(self) -> Any:
+        return self.rig.until(lambda: self.experiments, "the record")[-1]
+
+    def is_said(self, text: str) -> bool:
+        """Return True if the newest diagnostics have a text."""
+        return any(text in s.message for m in self.status[-3:] for s in m.status)
+
+    def check_the_end(self, said: str, safe: float = SAFE) -> Any:
+        """See that a tune ended with a reason, safely and for good; return its record."""
+        ended = self.ended()
+        assert said in ended.reason, ended.reason
+        assert ended.outcome in (RelayExperiment.ABORTED, RelayExperiment.FAILED)
+        self.rig.until(lambda: self.commands[-1] == safe, "the safe command")
+        self.rig.until(lambda: self.is_said(said), "the diagnostics")
+        assert not self.gains
+        return ended
+
+    def check_that_it_stays(self, safe: float = SAFE) -> None:
+        """See that each further measurement is answered with the safe command."""
+        self.reset()
+        count = len(self.commands)
+        self.rig.until(lambda: len(self.commands) > count + 5, "commands after the tune")
+        assert set(self.commands[count:]) == {safe}
+
+
+__all__ = ["BASELINE", "DEFAULTS", "KINDS", "LATCHED", "PERIOD", "RELAY", "SAFE", "Loop"]
