@@ -165,6 +165,10 @@ class McapFile:
                 batch, size = [], 0
             batch.append(self._piece(segment, content, wanted))
             size += len(content)
+            if size >= _BATCH:
+                # Not held while the next one is read: a chunk may be large.
+                yield batch
+                batch, size = [], 0
         if batch:
             yield batch
 

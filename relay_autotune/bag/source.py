@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -96,7 +97,9 @@ class Source:
             return
         for start, end in ranges:
             length = min(end - start, _ANNOUNCED)
-            os.posix_fadvise(self._file.fileno(), start, length, os.POSIX_FADV_WILLNEED)
+            # A file system that takes no advice reads as well without.
+            with contextlib.suppress(OSError):
+                os.posix_fadvise(self._file.fileno(), start, length, os.POSIX_FADV_WILLNEED)
 
     def _check_start(self) -> None:
         start = self.read(0, 16)

@@ -119,6 +119,25 @@ def test_a_frame_that_holds_more_than_its_chunk_declares_is_not_expanded(tmp_pat
     assert any("differ in their size" in note for note in notes)
 
 
+def test_large_chunks_are_not_in_memory_together(tmp_path):
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        x = writer.register_channel("/x", "cdr", schema)
+        for k in range(8):
+            writer.add_message(x, START + k, encode_float64(float(k)) + bytes(10 << 20), START)
+        writer.finish()
+    tracemalloc.start()
+    values, _ = read(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_array_equal(values, np.arange(8))
+    # The one before is held until the next one has been expanded.
+    assert most < 25 << 20
+
+
 def test_a_message_index_that_leads_elsewhere_is_not_believed(tmp_path):
     path = write(tmp_path / "bag.mcap")
     data = bytearray(path.read_bytes())
