@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from relay_autotune.identification import Known
+from relay_autotune.identification.known import LOSSES
 from relay_autotune.models import STRUCTURES
 from relay_autotune.nodes.parameters import NodeParameter
 
@@ -33,6 +34,13 @@ KNOWN_PARAMETERS = (
     NodeParameter(
         "order", 0, "", "Number of equal lags, for lag_n; 0: to be found.", 0, _MOST_LAGS
     ),
+    NodeParameter(
+        "loss",
+        LOSSES[0],
+        "",
+        "How the waveform fit counts residuals; huber and tukey bear many outliers.",
+        choices=LOSSES,
+    ),
 )
 
 
@@ -47,4 +55,5 @@ def known_from(values: Mapping[str, Any]) -> Known:
         dead_time=float(values["known_dead_time"]),
         structure=str(values["structure"]),
         order=int(values["order"]),
+        loss=str(values["loss"]),
     )

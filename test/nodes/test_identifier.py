@@ -52,7 +52,7 @@ def test_nothing_is_known_unless_it_is_given() -> None:
     assert math.isnan(found.gain)
     assert (found.structure, found.order) == ("", 0)
     given = {"known_gain": 2.0, "known_dead_time": 1.0, "structure": "lag_n", "order": 2}
-    assert known_from(given) == Known(2.0, 1.0, "lag_n", 2)
+    assert known_from({**given, "loss": "huber"}) == Known(2.0, 1.0, "lag_n", 2, "huber")
     with pytest.raises(ParameterError, match="not zero"):
         known_from({**NOTHING, "known_gain": 0.0})
 
