@@ -16,7 +16,7 @@ from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.messages import transfer_function_from_message
 from relay_autotune.models import TransferFunction
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS
+from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
@@ -365,4 +365,4 @@ def said(gains: Controller | None) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Run controller_node."""
-    return run(ControllerNode, "controller_node", args)
+    return run(ControllerNode, "controller_node", args, PARAMETERS)

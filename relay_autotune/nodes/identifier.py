@@ -270,4 +270,4 @@ def _last_stamp(record: Record) -> int:
 
 def main(args: list[str] | None = None) -> int:
     """Run identifier_node."""
-    return run(IdentifierNode, "identifier_node", args)
+    return run(IdentifierNode, "identifier_node", args, PARAMETERS)

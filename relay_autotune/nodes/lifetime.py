@@ -7,10 +7,12 @@ node has brought its loop to a safe state.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 from collections import deque
@@ -25,6 +27,7 @@ from rclpy.subscription import Subscription
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.executor import Executor
+from relay_autotune.nodes.parameters import Entry
 
 # How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
@@ -90,14 +93,34 @@ class ServedNode(Node):
         """
 
 
-def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None = None) -> int:
+def run(
+    create: Callable[[], ServedNode],
+    name: str,
+    args: Sequence[str] | None = None,
+    parameters: Sequence[Entry] = (),
+) -> int:
     """Run a node until SIGINT or SIGTERM, or until a callback raises.
 
     :param create: makes the node.
     :param name: name of the executable, for messages on standard error.
     :param args: command line; default: that of the process.
+    :param parameters: those of the node, for ``--help``.
     :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
     """
+    own = _outside_of_ros(sys.argv[1:] if args is None else list(args))
+    if {"-h", "--help"} & set(own):
+        # Whoever pages through it may have seen enough.
+        with contextlib.suppress(BrokenPipeError):
+            print(_help(name, str(sys.modules[create.__module__].__doc__), parameters), flush=True)
+        return 0
+    if own:
+        # ROS would pass over them without a word, and over the limits that they may be.
+        print(
+            f"{name}: {' '.join(own)} has no effect outside of --ros-args; expected such as "
+            f"{name} --ros-args -p NAME:=VALUE; --help lists the names",
+            file=sys.stderr,
+        )
+        return 2
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         # A second signal changes nothing: the end below is bounded in time.
@@ -122,6 +145,37 @@ def run(create: Callable[[], ServedNode], name: str, args: Sequence[str] | None 
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _outside_of_ros(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line that are not between ``--ros-args`` and ``--``."""
+    own, ros = [], False
+    for word in words:
+        if word == "--ros-args":
+            ros = True
+        elif ros:
+            ros = word != "--"
+        else:
+            own.append(word)
+    return own
+
+
+def _help(name: str, purpose: str, parameters: Sequence[Entry]) -> str:
+    lines = [
+        f"usage: {name} [--ros-args [-p NAME:=VALUE ...] [-r NAME:=NAME ...]",
+        f"{'':<{len(name) + 8}}[--params-file FILE] ...]",
+        "",
+        purpose.strip(),
+    ]
+    if parameters:
+        lines += ["", "parameters, with their defaults:"]
+    for entry in parameters:
+        unit = f" {entry.unit}" if entry.unit else ""
+        lines.append(f"  {entry.name} ({entry.default!s}{unit})".replace("()", "(none)"))
+        lines += textwrap.wrap(
+            entry.description, 80, initial_indent=" " * 6, subsequent_indent=" " * 6
+        )
+    return "\n".join(lines)
 
 
 def _serve(node: ServedNode, stopped: list[int]) -> int:

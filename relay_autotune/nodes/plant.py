@@ -364,4 +364,4 @@ class PlantNode(ServedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run plant_node."""
-    return run(PlantNode, "plant_node", args)
+    return run(PlantNode, "plant_node", args, PARAMETERS)

@@ -397,4 +397,4 @@ class RelayNode(ServedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run relay_node."""
-    return run(RelayNode, "relay_node", args)
+    return run(RelayNode, "relay_node", args, (*TUNE_PARAMETERS, *FIXED_PARAMETERS))

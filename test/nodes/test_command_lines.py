@@ -1,0 +1,36 @@
+"""What nodes do with command lines that are none of ROS."""
+
+from __future__ import annotations
+
+import importlib
+
+import pytest
+
+from tools.fill_docs import TABLES
+
+
+def run(name: str, *arguments: str) -> int:
+    module = importlib.import_module(f"relay_autotune.nodes.{name.removesuffix('_node')}")
+    return module.main(list(arguments))
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_help_lists_every_parameter_and_starts_nothing(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(name, "--help") == 0
+    told = capsys.readouterr().out
+    assert told.startswith(f"usage: {name} ")
+    for entry in TABLES[name]:
+        assert f"\n  {entry.name} (" in told
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_what_ros_would_pass_over_in_silence_is_refused(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--ros-args", "-p", "use_sim_time:=false", "--", "-p", "measurement_max:=50.0")
+    assert run(name, *arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"{name}: -p measurement_max:=50.0 has no effect outside of --ros-args")
+    assert said.count("\n") == 1
