@@ -14,10 +14,57 @@ _STEPS = 3
 _FASTER = 1.15
 _LARGER = 3.0
 
+# Growth is exponential if the last of so many steps by this factor took no longer than the one so
+# many before it, give or take: t^8, with which eight lags answer at first, takes 1.7 times as
+# long. Steps of fewer samples are too short to tell.
+_STEP, _LEAST_STEPS, _APART, _NO_LONGER = 8.0, 4, 2, 1.1
+_SAMPLES = 10
+# What falls below this part of what it had reached grows no more.
+_FALLEN = 0.05
+
 # Over its last third, a measurement that moves by less than this part of its whole way is level.
 _LEVEL = 0.03
 # What is no further than this part of its way from where it went last has not come back.
 _BACK = 0.1
+
+
+class RunawayWatch:
+    """Recognise exponential growth, as of an unstable process of which the relay has no hold.
+
+    Before the first cycle nothing is known of the process by which a distance could be called far,
+    but the answer of a stable one multiplies ever more slowly.
+
+    :param floor: distance from which steps count [y]; 0: from the first one above zero.
+    """
+
+    def __init__(self, floor: float) -> None:
+        self._floor = floor
+        self._next = _STEP * floor
+        self._passed: list[float] = []
+        self._samples = 0
+
+    def add(self, time: float, distance: float) -> bool:
+        """Take a sample; return True if it runs away.
+
+        :param time: its instant [s].
+        :param distance: from the set-point, of either sign [y].
+        """
+        away = abs(distance)
+        self._samples += 1
+        if away < self._next:
+            if away < _FALLEN * self._next:
+                self._passed.clear()
+                self._next = _STEP * self._floor
+            return False
+        # One at a time, so that a spike of the sensor is one.
+        self._passed.append(time)
+        self._next = _STEP * (self._next or away)
+        samples, self._samples = self._samples, 0
+        if len(self._passed) <= _LEAST_STEPS or samples < _SAMPLES:
+            return False
+        before, begin = self._passed[-1 - _APART], self._passed[-2 - _APART]
+        last = self._passed[-1] - self._passed[-2]
+        return last <= _NO_LONGER * (before - begin)
 
 
 def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> str:

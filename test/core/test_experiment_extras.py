@@ -10,7 +10,7 @@ from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.no_return import is_growing
+from relay_autotune.experiment.no_return import RunawayWatch, is_growing
 from relay_autotune.experiment.sensor_watch import ClockWatch, FrozenWatch
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome
@@ -251,6 +251,31 @@ def test_what_runs_away_is_given_up_long_before_the_patience_is_over():
     swing = max(c.peak_max - c.peak_min for c in tune.cycles)
     assert abs(y - tune.settings.setpoint) < 20.0 * swing
     assert "moved away" in tune.reason
+
+
+def test_exponential_growth_is_told_from_that_of_any_stable_process():
+    def gives_up(answer, floor=0.0, samples=4000):
+        watch = RunawayWatch(floor)
+        return next((t for t in range(samples) if watch.add(t, answer(t))), None)
+
+    for floor in (0.0, 0.01):
+        far = gives_up(lambda t: -0.02 * math.exp(t / 8.0), floor)
+        # From the fifth step by eight on.
+        assert 8.0 * math.log(8.0**4) < far < 8.0 * math.log(8.0**7)
+        for power in (1, 2, 8, 20):
+            assert gives_up(lambda t, power=power: (t / 100.0) ** power, floor) is None
+        # Heat that reaches a sensor through a wall.
+        assert gives_up(lambda t: math.exp(-900.0 / (t + 1.0)), floor) is None
+        assert gives_up(lambda t: 1e9 if t % 50 == 0 else 0.0, floor) is None
+
+
+def test_an_unstable_process_is_given_up_before_the_first_cycle():
+    # A quarter of the gain that the relay would need.
+    tune = experiment(process_gain_sign=1, hysteresis=1.0)
+    run(tune, FopdtPlant(-1.0, -1.0, 0.2), 0.02)
+    assert tune.outcome is Outcome.FAILED
+    assert "faster and faster" in tune.reason
+    assert np.abs(tune.record().measurement).max() < 8.0**6
 
 
 # What is commanded after the end.
