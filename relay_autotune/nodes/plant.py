@@ -262,7 +262,7 @@ class PlantNode(ServedNode):
             Float64,
             "command",
             received,
-            QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE),
+            QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE),
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=overridable,
         )
