@@ -30,10 +30,11 @@ def summary(results: Sequence[Result]) -> tuple[str, bool]:
     enough = [r for r in quiet if r.cycles >= LEAST_CYCLES]
     of_these = 100.0 * sum(not _served(r) for r in enough) / max(len(enough), 1)
     states = sorted({r.state for r in results})
+    cost = np.mean([r.seconds for r in results])
     parts = [
         f"{len(results)} experiments, seeds {min(r.seed for r in results)} to "
         f"{max(r.seed for r in results)}, of {len(states)} state{'s' * (len(states) > 1)} of the "
-        f"code ({', '.join(states)}), {np.mean([r.seconds for r in results]):.2f} s of a processor each. Gains "
+        f"code ({', '.join(states)}), {cost:.2f} s of a processor each. Gains "
         f"from an experiment that was not completed: {gains} (target 0). Safe command later than "
         f"one sample: {late} (target 0). Another command after it, or a process that ran away "
         f"though it could be held: {unsafe}. Recommended loops unstable on the true process: "
