@@ -43,9 +43,11 @@ def main() -> int:
     if sys.argv[1:]:
         first_screen(sys.argv[1], case)
     for picture in (IMAGES / "demo.png", *IMAGES.glob("report_*.png")):
-        # A palette is enough for lines, and a third of the size.
+        # A palette is enough for lines, and a third of the size; this one keeps the colours that
+        # few points have, by which the signs on a curve are told apart.
         with Image.open(picture) as image:
-            image.convert("RGB").quantize(128).save(picture, optimize=True)
+            few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
+            few.save(picture, optimize=True)
     return 0
 
 
