@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from relay_autotune.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.experiment.levels import Levels, clear_swing
-from relay_autotune.experiment.no_return import RunawayWatch, is_growing, why_no_return
+from relay_autotune.experiment.no_return import is_growing, why_no_return
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
@@ -138,11 +138,8 @@ class Oscillation:
             self._on_the_way.append((due, relay.is_high, begins))
         elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
-        elif self._runs_away(t, y):
-            if self._doubtful and not self.cycles:
-                self._no_return(t, y)
-            else:
-                self._end(Outcome.FAILED, self._why_lost(t, y))
+        elif self._runs_away(y):
+            self._end(Outcome.FAILED, self._why_lost(t, y))
         waiting = self._on_the_way
         while waiting and waiting[0][0] <= t + _ROUNDING * self._samples.interval:
             _, self._is_high, begins = waiting.popleft()
@@ -150,9 +147,7 @@ class Oscillation:
                 self._begin_cycle()
         return self.command
 
-    def _runs_away(self, t: float, y: float) -> bool:
-        if not self.cycles:
-            return self._watch.add(t, y - self._setpoint)
+    def _runs_away(self, y: float) -> bool:
         self._away = self._away + 1 if abs(y - self._setpoint) > self._furthest else 0
         return self._away >= _RUNAWAY_SAMPLES
 
@@ -160,8 +155,6 @@ class Oscillation:
         t, y = self._samples.time[-1], self._samples.measurement[-1]
         self._relay = Relay(self.sign, self._setpoint, self._hysteresis, t, y)
         self._is_high = self._relay.is_high
-        floor = max(self._hysteresis, abs(y - self._setpoint), 3.0 * self._rest.noise_std)
-        self._watch = RunawayWatch(floor)
         self._on_the_way.clear()
         self._switches_before = self.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
@@ -307,7 +300,8 @@ class Oscillation:
     def _no_return(self, t: float, y: float) -> None:
         """Fail, unless the amplitude can grow or a sign that is in doubt can be reversed."""
         # A half cycle that is no noise shows that the process goes both ways with the relay.
-        follows = self.switches - self._switches_before >= _FOLLOWS and not self._is_noise()
+        stays = self.switches - self._switches_before
+        follows = bool(self.cycles) or (stays >= _FOLLOWS and not self._is_noise())
         if self._doubtful and not follows:
             self._doubtful = False
             self.notes.append(

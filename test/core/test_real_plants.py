@@ -15,11 +15,14 @@ from relay_autotune.identification import Known, identify
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome
 from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.ultimate import ultimate_point
 from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 PROCESS = TransferFunction.from_structure(
     "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0
 )
+# A slow heater: 2.5 degrees for a percent.
+HEATER = TransferFunction.from_structure("fopdt", gain=2.5, time_constants=[600.0], dead_time=40.0)
 PERIOD = 0.2
 # At the root w of 10 w + atan(20 w) = pi.
 ULTIMATE_GAIN = math.hypot(1.0, 20.0 * 0.183659720315) / 1.65
@@ -96,6 +99,14 @@ def test_a_load_that_stops_the_oscillation_is_borne():
     check(tune, rel=0.03)
 
 
+@pytest.mark.parametrize(("load_time", "load_size"), [(90.0, 0.8), (110.0, 1.5)])
+def test_a_load_that_stops_the_first_cycle_is_borne(load_time, load_size):
+    tune = run(load_time=load_time, load_size=load_size, noise_std=0.01, max_cycles=20)
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    assert "a load came during the test" in tune.reason
+    check(tune, rel=0.03)
+
+
 def test_a_load_beyond_the_command_limits_fails():
     tune = run(load_time=150.0, load_size=5.0, command_min=-1.0, command_max=1.5)
     assert tune.outcome is Outcome.FAILED
@@ -114,6 +125,31 @@ def test_a_coarse_sensor():
 
 def test_a_sensor_that_speaks_only_on_change():
     check(run(quantisation=0.02, noise_std=0.02, keep=lambda k, y, last: y != last))
+
+
+@pytest.mark.parametrize("noise_std", [0.0, 0.05])
+def test_a_slow_heater_with_steps_of_three_tenths_of_a_degree(noise_std):
+    tune = run(HEATER, period=2.0, amplitude=20.0, quantisation=0.3, noise_std=noise_std)
+    assert tune.elapsed < 1500.0
+    assert gain_of(tune) == pytest.approx(ultimate_point(HEATER).gain, rel=0.02)
+
+
+def test_a_slow_heater_finds_its_amplitude():
+    limits = {"command_min": -30.0, "command_max": 50.0}
+    tune = run(HEATER, period=2.0, amplitude=0.0, quantisation=0.3, **limits)
+    assert gain_of(tune) == pytest.approx(ultimate_point(HEATER).gain, rel=0.02)
+
+
+def test_samples_that_come_when_they_like():
+    rng = np.random.default_rng(3)
+    plant = VirtualProcess(PROCESS, disturbances=Disturbances(noise_std=0.02), seed=4)
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0), 0.0)
+    for k in range(20_000):
+        t = (k + rng.uniform(0.0, 0.9)) * PERIOD
+        plant.command(tune.step(t, plant.measure(t)))
+        if tune.finished:
+            break
+    check(tune, rel=0.02)
 
 
 def test_lost_samples():
