@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from relay_autotune.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.experiment.levels import Levels, clear_swing
-from relay_autotune.experiment.no_return import is_growing, why_no_return
+from relay_autotune.experiment.no_return import RunawayWatch, is_growing, why_no_return
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
@@ -138,8 +138,11 @@ class Oscillation:
             self._on_the_way.append((due, relay.is_high, begins))
         elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
-        elif self._runs_away(y):
-            self._end(Outcome.FAILED, self._why_lost(t, y))
+        elif self._runs_away(t, y):
+            if self._doubtful and not self.cycles:
+                self._no_return(t, y)
+            else:
+                self._end(Outcome.FAILED, self._why_lost(t, y))
         waiting = self._on_the_way
         while waiting and waiting[0][0] <= t + _ROUNDING * self._samples.interval:
             _, self._is_high, begins = waiting.popleft()
@@ -147,7 +150,9 @@ class Oscillation:
                 self._begin_cycle()
         return self.command
 
-    def _runs_away(self, y: float) -> bool:
+    def _runs_away(self, t: float, y: float) -> bool:
+        if not self.cycles:
+            return self._watch.add(t, y - self._setpoint)
         self._away = self._away + 1 if abs(y - self._setpoint) > self._furthest else 0
         return self._away >= _RUNAWAY_SAMPLES
 
@@ -155,6 +160,8 @@ class Oscillation:
         t, y = self._samples.time[-1], self._samples.measurement[-1]
         self._relay = Relay(self.sign, self._setpoint, self._hysteresis, t, y)
         self._is_high = self._relay.is_high
+        floor = max(self._hysteresis, abs(y - self._setpoint), 3.0 * self._rest.noise_std)
+        self._watch = RunawayWatch(floor)
         self._on_the_way.clear()
         self._switches_before = self.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
