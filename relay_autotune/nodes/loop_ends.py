@@ -156,7 +156,9 @@ class LoopEnds:
             checks.append(Silence(f"no command on {topic}", timeout, lambda: self.handover.age))
         timeout = self._value("feedback_timeout")
         self._follow = None
-        fed_back = time.monotonic() - self._feedback_at < timeout
+        # One that was heard and is late is a fault, too.
+        heard = not math.isnan(self._feedback)
+        fed_back = heard and self._node.count_publishers("command_feedback") > 0
         if fed_back and self._ends.setpoint is None:
             self._follow = FollowWatch(self._tolerance(experiment), timeout)
             checks.append(

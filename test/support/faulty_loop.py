@@ -182,7 +182,7 @@ class Loop:
     def begin(self) -> None:
         """Bring all to the state before a tune, and remember what came before it."""
         self.reset()
-        del self.experiments[:], self.status[:], self.commands[:-1]
+        del self.experiments[:], self.status[:], self.commands[:-1], self.gains[:]
 
     def tune(self) -> Any:
         self.begin()
