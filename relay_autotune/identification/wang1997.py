@@ -95,6 +95,10 @@ def fopdt_from_biased(
     return k, time_constant, time_constant * theta
 
 
+# A/(mu A_0), the limit of eq 25 for T -> infinity: the triangle of an integrator.
+INTEGRATOR_RATIO = 0.5 * math.pi
+
+
 def fopdt_from_unbiased(
     period: float, amplitude: float, response: float, mu: float, epsilon: float
 ) -> tuple[float, float, float]:

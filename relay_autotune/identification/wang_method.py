@@ -7,12 +7,13 @@ does not raise; the levels at which the relay was seen to switch take the place 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtr, stdtrit
 
 from relay_autotune.cycles import find_cycles
 from relay_autotune.errors import IdentificationError
@@ -28,6 +29,7 @@ from relay_autotune.identification.cycle.symmetric_cycle import require_unbiased
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, with_uncertainty
 from relay_autotune.identification.wang1997 import (
+    INTEGRATOR_RATIO,
     PARAMETERS,
     FopdtCycle,
     fopdt_from_biased,
@@ -42,6 +44,13 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
 _MOST_PARTS = 20
+# So many standard deviations above that of an integrator a ratio is not one of noise.
+_CERTAIN = 3.0
+_LIKE_AN_INTEGRATOR = (
+    "the peaks are those of an integrator's limit cycle, or noise lets them look so: gain and "
+    "time constant are hardly more than their ratio; a biased relay or the method waveform tells "
+    "them apart"
+)
 
 
 @dataclass(frozen=True)
@@ -51,11 +60,14 @@ class _Facts:
     :param sign: +1, or -1 for a reverse-acting relay.
     :param gain: K [y/u], with its sign; NaN: to be found.
     :param rest: measurement at rest [y].
+    :param ratio: amplitude of the measurement over that of the relay times the response at the
+        fundamental; NaN: as it is in the cycles.
     """
 
     sign: int
     gain: float
     rest: float
+    ratio: float = math.nan
 
 
 def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
@@ -96,6 +108,11 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
 def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a FOPDT model from an unbiased relay test (eqs 21 to 25).
 
+    Gain and time constant come of what the amplitude is above that of the fundamental, which is
+    at most that of an integrator. With a short dead time it is hardly less, and noise may put it
+    above: then the value that is expected of it below that limit takes its place, and what that
+    leaves open is told as uncertain.
+
     :param record: a relay test without bias.
     :param known: a known gain takes the place of eqs 23 to 25.
     :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
@@ -109,7 +126,63 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
             "the wrong sign"
         )
     facts = _Facts(sign, known.gain, math.nan)
-    return _identified("wang_unbiased", test, record, _from_unbiased, facts, (), "")
+    run = partial(_identified, "wang_unbiased", test, record, _from_unbiased)
+    if not math.isnan(known.gain):
+        return run(facts, (), "")
+    try:
+        found = run(facts, (), "")
+    except IdentificationError:
+        likely = _likely_ratio(test, record)
+        if likely is None:
+            raise
+        ratio, std = likely
+        remark = _LIKE_AN_INTEGRATOR
+    else:
+        likely = None
+        if not bool(np.all(np.isfinite(found.covariance))):
+            likely = _likely_ratio(test, record)
+        if likely is None:
+            return found
+        (ratio, std), remark = likely, ""
+    lower = replace(facts, ratio=ratio - std)
+    return run(replace(facts, ratio=ratio), (lower,), remark)
+
+
+def _likely_ratio(test: RelayTest, record: Record) -> tuple[float, float] | None:
+    """Return what is expected of the ratio below that of an integrator, and how far it scatters.
+
+    :param test: the relay test.
+    :param record: the record.
+    :return: None where the cycles are too few to tell, or the ratio is above by far.
+    """
+    cycles = test.whole.cycle.cycles
+    if len(cycles) < _LEAST_CYCLES:
+        return None
+    record = replace(record, settings=test.whole.settings, cycle_start=_bounds(record))
+    whole = fold(record, cycles)
+    seen = _ratio(whole)
+    parts = np.array([_ratio(part) for part in _without_each(whole, record, cycles)])
+    scatter = math.sqrt(float(np.var(parts)) * (len(cycles) - 1))
+    room = INTEGRATOR_RATIO - seen
+    if room > 0.0:
+        return seen, scatter
+    if not -room < _CERTAIN * scatter:
+        return None
+    # Mean and variance of a normal distribution below a limit.
+    a = room / scatter
+    beyond = math.exp(-0.5 * a * a) / (math.sqrt(2.0 * math.pi) * float(ndtr(a)))
+    return seen - scatter * beyond, scatter * math.sqrt(1.0 - a * beyond - beyond**2)
+
+
+def _ratio(seen: Fold) -> float:
+    down, up = seen.peaks()
+    return 0.5 * (up - down) / (as_switched(seen).amplitude * abs(seen.fundamental()))
+
+
+def _without_each(whole: Fold, record: Record, cycles: tuple[int, ...]) -> Iterator[Fold]:
+    """Yield the averages without one cycle after the other, of some where they are many."""
+    for left_out in cycles[:: -(-len(cycles) // _MOST_PARTS)]:
+        yield fold(record, tuple(c for c in cycles if c != left_out), whole)
 
 
 def _from_biased(seen: Fold, facts: _Facts) -> FloatArray:
@@ -129,8 +202,11 @@ def _from_unbiased(seen: Fold, facts: _Facts) -> FloatArray:
     down, up = seen.peaks()
     amplitude, period = 0.5 * (up - down), seen.period
     if math.isnan(facts.gain):
+        response = abs(seen.fundamental())
+        if not math.isnan(facts.ratio):
+            response = amplitude / (settings.amplitude * facts.ratio)
         k, t, dead = fopdt_from_unbiased(
-            period, amplitude, abs(seen.fundamental()), settings.amplitude, settings.hysteresis
+            period, amplitude, response, settings.amplitude, settings.hysteresis
         )
     else:
         k, t, dead = fopdt_with_gain(
@@ -170,7 +246,13 @@ def _identified(
     best = values(whole, facts)
     covariance = None
     if len(cycles) >= _LEAST_CYCLES:
-        covariance = _jackknife(whole, record, cycles, lambda part: values(part, facts))
+        covariance = _jackknife(
+            whole,
+            record,
+            cycles,
+            lambda part: values(part, facts),
+            partly=method == "wang_biased",
+        )
     if covariance is not None:
         for other in uncertain:
             covariance = covariance + _by(lambda known: values(whole, known), other, best)
@@ -195,16 +277,22 @@ def _jackknife(
     record: Record,
     cycles: tuple[int, ...],
     measure: Callable[[Fold], FloatArray],
+    *,
+    partly: bool,
 ) -> FloatArray | None:
-    """Return the covariance by leaving out one cycle after the other; None: too few solve."""
-    parts = []
-    for left_out in cycles[:: -(-len(cycles) // _MOST_PARTS)]:
+    """Return the covariance by leaving out one cycle after the other; None: too few solve.
+
+    :param partly: True: some need not solve.
+    """
+    parts, tried = [], 0
+    for part in _without_each(whole, record, cycles):
+        tried += 1
         try:
-            parts.append(measure(fold(record, tuple(c for c in cycles if c != left_out), whole)))
+            parts.append(measure(part))
         except IdentificationError:
             # Without that cycle the numbers are no limit cycle; the others tell the scatter.
             continue
-    if len(parts) < _LEAST_CYCLES:
+    if len(parts) < (_LEAST_CYCLES if partly else tried):
         return None
     away = np.array(parts) - np.mean(parts, axis=0)
     return np.asarray(away.T @ away * (len(cycles) - 1) / len(parts))
@@ -214,7 +302,7 @@ def _by(
     measure: Callable[[_Facts], FloatArray], uncertain: _Facts, best: FloatArray
 ) -> FloatArray:
     """Return the covariance that one uncertain fact makes."""
-    if not math.isfinite(uncertain.gain + uncertain.rest):
+    if math.isnan(uncertain.ratio) and not math.isfinite(uncertain.gain + uncertain.rest):
         return np.full((best.size, best.size), math.nan)
     try:
         change = measure(uncertain) - best

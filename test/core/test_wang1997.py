@@ -23,6 +23,7 @@ from relay_autotune.models import TransferFunction
 from relay_autotune.record import Record, RelaySettings
 from relay_autotune.sampled_relay import simulate_sampled_relay
 from relay_autotune.simulation import simulate_relay
+from relay_autotune.ultimate import ultimate_point
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T1"))
@@ -213,3 +214,30 @@ def test_the_error_of_the_steady_state_is_one_of_the_gain():
     # Nearly all of the uncertainty, and of the right size: 0.5 to 1.5 hold 99.5 % of such rms.
     assert np.median(shares) > 0.6
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
+
+
+def test_noise_that_makes_a_lag_look_like_an_integrator_leaves_the_ultimate_point():
+    # The amplitude is 0.1 % below that of an integrator, and the noise of the peaks is larger.
+    model, relay = TransferFunction.fopdt(1.0, 1.0, 0.1), RelaySettings(0.0, 0.0, 1.0, 0.0, 0.0)
+    truth = ultimate_point(model)
+    run = simulate_relay(model, relay, cycles=7, time=0.0019 * np.arange(1000))
+    rng, held, like = np.random.default_rng(4), 0, 0
+    for _ in range(12):
+        found = identify_unbiased(run.record(noise_std=0.006, rng=rng))
+        assert found.ultimate_gain == pytest.approx(truth.gain, rel=0.1)
+        held += abs(found.ultimate_gain - truth.gain) < 3.0 * found.ultimate_gain_std
+        # What is hardly in the data has a wide interval.
+        if found.warnings:
+            like += 1
+            assert found.std[0] > 0.1 * found.values[0]
+    assert held >= 10
+    assert 2 <= like <= 10
+
+
+def test_an_exact_integrator_is_refused():
+    relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.0)
+    run = simulate_relay(
+        TransferFunction.ipdt(1.0, 1.0), relay, cycles=9, time=np.arange(0.0, 30.0, 0.02)
+    )
+    with pytest.raises(IdentificationError, match="no stable FOPDT"):
+        identify_unbiased(run.record())
