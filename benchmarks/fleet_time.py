@@ -1,4 +1,4 @@
-"""Time of many bags with one job and with two: `python3 benchmarks/fleet_time.py [--quick]`.
+"""Time of many bags, one job and two: `python3 benchmarks/fleet_time.py [--count N] [--quick]`.
 
 The bags are step tests of 60 s at 10 Hz, each with noise of its own; `replay` writes their results
 to a file. The whole processes are timed.
@@ -64,8 +64,9 @@ def main() -> int:
         bags = make(folder, count)
         for jobs in (1, 2):
             begin = time.perf_counter()
-            # The choice of structure would only take longer, in one process as in two.
-            flags = ["--structure", "fopdt", "--jobs", str(jobs), "--output", f"{jobs}.jsonl"]
+            # Choice of structure and PID would only take longer, in one process as in two.
+            flags = ["--structure", "fopdt", "--controller", "pi"]
+            flags += ["--jobs", str(jobs), "--output", f"{jobs}.jsonl"]
             subprocess.run(
                 [replay, *flags, *bags],
                 cwd=folder, env=os.environ, check=True, stderr=subprocess.DEVNULL,
