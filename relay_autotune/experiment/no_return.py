@@ -42,6 +42,7 @@ class RunawayWatch:
         self._next = _STEP * floor
         self._passed: list[float] = []
         self._samples = 0
+        self._above = False
 
     def add(self, time: float, distance: float) -> bool:
         """Take a sample; return True if it runs away.
@@ -51,6 +52,11 @@ class RunawayWatch:
         """
         away = abs(distance)
         self._samples += 1
+        if (distance > 0.0) != self._above:
+            # What has turned back to the other side obeys the relay; from a passage through
+            # zero on, a distance multiplies fast whatever the process.
+            self._above = not self._above
+            self._passed.clear()
         if away < self._next:
             if away < _FALLEN * self._next:
                 self._passed.clear()

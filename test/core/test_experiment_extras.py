@@ -338,3 +338,17 @@ def test_a_tune_can_be_concluded_before_its_cycles_agree():
     assert tune.record().reason == "K_u is known well enough"
     assert tune.conclude("again") == 0.0
     assert tune.reason == "K_u is known well enough"
+
+
+def test_many_lags_that_turn_back_through_the_set_point_do_not_run_away():
+    # Without noise the relay switches at the first sample that moved, long before the lags show
+    # what was asked of them; their answer then passes zero and grows as t^8.
+    process = TransferFunction.lag_n(1.0, 6.0, 8, 0.6)
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0, process_gain_sign=1), 0.0)
+    plant, interval = Plant(process), 0.46
+    u = 0.0
+    for k in range(3000):
+        u = tune.step(k * interval, plant.advance(k * interval, u))
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
