@@ -53,11 +53,12 @@ RECORD_BYTES, CYCLE_BYTES = 5 * 8, 3 * 8
 # Share of the tune after which memory is looked at: buffers of a fixed size are full by then.
 WARM = 0.2
 MEGA = 1e6
+# So slow that a stall of the machine does not change how it oscillates.
 PLANT = {
     "structure": "fopdt",
     "gain": 1.0,
-    "time_constants": [2.0],
-    "dead_time": 0.4,
+    "time_constants": [20.0],
+    "dead_time": 2.0,
     "noise_std": 0.005,
 }
 TUNE = {

@@ -103,7 +103,9 @@ def _happenings(results: Sequence[Result]) -> str:
         done = [r for r in some if r.outcome == "completed"]
         rows.append(
             (
-                *(name, len(some), len(done), len(some) - len(done)),
+                *(name, len(some), len(done)),
+                sum(r.outcome in ("aborted", "failed") for r in some),
+                sum(r.outcome == "unknown" for r in some),
                 sum(not r.gains for r in done),
                 sum(r.gains for r in some if r.outcome != "completed"),
                 *(sum(r.late for r in some), sum(r.unsafe for r in some)),
@@ -111,7 +113,8 @@ def _happenings(results: Sequence[Result]) -> str:
             )
         )
     headings = (
-        *("what happens", "experiments", "completed", "aborted or failed", "completed, no gains"),
+        *("what happens", "experiments", "completed", "aborted or failed", "goes on"),
+        "completed, no gains",
         *("gains without completion", "safe command late", "unsafe after", "unstable loops"),
     )
     return _filled(headings, rows)

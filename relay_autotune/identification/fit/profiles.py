@@ -163,7 +163,8 @@ def _hold(
         gradient = _gradient(point, k, lambda x: parameter(*unpacked(x)))
         if not (math.isfinite(miss) and bool(np.all(np.isfinite(gradient)))):
             return None
-        previous, cost = cost, float(residual @ residual)
+        with np.errstate(over="ignore"):
+            previous, cost = cost, float(residual @ residual)
         if not math.isfinite(cost):
             return None
         small = abs(miss) <= 1e-6 * (abs(target) or 1.0)
