@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,7 +67,7 @@ class TransferFunction:
         zeros = tuple(complex(z) for z in self.zeros if z != 0.0)
         constants = tuple(complex(t) for t in self.time_constants if t != 0.0)
         numbers = (self.gain, self.dead_time, *zeros, *constants)
-        if not all(np.isfinite(n) for n in numbers):
+        if not all(cmath.isfinite(n) for n in numbers):
             raise ModelError(f"every number of a transfer function must be finite, found {self!r}")
         if self.gain == 0.0:
             raise ModelError("the gain of a transfer function must not be zero")
@@ -96,7 +97,9 @@ class TransferFunction:
         """Return G at each complex frequency ``s`` [rad/s], any shape."""
         s = np.asarray(s, dtype=np.complex128)
         delay = np.exp(-self.dead_time * s)
-        value: ComplexArray = np.asarray(self.gain * delay * s ** float(-self.integrators))
+        value: ComplexArray = np.asarray(self.gain * delay)
+        if self.integrators:
+            value = np.asarray(value * s ** float(-self.integrators))
         for z in self.zeros:
             value = np.asarray(value * (1.0 + z * s))
         for t in self.time_constants:
