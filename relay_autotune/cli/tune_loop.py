@@ -109,9 +109,6 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         from relay_autotune.cli.report import check_output
 
         check_output(options.report)
-    interrupted: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: interrupted.append(n))
     try:
         client = TuneClient(options.namespace, options.node, ros)
     except ParameterError as error:
@@ -120,6 +117,10 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     with client:
         deadline = time.monotonic() + options.wait
         client.find(options.wait, needs_identifier=not (options.dry_run or options.record_only))
+        # Until here there is nothing that could be left half done.
+        interrupted: list[int] = []
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda n, _: interrupted.append(n))
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")

@@ -45,7 +45,7 @@ def run(rig: Rig, *arguments: str) -> tuple[int, str, str]:
 
 def ready(rig: Rig) -> None:
     """Wait until a tune could start, by asking as a person would."""
-    deadline = time.monotonic() + 30.0
+    deadline = time.monotonic() + 90.0
     while run(rig, "--namespace", "/tank", "--dry-run")[0]:
         assert time.monotonic() < deadline, rig.logs()
 
@@ -116,6 +116,16 @@ def test_without_a_relay_node_it_says_so_in_one_line(rig: Rig) -> None:
     status, output, said = run(rig, "--namespace", "no name")
     assert (status, output) == (2, "")
     assert said.count("\n") == 1
+
+
+def test_ctrl_c_ends_the_search_for_nodes_at_once(rig: Rig) -> None:
+    process = command(rig, "--namespace", "nowhere", "--wait", "600")
+    # Its node is in the graph once it looks for the others.
+    rig.until(lambda: "tune_loop" in rig.node.get_node_names(), "tune_loop")
+    process.send_signal(signal.SIGINT)
+    output, said = process.communicate(timeout=30.0)
+    assert process.returncode == 130
+    assert output + said == ""
 
 
 def test_help_needs_no_graph() -> None:
