@@ -63,7 +63,8 @@ def block_noted(page: str, note: str) -> Block:
 
 def commands(text: str) -> list[list[str]]:
     """Return the words of each line of a shell block."""
-    return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
+    lines = text.replace("\\\n", " ").splitlines()
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
 
 
 def sessions(text: str) -> list[tuple[list[str], str]]:
