@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from loop_rig import RELIABLE, Rig
 from made_bags import REPOSITORY
+from make_bags import record_tune
 from ros_domain import free_domain
 from std_msgs.msg import Float64
 
@@ -24,7 +25,7 @@ from relay_autotune_msgs.srv import Identify
 
 BAG = REPOSITORY / "bags" / "unbiased_relay_with_noise"
 PLAYER = Path(__file__).parents[1] / "support" / "bag_player.py"
-# The bag's 194 s take 5 s.
+# The bag's 190 s take 5 s.
 RATE = 40.0
 
 
@@ -37,6 +38,14 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
             yield rig
         finally:
             rig.close()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a tune with the messages of today, whose bytes a player can publish."""
+    bag = tmp_path_factory.mktemp("recorded") / "bag"
+    record_tune(bag, plant={"noise_std": 0.02, "seed": 11}, relay={"bias_ratio": 0.0})
+    return bag
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +86,9 @@ def test_the_service_refuses_with_a_reason(rig: Rig) -> None:
     assert "unknown method 'guess'" in answer.reason
 
 
-def test_a_bag_played_into_the_nodes_gives_what_replay_gives(rig: Rig, replayed: Analysis) -> None:
+def test_a_bag_played_into_the_nodes_gives_what_replay_gives(rig: Rig, recorded: Path) -> None:
+    (record,) = read_experiments(recorded).experiments
+    replayed = analyse(record)
     models = rig.listen("transfer_function", TransferFunction)
     gains = rig.listen("pi_gains", PidGains)
     heard: list[tuple[str, int, float]] = []
@@ -87,13 +98,14 @@ def test_a_bag_played_into_the_nodes_gives_what_replay_gives(rig: Rig, replayed:
             heard.append((topic, info["source_timestamp"], message.data))
 
         rig.node.create_subscription(Float64, topic, note, RELIABLE)
-    rig._launch("player", [sys.executable, str(PLAYER), str(BAG), str(RATE)], (), {})
+    rig._launch("player", [sys.executable, str(PLAYER), str(recorded), str(RATE)], (), {})
     # The record travels in one message, so that the time of its arrival does not matter.
     rig.until(lambda: gains and models and models[-1].final, "model and gains", 60.0)
     assert_same(models[-1], gains[-1], replayed)
 
     # The samples themselves carry the times at which they were played.
-    (again,) = read_experiments(BAG, Selection("/measurement", "/command", start=0.0)).experiments
+    both = Selection("/measurement", "/command", start=0.0)
+    (again,) = read_experiments(recorded, both).experiments
     rig.until(lambda: sum(t == "measurement" for t, _, _ in heard) >= len(again), "all samples")
     fopdt = Known(structure="fopdt")
     played = identify(played_record(heard), "waveform", fopdt)
