@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import os
 import signal
 import sys
@@ -27,7 +28,7 @@ from rclpy.subscription import Subscription
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.executor import Executor
-from relay_autotune.nodes.parameters import Entry
+from relay_autotune.nodes.parameters import Entry, unknown_parameters
 
 # How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
@@ -104,10 +105,11 @@ def run(
     :param create: makes the node.
     :param name: name of the executable, for messages on standard error.
     :param args: command line; default: that of the process.
-    :param parameters: those of the node, for ``--help``.
+    :param parameters: those of the node, for ``--help`` and to tell names that are not among them.
     :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
     """
-    own = _outside_of_ros(sys.argv[1:] if args is None else list(args))
+    words = sys.argv[1:] if args is None else list(args)
+    own = _outside_of_ros(words)
     if {"-h", "--help"} & set(own):
         # Whoever pages through it may have seen enough.
         with contextlib.suppress(BrokenPipeError):
@@ -120,6 +122,9 @@ def run(
             f"{name} --ros-args -p NAME:=VALUE; --help lists the names",
             file=sys.stderr,
         )
+        return 2
+    for unknown in unknown_parameters(_typed_parameters(words), parameters):
+        print(f"{name}: {unknown}", file=sys.stderr)
         return 2
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -141,6 +146,9 @@ def run(
         rclpy.try_shutdown()
         return 2
     try:
+        for unknown in unknown_parameters(list(node._parameter_overrides), parameters):
+            # A file may hold what is meant for others.
+            node.get_logger().warning(unknown)
         return _serve(node, stopped)
     finally:
         node.destroy_node()
@@ -158,6 +166,14 @@ def _outside_of_ros(words: Sequence[str]) -> list[str]:
         else:
             own.append(word)
     return own
+
+
+def _typed_parameters(words: Sequence[str]) -> list[str]:
+    """Return the names of the parameters that were given with ``-p``."""
+    pairs = itertools.pairwise(words)
+    given = [after.split(":=")[0] for flag, after in pairs if flag in ("-p", "--param")]
+    # NODE:NAME is for one node of a process.
+    return [name.rsplit(":", maxsplit=1)[-1] for name in given]
 
 
 def _help(name: str, purpose: str, parameters: Sequence[Entry]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import sys
 from collections.abc import Iterable, Sequence
@@ -15,6 +16,9 @@ from rclpy.parameter import Parameter
 
 from relay_autotune.errors import ParameterError
 
+# What rclpy adds to every node.
+_EVERY_NODE = ("use_sim_time", "start_type_description_service")
+_QOS_OVERRIDES = "qos_overrides."
 _LARGEST_INTEGER = 2**62
 
 
@@ -165,6 +169,25 @@ def declare(node: Node, table: Iterable[Entry], *, read_only: bool = False) -> N
                 f"{entry.name} is {found}, expected {entry.range_text}"
             ) from error
         _check(entry, value_of(node, entry))
+
+
+def unknown_parameters(names: Iterable[str], table: Iterable[Entry]) -> list[str]:
+    """Return a sentence on each name that no parameter has.
+
+    rclpy passes over them without a word, and over the limits that they may have been.
+
+    :param names: of the values that were given at the start.
+    :param table: the node's parameters.
+    """
+    known = [*(entry.name for entry in table), *_EVERY_NODE]
+    found = []
+    for name in names:
+        if name in known or name.startswith(_QOS_OVERRIDES):
+            continue
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else "--help lists the parameters"
+        found.append(f"there is no parameter {name}, so that it has no effect; {hint}")
+    return found
 
 
 def value_of(node: Node, entry: Entry) -> Any:

@@ -189,6 +189,7 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
         ("relay_node", {"min_cycles": 1}, "min_cycles is 1"),
         ("identifier_node", {"method": "guess"}, "method is 'guess', expected one of waveform"),
         ("plant_node", {}, "found neither"),
+        ("relay_node", {"measurment_max": 50.0}, "did you mean measurement_max?"),
     ],
 )
 def test_a_bad_parameter_at_the_start_is_one_line(
@@ -199,6 +200,16 @@ def test_a_bad_parameter_at_the_start_is_one_line(
     (line,) = process.log.strip().splitlines()
     assert line.startswith(f"{executable}: ")
     assert said in line
+
+
+def test_a_misspelt_name_in_a_file_is_told(rig: Rig) -> None:
+    """It may be meant for another node, so that it is no reason to end."""
+    file = rig.folder / "parameters.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    measurment_max: 50.0\n    amplitude: 1.0\n")
+    process = rig.relay("--params-file", str(file))
+    rig.until(lambda: "did you mean measurement_max?" in process.log, "the warning")
+    assert "[WARN]" in process.log
+    process.end()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
