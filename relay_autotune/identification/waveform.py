@@ -133,16 +133,30 @@ def _sign(records: Sequence[Record]) -> int:
 
 def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
     # What is decided on some thousand samples would not be decided otherwise on a million.
-    chosen, candidates = _choose(problem.thinned(_MOST_FOR_CHOICE), known, sign)
-    nuisances = chosen.problem
-    whole = replace(
-        problem,
-        structure=nuisances.structure,
-        drift=nuisances.drift,
-        relaxation=nuisances.relaxation,
+    part = problem.thinned(_MOST_FOR_CHOICE)
+    selection = Selection(part, part.time.size * NEGLIGIBLE**2, sign)
+    candidates = _candidates(selection, known)
+    rest = candidates
+    while rest:
+        picked = choose(rest)
+        chosen = selection.with_nuisances(picked)
+        nuisances = chosen.problem
+        whole = replace(
+            problem,
+            structure=nuisances.structure,
+            drift=nuisances.drift,
+            relaxation=nuisances.relaxation,
+        )
+        whole = after_the_unknown(whole, chosen.state)
+        state = refine(whole, chosen.state.theta)
+        # With a drift beside it, a fit may still run off to where it is no process any more.
+        if selection.candidate(whole, state) is not None:
+            return Fit(whole, state, (chosen,) if known.structure else tuple(rest), scale)
+        rest = [c for c in rest if c is not picked]
+    raise IdentificationError(
+        "no structure fits the record by a process that the samples show: record longer, or check "
+        "that command and measurement belong to one loop"
     )
-    whole = after_the_unknown(whole, chosen.state)
-    return Fit(whole, refine(whole, chosen.state.theta), tuple(candidates), scale)
 
 
 def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
@@ -240,8 +254,7 @@ def _outliers(whole: Problem, problem: Problem, state: State) -> NDArray[np.bool
     return found
 
 
-def _choose(problem: Problem, known: Known, sign: int) -> tuple[Candidate, list[Candidate]]:
-    selection = Selection(problem, problem.time.size * NEGLIGIBLE**2, sign)
+def _candidates(selection: Selection, known: Known) -> list[Candidate]:
     if not known.structure:
         candidates = selection.all()
         if not candidates:
@@ -249,15 +262,14 @@ def _choose(problem: Problem, known: Known, sign: int) -> tuple[Candidate, list[
                 "no structure explains the record with a gain in the direction of the relay: "
                 "check that command and measurement belong to one loop"
             )
-        return selection.with_nuisances(choose(candidates)), candidates
+        return candidates
     found = selection.fit(known.structure, known.order)
     if found is None:
         raise IdentificationError(
             f"no {known.structure} model explains the record; leave the structure open to have "
             "it chosen"
         )
-    found = selection.with_nuisances(found)
-    return found, [found]
+    return [found]
 
 
 def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -211,3 +212,19 @@ def test_no_rival_rings_faster_than_the_samples_show(seed):
 )
 def test_a_fit_that_lives_between_the_samples_is_none(model, unseen):
     assert is_unseen(model, interval=0.1, length=100.0) is unseen
+
+
+def test_a_drift_beside_a_slow_pole_and_zero_is_no_process():
+    """One cycle of 2 e^(-0.1 s)/(0.2 s + 1), recorded on a machine that stepped the plant late.
+
+    With a drift, a pole of 1863 s and a zero of -299 s fitted the 1.8 s best, with a gain against
+    the direction of the relay.
+    """
+    data = Path(__file__).parents[1] / "support" / "data" / "drifting_kiln.csv"
+    time, y, u = np.loadtxt(data, delimiter=",", skiprows=1).T
+    relay = RelaySettings(0.00028823, 0.0, 0.5, 0.15, 0.0326236659)
+    found = identify_waveform(Record(time, y, u, settings=relay, noise_std=0.0108745555))
+    assert found.model.process_sign == 1
+    slowest = max(abs(c) for c in (*found.model.time_constants, *found.model.zeros))
+    assert slowest < 2.0 * time[-1]
+    assert found.ultimate_gain == pytest.approx(1.9034, rel=0.05)

@@ -10,8 +10,9 @@ from relay_autotune.models import TransferFunction
 _SAMPLES_A_SWING = 4.0
 # Intervals between samples that a whole response takes at least, to be one.
 _SHORTEST_RESPONSE = 0.5
-# Lengths of the record up to which a zero counts; beyond, it is a gain of nothing.
-_LONGEST_ZERO = 1e3
+# Lengths of the record up to which a zero counts; beyond, a slow pole cancels it, or nothing does,
+# and what is left is a drift.
+_LONGEST_ZERO = 2.0
 
 
 def is_unseen(model: TransferFunction, interval: float, length: float) -> bool:
