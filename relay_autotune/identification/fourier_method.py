@@ -35,6 +35,7 @@ METHOD = "fourier"
 
 _UNLIKELY = 1e-3
 _LAGS = (0.1, 0.5, 2.0, 10.0)
+_NO_VALUE = 1e12 * (1.0 + 1.0j)
 _LARGEST, _SMALLEST = 300.0, 1e-300
 _LONGEST = 1e4
 _BEYOND = 1.3
@@ -249,7 +250,10 @@ class _Fit:
     def residual(self, x: FloatArray, points: _Points) -> FloatArray:
         """Return what the model misses of each number, over its deviation."""
         model = self.structure.build(self.values(x))
-        away = (model(1j * points.frequency) - points.value) / points.std
+        with np.errstate(over="ignore", invalid="ignore"):
+            away = (model(1j * points.frequency) - points.value) / points.std
+        # A search that strays meets models without a value: as bad as can be.
+        away = np.where(np.isfinite(away), away, _NO_VALUE)
         return np.concatenate((away.real, away.imag[points.frequency > 0.0]))
 
     def refined(self, x: FloatArray, points: _Points) -> tuple[float, FloatArray]:
