@@ -19,9 +19,9 @@ from relay_autotune.bag.metadata import Qos
 
 FLOAT64_TYPE = "std_msgs/msg/Float64"
 
-# A process that waits for a busy processor has its samples wait for it, a second of them at 1 kHz.
+# A sensor may burst after a stall of some milliseconds; at 1 kHz a depth of 1 loses samples.
 MEASUREMENT = QoSProfile(
-    depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
+    depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
 )
 COMMAND = QoSProfile(
     depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
