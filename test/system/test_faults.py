@@ -112,13 +112,18 @@ def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
     )
     rig.node.create_timer(0.01, lambda: sensor.publish(Float64(data=math.sin(len(from_relay)))))
     rig.until(lambda: controller.get_subscription_count() == 2, "the relay")
+    rig.until(sensor.get_subscription_count, "the relay's ear")
     controller.publish(Float64(data=BASELINE))
     # Before the tune only the controller is heard.
     rig.run_for(0.4)
     assert {m.data for m in from_relay} <= {BASELINE}
-    controller.publish(Float64(data=BASELINE))
-    rig.run_for(0.05)
-    assert "is being commanded by another node" in rig.ask_for_tune(dry_run=True).reason
+
+    def refused() -> bool:
+        controller.publish(Float64(data=BASELINE))
+        rig.run_for(0.05)
+        return "is being commanded by another node" in rig.ask_for_tune(dry_run=True).reason
+
+    rig.until(refused, "a refusal")
     rig.run_for(0.4)
     # Its last command is the baseline.
     started = rig.tune()
