@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.cycles import cycles_of, limit_cycle
-from relay_autotune.disturbance import without_disturbance
+from relay_autotune.disturbance import is_far_off, without_disturbance
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
 from relay_autotune.experiment.early_end import Finding
 from relay_autotune.identification import (
@@ -152,10 +152,12 @@ def analyse(
         chosen = _guarded(record, method, known)
     except RelayAutotuneError as error:
         return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
-    if final:
-        chosen = without_disturbance(
-            chosen, record, cycles, lambda part: _guarded(part, method, known)
-        )
+    chosen = without_disturbance(
+        chosen, record, cycles, lambda part: _guarded(part, method, known)
+    )
+    if not final and is_far_off(chosen, record):
+        # Its interval is that of a model which the record contradicts: nothing to end a test on.
+        chosen = replace(chosen, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
     models = [chosen]
     if final:
         if not alone:

@@ -18,6 +18,9 @@ from relay_autotune.record import Cycle, PiecewiseConstant, Record
 _MORE_THAN_NOISE = 1.3
 _MORE_THAN_SPREAD = 0.02
 _BETTER = 0.5
+# With so many times the noise, and so much of the spread, left over, a model is another process's.
+_FAR_OFF_NOISE = 2.0
+_FAR_OFF_SPREAD = 0.05
 
 # So many last cycles are kept.
 KEPT_CYCLES = 3
@@ -35,6 +38,18 @@ def fits_badly(found: Identification, record: Record) -> bool:
     if residual <= _MORE_THAN_SPREAD * float(np.std(record.measurement)):
         return False
     return math.isnan(noise) or residual > _MORE_THAN_NOISE * noise
+
+
+def is_far_off(found: Identification, record: Record) -> bool:
+    """Return True if the model leaves so much that its intervals say nothing.
+
+    :param found: what was identified.
+    :param record: its record.
+    """
+    residual, noise = found.fit.residual_rms, record.noise_std
+    if not residual > _FAR_OFF_SPREAD * float(np.std(record.measurement)):
+        return False
+    return math.isnan(noise) or residual > _FAR_OFF_NOISE * noise
 
 
 def _unexplained(found: Identification, record: Record) -> float:

@@ -129,3 +129,32 @@ def test_no_record_raises(seed, samples, kind, outcome):
     assert found.reason or found.gains
     if outcome in (Outcome.ABORTED, Outcome.FAILED):
         assert found.gains == ()
+
+
+def _beginning(record: Record, samples: int) -> Record:
+    return replace(
+        record,
+        time=record.time[:samples],
+        measurement=record.measurement[:samples],
+        command=record.command[:samples],
+        receive_time=record.receive_time[:samples],
+        command_time=record.command_time[:samples],
+        cycle_start=tuple(s for s in record.cycle_start if s < samples),
+    )
+
+
+def test_a_running_test_forgets_a_disturbance_of_its_beginning():
+    """While the model contradicts the record there is no interval to end the test on."""
+    model = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.1)
+    draws = 0.02 * np.random.default_rng(0).standard_normal(1200)
+    draws[150:200] += 1.0
+    whole = simulate_sampled_relay(model, relay, period=0.2, noise=draws)
+    record = replace(whole, noise_std=0.02)
+    found = analyse(_beginning(record, 300), final=False).model
+    assert found is not None
+    assert np.isnan(found.ultimate_gain_std)
+    found = analyse(record, final=False).model
+    assert found is not None
+    assert found.ultimate_gain == pytest.approx(2.3069, rel=0.01)
+    assert found.ultimate_gain_std < 0.01 * found.ultimate_gain
