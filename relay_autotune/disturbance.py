@@ -10,6 +10,7 @@ import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification
+from relay_autotune.identification.cycle.symmetric_cycle import roughness
 from relay_autotune.record import Cycle, PiecewiseConstant, Record
 
 # A fit is looked at again if its residual is larger than so many times the noise, known to 10 %
@@ -46,10 +47,11 @@ def is_far_off(found: Identification, record: Record) -> bool:
     :param found: what was identified.
     :param record: its record.
     """
-    residual, noise = found.fit.residual_rms, record.noise_std
+    residual = found.fit.residual_rms
     if not residual > _FAR_OFF_SPREAD * float(np.std(record.measurement)):
         return False
-    return math.isnan(noise) or residual > _FAR_OFF_NOISE * noise
+    noise = roughness(record) if math.isnan(record.noise_std) else record.noise_std
+    return residual > _FAR_OFF_NOISE * noise
 
 
 def _unexplained(found: Identification, record: Record) -> float:

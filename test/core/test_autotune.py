@@ -151,9 +151,14 @@ def test_a_running_test_forgets_a_disturbance_of_its_beginning():
     draws[150:200] += 1.0
     whole = simulate_sampled_relay(model, relay, period=0.2, noise=draws)
     record = replace(whole, noise_std=0.02)
-    found = analyse(_beginning(record, 300), final=False).model
+    for disturbed in (record, replace(record, noise_std=np.nan)):
+        found = analyse(_beginning(disturbed, 300), final=False).model
+        assert found is not None
+        assert np.isnan(found.ultimate_gain_std)
+    calm = replace(_record(noise=0.2), noise_std=np.nan)
+    found = analyse(_beginning(calm, 300), final=False).model
     assert found is not None
-    assert np.isnan(found.ultimate_gain_std)
+    assert found.ultimate_gain_std > 0.0
     found = analyse(record, final=False).model
     assert found is not None
     assert found.ultimate_gain == pytest.approx(2.3069, rel=0.01)
