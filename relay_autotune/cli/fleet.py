@@ -12,6 +12,10 @@ from relay_autotune.cli.replay_bag import Done, Job, died, work
 from relay_autotune.errors import BagError
 
 _CONNECT_S = 10.0
+_PRELOADED = [
+    f"relay_autotune.{name}"
+    for name in ("threads", "autotune", "bag.reader", "cli.replay_bag", "document")
+]
 
 Work = Callable[[Job], Done]
 
@@ -55,7 +59,8 @@ def _alone(job: Job, do: Work) -> Done:
 def _pool(count: int) -> ProcessPoolExecutor:
     # A fork of a process that has threads, as numpy's may, can stand still for ever.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["relay_autotune.threads", "relay_autotune.autotune"])
+    # What every job needs is loaded once, in the process that they are forked from.
+    context.set_forkserver_preload(_PRELOADED)
     return ProcessPoolExecutor(count, mp_context=context)
 
 
