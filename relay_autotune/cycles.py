@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from relay_autotune.errors import RecordError
-from relay_autotune.foreign import find_cycles, infer_settings
+from relay_autotune.foreign import find_cycles, settings_of
 from relay_autotune.record import Cycle, CycleFeatures, FloatArray, Outcome, Record
 
 __all__ = [
@@ -21,9 +21,9 @@ __all__ = [
     "cycle_from_samples",
     "cycles_of",
     "find_cycles",
-    "infer_settings",
     "limit_cycle",
     "next_cycle",
+    "settings_of",
 ]
 
 MIN_CYCLES = 3
@@ -204,7 +204,7 @@ def cycles_of(
     :param tolerance: relative difference allowed between them, see :func:`agree`.
     """
     bounds = _bounds(record)
-    settings = record.settings or infer_settings(record)
+    settings = settings_of(record)
     if settings is None or len(bounds) < 2:
         return ()
     cycles: list[Cycle] = []

@@ -11,7 +11,7 @@ import numpy as np
 
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.foreign import infer_settings
+from relay_autotune.foreign import settings_of
 from relay_autotune.identification.cycle.shape import shape_of_record
 from relay_autotune.identification.validation import DIFFERENCES
 from relay_autotune.record import Outcome, Record
@@ -87,7 +87,7 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
 
 
 def _relay(record: Record) -> dict[str, Any] | None:
-    settings = record.settings or infer_settings(record)
+    settings = settings_of(record)
     if settings is None:
         return None
     return {name: _number(value) for name, value in vars(settings).items()}

@@ -88,6 +88,15 @@ def infer_settings(record: Record) -> RelaySettings | None:
     )
 
 
+def settings_of(record: Record) -> RelaySettings | None:
+    """Return the settings of a record's relay: its own, or else what its data tell.
+
+    :param record: a record of any origin.
+    :returns: as :func:`infer_settings`.
+    """
+    return record.settings or infer_settings(record)
+
+
 def _crossed_level(measurement: FloatArray, at: IntArray) -> float:
     """Return the level that the measurement reached from below at some samples."""
     before = measurement[np.maximum(at - 1, 0)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.autotune import Analysis
-from relay_autotune.cycles import LimitCycle, cycles_of, infer_settings, limit_cycle
+from relay_autotune.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
@@ -178,7 +178,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         samples=len(record),
         lost_samples=record.lost_samples,
         record=record,
-        settings=record.settings or infer_settings(record),
+        settings=settings_of(record),
         cycles=analysis.cycles or _cycles(record),
         models_around=around(analysis.model),
         added_delay=analysis.added_delay,

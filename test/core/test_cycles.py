@@ -16,10 +16,10 @@ from relay_autotune.cycles import (
     cycle_from_samples,
     cycles_of,
     find_cycles,
-    infer_settings,
     limit_cycle,
 )
 from relay_autotune.errors import RecordError
+from relay_autotune.foreign import infer_settings
 from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.relay import ExperimentParameters, RelayExperiment
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, infer_settings, limit_cycle
+from relay_autotune.cycles import LimitCycle, cycles_of, find_cycles, limit_cycle, settings_of
 from relay_autotune.errors import IdentificationError
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
 
@@ -89,7 +89,7 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
     :raises IdentificationError: if it holds no whole cycle, too few samples in one, no motion,
         or a command of more than two levels.
     """
-    settings = record.settings or infer_settings(record)
+    settings = settings_of(record)
     bounds = record.cycle_start or find_cycles(record)
     cycles = cycles_of(record)
     if settings is None or not cycles:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import fdtrc
 
-from relay_autotune.cycles import cycles_of, infer_settings
+from relay_autotune.cycles import cycles_of, settings_of
 from relay_autotune.errors import IdentificationError
 from relay_autotune.record import Record
 
@@ -42,7 +42,7 @@ def envelope(record: Record) -> Envelope:
     :param record: a relay test.
     :raises IdentificationError: if it holds no whole cycle.
     """
-    settings = record.settings or infer_settings(record)
+    settings = settings_of(record)
     cycles = cycles_of(record)
     if settings is None or not cycles:
         raise IdentificationError(

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.cycles import find_cycles, infer_settings, limit_cycle
+from relay_autotune.cycles import find_cycles, limit_cycle, settings_of
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.cycle.periodic_spline import Basis, Spline
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
@@ -159,7 +159,7 @@ def fold(
     :param sharp: True if there is a kink for certain, so that only its place is decided.
     :raises IdentificationError: if the record holds no whole cycle, or too few samples in it.
     """
-    settings = record.settings or infer_settings(record)
+    settings = settings_of(record)
     bounds = record.cycle_start or find_cycles(record)
     if settings is None or len(bounds) < 2:
         raise IdentificationError(
