@@ -164,11 +164,11 @@ def analyse(
             models += _others(record, method, known, chosen)
         models = list(assess(models, record))
     simple = next((m.model for m in models if m.structure == "fopdt"), None)
-    if alone and simple is None and rule != DEFAULT_RULE:
+    if (alone or predict) and simple is None and rule != DEFAULT_RULE:
         simple = _simple((record,), known, chosen)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
-        return _with_prediction(found, rule, known, rng, options) if predict else found
+        return _with_prediction(found, rule, rng, simple, options) if predict else found
     refused = _NO_GAINS.get(record.outcome)
     if refused:
         return Analysis(
@@ -262,12 +262,11 @@ def _tuned(
 def _with_prediction(
     found: Analysis,
     rule: str,
-    known: Known,
     rng: np.random.Generator | None,
+    simple: TransferFunction | None,
     options: DesignOptions | None,
 ) -> Analysis:
     """Add the Ms that the gains of a rule would have on the model and on those around it."""
-    simple = None if rule == DEFAULT_RULE else _simple((found.record,), known, found.models[0])
     task = _task(found, rng, simple, options)
     return replace(found, predicted=predicted_ms(task, rule_named(rule)))
 
