@@ -272,13 +272,7 @@ def test_a_folder_that_cannot_be_written_is_said_and_the_tune_goes_on(rig: Rig) 
     blocked.write_text("not a folder")
     status = rig.listen("/diagnostics", DiagnosticArray, QoSProfile(depth=10))
     gains = rig.listen("pi_gains", PidGains)
-    rig.plant(
-        sample_period=0.1,
-        mode="lockstep",
-        structure="fopdt",
-        time_constants=[2.0],
-        dead_time=1.0,
-    )
+    start_plant(rig)
     relay = rig.relay(
         amplitude=1.0, baseline=0.0, sample_period=0.1, record_directory=str(blocked)
     )
@@ -293,7 +287,8 @@ def test_a_folder_that_cannot_be_written_is_said_and_the_tune_goes_on(rig: Rig) 
     assert "the tune goes on, but not recorded" in relay.log
 
 
-def test_without_an_identifier_the_bag_is_closed_with_the_reason(rig: Rig) -> None:
+def start_plant(rig: Rig) -> None:
+    """Start e^(-s)/(2 s + 1) in lockstep, for tests of what comes after a tune."""
     rig.plant(
         sample_period=0.1,
         mode="lockstep",
@@ -301,6 +296,10 @@ def test_without_an_identifier_the_bag_is_closed_with_the_reason(rig: Rig) -> No
         time_constants=[2.0],
         dead_time=1.0,
     )
+
+
+def test_without_an_identifier_the_bag_is_closed_with_the_reason(rig: Rig) -> None:
+    start_plant(rig)
     relay = rig.relay(amplitude=1.0, baseline=0.0, sample_period=0.1, model_timeout=0.5)
     answer = rig.tune()
     said = "is closed without transfer_function and pi_gains, not come within 0.5 s"
@@ -325,13 +324,7 @@ sys.exit(identifier.main())
 
 
 def test_an_identifier_that_takes_long_is_waited_for_and_says_if_nothing_comes(rig: Rig) -> None:
-    rig.plant(
-        sample_period=0.1,
-        mode="lockstep",
-        structure="fopdt",
-        time_constants=[2.0],
-        dead_time=1.0,
-    )
+    start_plant(rig)
     identifier = rig.start_python("late_identifier", LATE)
     rig.until(lambda: "ready" in identifier.log, "the identifier")
     limits = {"sample_period": 0.1, "model_timeout": 2.0, "amplitude": 1.0, "baseline": 0.0}
