@@ -7,12 +7,22 @@ from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.schema import first_line
+from relay_autotune.bag.schema import Number, Struct, Text, Type, first_line, message_type
 from relay_autotune.errors import BagError
 
 EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
 CYCLE = "relay_autotune_msgs/msg/RelayCycle"
+
+_LENGTH = Number("uint32", "u4")
+# numpy's types as the module struct names them
+_FORMATS = {
+    "u1": "B", "i1": "b", "u2": "H", "i2": "h", "u4": "I", "i4": "i", "u8": "Q", "i8": "q",
+    "f4": "f", "f8": "d",
+}  # fmt: skip
 
 _STAMP = {"sec": 0, "nanosec": 0}
 _HEADER: dict[str, Any] = {"stamp": _STAMP, "frame_id": ""}
@@ -82,28 +92,12 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
             f"{channel.topic} is encoded as {channel.encoding!r} with a definition in "
             f"{channel.schema_encoding!r}; expected 'cdr' with 'ros2msg'"
         )
-    try:
-        from rosbags.serde import SerdeError
-        from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-    except ImportError:
-        raise BagError(
-            "reading recorded experiments needs the Python package rosbags; "
-            "install it with: pip install rosbags"
-        ) from None
-    try:
-        text = channel.definition.decode("utf-8").replace("\r\n", "\n")
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(text, channel.type))
-    except (UnicodeDecodeError, TypesysError, KeyError, ValueError, RecursionError) as error:
-        raise BagError(
-            f"the definition of {channel.type} in the recording makes no sense: "
-            f"{first_line(error)}"
-        ) from None
+    root = message_type(channel)
     messages = []
     for data in payload:
         try:
-            decoded = _decoded(store, channel.type, data)
-        except (SerdeError, KeyError, ValueError, IndexError, struct.error, MemoryError) as error:
+            decoded = _decoded(root, data)
+        except (ValueError, struct.error, MemoryError) as error:
             raise BagError(
                 f"a message of {channel.topic} does not fit its definition: {first_line(error)}"
             ) from None
@@ -111,20 +105,66 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
     return messages
 
 
-def _decoded(store: Any, type_name: str, data: bytes) -> Any:
+def _decoded(root: Struct, data: bytes) -> Any:
     """Decode one message; bytes after its end are allowed.
 
     ROS 2's own serialization leaves some there: it makes room for the alignment of a sequence's
-    elements even if the sequence is empty. `Typestore.deserialize_cdr` refuses such messages.
+    elements even if the sequence is empty.
     """
     if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < 4:
         raise ValueError("it is not in plain CDR")
-    definition = store.get_msgdef(type_name)
-    decode = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
-    message, end = decode(memoryview(data)[4:], 0, definition.cls, store)
-    if end > len(data) - 4:
-        raise ValueError(f"it has {len(data)} bytes, fewer than its fields take")
-    return message
+    return _Decoder(memoryview(data)[4:], "<" if data[1] else ">").take(root)
+
+
+class _Decoder:
+    """Takes one value after another out of a message in plain CDR, see `cdr`."""
+
+    def __init__(self, data: memoryview, order: str) -> None:
+        self._data = data
+        self._order = order
+        self._at = 0
+
+    def take(self, kind: Type) -> Any:
+        """Return the next value: a number, a text, an array, a list, or an object with fields."""
+        if isinstance(kind, Number):
+            return self._number(kind)
+        if isinstance(kind, Text):
+            return self._text(kind)
+        if isinstance(kind, Struct):
+            return SimpleNamespace(**{name: self.take(inner) for name, inner in kind.fields})
+        count = self._number(_LENGTH) if kind.count is None else kind.count
+        if isinstance(kind.item, Number):
+            return self._array(kind.item, count)
+        # Each takes a byte at least, so that a wrong count meets the message's end.
+        return [self.take(kind.item) for _ in range(count)]
+
+    def _number(self, kind: Number) -> Any:
+        self._align(kind.size)
+        (value,) = struct.unpack_from(self._order + _FORMATS[kind.form], self._data, self._at)
+        self._at += kind.size
+        return bool(value) if kind.name == "bool" else value
+
+    def _array(self, kind: Number, count: int) -> NDArray[Any]:
+        if count == 0:
+            # Where a sequence is empty nothing is aligned.
+            return np.empty(0, dtype=kind.form)
+        self._align(kind.size)
+        values = np.frombuffer(self._data, self._order + kind.form, count, self._at)
+        self._at += count * kind.size
+        return values
+
+    def _text(self, kind: Text) -> str:
+        if kind.wide:
+            raise ValueError("the length of a wstring differs between middlewares")
+        end = self._number(_LENGTH) + self._at
+        if end > len(self._data):
+            raise ValueError(f"a text ends {end - len(self._data)} bytes behind the message")
+        text = bytes(self._data[self._at : end]).removesuffix(b"\0").decode("utf-8")
+        self._at = end
+        return text
+
+    def _align(self, size: int) -> None:
+        self._at = (self._at + size - 1) & -size
 
 
 def _with_defaults(message: Any, defaults: Mapping[str, Any]) -> SimpleNamespace:

@@ -9,6 +9,7 @@ from typing import Any
 
 from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
 from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.ros2msg import types_from_ros2msg
 from relay_autotune.errors import BagError
 
 _NUMBERS = {
@@ -126,29 +127,37 @@ def message_type(channel: Channel) -> Struct:
 
 
 def _parsed(channel: Channel, text: str) -> Mapping[str, Any]:
+    if not text.strip():
+        raise _senseless(channel, "it is empty")
+    if channel.schema_encoding == "ros2msg":
+        try:
+            return types_from_ros2msg(text, channel.type)
+        except ValueError as error:
+            raise _senseless(channel, first_line(error)) from None
+    if channel.schema_encoding in ("ros2idl", "omgidl"):
+        return _parsed_idl(channel, text)
+    raise _senseless(
+        channel, f"it is in {channel.schema_encoding!r}; expected 'ros2msg' or 'ros2idl'"
+    )
+
+
+def _parsed_idl(channel: Channel, text: str) -> Mapping[str, Any]:
+    # Few bags define a type in IDL, and loading its parser takes longer than reading a small bag.
     try:
-        from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+        from rosbags.typesys import TypesysError, get_types_from_idl
     except ImportError:
         raise BagError(
             f"reading {channel.type} needs the Python package rosbags; "
             f"install it with: pip install rosbags"
         ) from None
-    if not text.strip():
-        raise _senseless(channel, "it is empty")
+    types: dict[str, Any] = {}
     try:
-        if channel.schema_encoding == "ros2msg":
-            return get_types_from_msg(text, channel.type)
-        if channel.schema_encoding in ("ros2idl", "omgidl"):
-            types: dict[str, Any] = {}
-            for part in _IDL_HEADING.split(_IDL_DIRECTIVE.sub("", text)):
-                types |= get_types_from_idl(part) if part.strip() else {}
-            return types
+        for part in _IDL_HEADING.split(_IDL_DIRECTIVE.sub("", text)):
+            types |= get_types_from_idl(part) if part.strip() else {}
     except (TypesysError, LookupError, ValueError, TypeError, AttributeError, RecursionError,
             ArithmeticError, MemoryError) as error:  # fmt: skip
         raise _senseless(channel, first_line(error)) from None
-    raise _senseless(
-        channel, f"it is in {channel.schema_encoding!r}; expected 'ros2msg' or 'ros2idl'"
-    )
+    return types
 
 
 class _Tree:

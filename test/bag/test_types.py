@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from relay_autotune.bag.decode import decode_messages
 from relay_autotune.bag.definitions import installed_prefixes
 from relay_autotune.bag.fields import named_field, only_field
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.ros2msg import types_from_ros2msg
 from relay_autotune.bag.schema import message_type, numeric_paths
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, SelectionError
@@ -310,6 +312,70 @@ def test_every_number_of_any_type(text, seed):
         np.testing.assert_array_equal(
             values[good].astype(float), [v for v in expected if v is not None]
         )
+
+
+def plain(value):
+    """Return a decoded message as lists of names, numbers and texts."""
+    if hasattr(value, "__dict__"):
+        return {k: plain(v) for k, v in vars(value).items() if k != "__msgtype__"}
+    return [plain(item) for item in value] if isinstance(value, (list, np.ndarray)) else value
+
+
+@given(text=definitions(), seed=st.integers(0, 2**32 - 1), cut=st.integers(1, 4))
+@settings(max_examples=60, deadline=None)
+def test_whole_messages_of_any_type(text, seed, cut):
+    rng = np.random.default_rng(seed)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, "x_msgs/msg/T"))
+    messages = [random_message(rng, store, "x_msgs/msg/T") for _ in range(4)]
+    data = [
+        bytes(store.serialize_cdr(m, "x_msgs/msg/T", little_endian=bool(rng.integers(0, 2))))
+        for m in messages
+    ]
+    ours = decode_messages(channel("x_msgs/msg/T", text), [*data, data[0] + bytes(7)])
+    assert [plain(m) for m in ours] == [plain(m) for m in (*messages, messages[0])]
+    with pytest.raises(BagError, match="of /t does not fit its definition"):
+        decode_messages(channel("x_msgs/msg/T", text), [data[0][:-cut]])
+
+
+def test_fields_of_the_installed_definitions():
+    """Those of ROS have comments, defaults, constants and bounds in all the forms there are."""
+    paths = [
+        path
+        for prefix in installed_prefixes()
+        for path in prefix.glob("share/*/msg/*.msg")
+        if path.read_text().strip()
+    ]
+    assert paths
+    for path in paths:
+        name = f"{path.parts[-3]}/msg/{path.stem}"
+        ours = types_from_ros2msg(path.read_text(), name)
+        expected = get_types_from_msg(path.read_text(), name)
+        assert {k: named(fields) for k, (_, fields) in ours.items()} == {
+            k: named(fields) for k, (_, fields) in expected.items()
+        }
+
+
+def named(fields):
+    return [(name, numbered(kind)) for name, kind in fields]
+
+
+def numbered(kind):
+    """Return the type of a field with numbers and names alone."""
+    number, what = int(kind[0]), kind[1]
+    if number == 1:
+        return "byte" if what[0] == "octet" else what[0]
+    return (number, what) if number == 2 else (number, numbered(what[0]), what[1])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["float64", "float64 1a", "float64[ a", "float64[x] a", "float64[-1] a", "float64 a!", "= a",
+     "float64[1]] a", "float64 a=1 = b\n===", "<html> a", "MSG: x/msg/B"],
+)  # fmt: skip
+def test_lines_that_are_no_field(line):
+    with pytest.raises(BagError, match="makes no sense"):
+        message_type(channel("x/msg/A", f"float64 a\n{line}\n"))
 
 
 def channel(type_name, text, schema_encoding="ros2msg", encoding="cdr"):
