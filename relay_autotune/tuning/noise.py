@@ -27,16 +27,23 @@ _RATIOS = np.geomspace(1e-3, 1e4, 141)
 @lru_cache(maxsize=1)
 def _moments() -> FloatArray:
     """Return var(yf), cov(yf, h yf') and var(h yf') for each of ``_RATIOS``, shape (3, n)."""
-    rows = []
-    for ratio in _RATIOS:
-        turn, past, present = filter_matrices(float(ratio), 1.0)
-        # What the state and the next sample share is the sample before.
-        shared = turn @ np.outer(present, past)
-        drive = np.outer(past, past) + np.outer(present, present) + shared + shared.T
-        operator = np.eye(4) - np.kron(turn, turn)
-        covariance = np.linalg.solve(operator, drive.ravel())
-        rows.append(covariance[[0, 1, 3]])
-    return np.array(rows).T
+    motions = [filter_matrices(float(ratio), 1.0) for ratio in _RATIOS]
+    turn, past, present = (np.array(part) for part in zip(*motions, strict=True))
+    # In time constants of the filter both states are of one size, as the solution needs.
+    size = np.stack((np.ones(_RATIOS.size), _RATIOS), axis=1)
+    turn, past, present = turn * size[:, :, None] / size[:, None, :], past * size, present * size
+    # What the state and the next sample share is the sample before.
+    shared = _outer((turn @ present[..., None])[..., 0], past)
+    drive = _outer(past, past) + _outer(present, present) + shared + shared.swapaxes(1, 2)
+    twice = turn[:, :, None, :, None] * turn[:, None, :, None, :]
+    operator = np.eye(4) - twice.reshape(-1, 4, 4)
+    covariance = np.linalg.solve(operator, drive.reshape(-1, 4, 1))
+    return covariance[:, [0, 1, 3], 0].T / np.stack((size[:, 0], _RATIOS, _RATIOS**2))
+
+
+def _outer(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the outer products of vectors, shape (n, 2, 2)."""
+    return np.asarray(left[:, :, None] * right[:, None, :])
 
 
 def open_noise_gain(td: FloatArray, tf: FloatArray, period: float) -> FloatArray:
@@ -108,9 +115,11 @@ def _sampled(controller: ControlLaw, angle: FloatArray, period: float) -> Comple
         return controller(1j * angle / period)
     turn, past, present = filter_matrices(controller.tf, period)
     z = np.exp(1j * angle)
-    drive = past + present * z[:, None]
-    state = np.linalg.solve(z[:, None, None] * np.eye(2) - turn, drive[:, :, None])[:, :, 0]
+    # The state's transform, by Cramer's rule.
+    first, second = (past[k] + present[k] * z for k in (0, 1))
+    (f11, f12), (f21, f22) = turn.tolist()
+    determinant = (z - f11) * (z - f22) - f12 * f21
+    value = ((z - f22) * first + f12 * second) / determinant
+    slope = ((z - f11) * second + f21 * first) / determinant
     integral = controller.i * period * z / (z - 1.0)
-    return np.asarray(
-        controller.kc * (state[:, 0] + controller.td * state[:, 1]) + integral * state[:, 0]
-    )
+    return np.asarray(controller.kc * (value + controller.td * slope) + integral * value)

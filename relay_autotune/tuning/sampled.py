@@ -14,7 +14,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from relay_autotune.errors import TuningError
 from relay_autotune.tuning.gains import Controller
@@ -77,15 +76,16 @@ def filter_matrices(tf: float, period: float) -> tuple[FloatArray, FloatArray, F
     """
     if tf <= 1e-6 * period:
         return np.zeros((2, 2)), np.array([0.0, -1.0 / period]), np.array([1.0, 1.0 / period])
-    stiff = 2.0 / tf**2
-    # State, input, and the input's slope times the period.
-    chain = np.zeros((4, 4))
-    chain[0, 1] = 1.0
-    chain[1, :3] = -stiff, -2.0 / tf, stiff
-    chain[2, 3] = 1.0 / period
-    moved = expm(chain * period)
-    ramp = moved[:2, 3]
-    return moved[:2, :2], moved[:2, 2] - ramp, ramp
+    # The poles lie at (-1 +- j)/tf, and a is the period in time constants. A matrix exponential
+    # would be solved for by BLAS, whose threads take longer to agree than this takes.
+    a = period / tf
+    decay, cosine, sine = math.exp(-a), math.cos(a), math.sin(a)
+    late, away = math.expm1(-a), 2.0 * math.sin(0.5 * a) ** 2
+    turn = decay * np.array([[cosine + sine, tf * sine], [-2.0 / tf * sine, cosine - sine]])
+    step = np.array([away - sine - late * (cosine + sine), 2.0 / tf * decay * sine])
+    # What a measurement leaves that rises from 0 to 1 in the period.
+    ramp = np.array([1.0 + (late * cosine - away) / a, step[0] / period])
+    return turn, step - ramp, ramp
 
 
 class SampledPid:

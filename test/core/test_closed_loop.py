@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
 from relay_autotune.tuning import Controller, analyse_loop
 from relay_autotune.tuning.closed_loop import simulate_closed_loop
-from relay_autotune.tuning.noise import noise_gain
+from relay_autotune.tuning.noise import noise_gain, open_noise_gain
 from relay_autotune.tuning.responses import step_responses
-from relay_autotune.tuning.sampled import SampledPid
+from relay_autotune.tuning.sampled import SampledPid, filter_matrices
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)
@@ -82,6 +83,30 @@ def test_the_filter_lags_by_its_time_constant_at_any_period():
         for k in range(int(60.0 / period)):
             command = law.step(0.0, k * period)
         assert command == pytest.approx(-(k * period - 2.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("tf", [0.02, 0.3, 2.0, 50.0])
+def test_the_filter_moves_as_the_matrix_exponential_has_it(tf):
+    period, stiff = 0.4, 2.0 / tf**2
+    # State, input, and the input's slope times the period.
+    chain = np.zeros((4, 4))
+    chain[0, 1] = 1.0
+    chain[1, :3] = -stiff, -2.0 / tf, stiff
+    chain[2, 3] = 1.0 / period
+    moved = expm(chain * period)
+    turn, past, present = filter_matrices(tf, period)
+    assert turn == pytest.approx(moved[:2, :2], rel=1e-9, abs=1e-12)
+    assert present == pytest.approx(moved[:2, 3], rel=1e-9)
+    assert past + present == pytest.approx(moved[:2, 2], rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [300.0, 9000.0])
+def test_a_slow_filter_leaves_the_noise_of_its_bandwidth(ratio):
+    period = 0.1
+    tf, td = np.array([ratio * period]), np.array([0.0, 1e3]) * ratio * period
+    # Integrals of |F(jw)|^2 and |w F(jw)|^2 with F = 1/(1 + tf s + (tf s)^2/2).
+    exact = np.sqrt((0.5 + np.array([0.0, 1e6])) / ratio)
+    assert open_noise_gain(td, tf, period) == pytest.approx(exact, rel=5e-3)
 
 
 def test_a_period_or_limits_without_sense_are_refused():
