@@ -10,7 +10,9 @@ import numpy as np
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.procedure import Procedure, State
 from relay_autotune.experiment.relay_parameters import PARAMETERS, ExperimentParameters, Parameter
+from relay_autotune.experiment.repetition import SilenceWatch
 from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy
+from relay_autotune.experiment.sample_check import SampleCheck
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.sensor_watch import FrozenWatch
 from relay_autotune.record import Cycle, FloatArray, Outcome, Record, RelaySettings
@@ -23,11 +25,6 @@ __all__ = [
     "SafePolicy",
     "State",
 ]
-
-# Numbers beyond this overflow when squared, and are no measurements of anything.
-_LARGEST = 1e100
-# So many samples with one and the same time come from a clock that stands still.
-_LONGEST_REPEAT = 10_000
 
 _OUTCOMES = {
     State.COMPLETED: Outcome.COMPLETED,
@@ -76,11 +73,12 @@ class RelayExperiment:
         self._hold: ProportionalHold | None = None
         self._samples = Samples()
         self._frozen = FrozenWatch()
+        self._silence = SilenceWatch()
+        self._check = SampleCheck()
         self._procedure = Procedure(
             parameters, self.baseline, self._samples, until_converged=until_converged
         )
         self._origin = math.nan
-        self._repeats = 0
 
     @property
     def state(self) -> State:
@@ -100,7 +98,10 @@ class RelayExperiment:
     @property
     def reason(self) -> str:
         """Why it ended, a sentence for people; empty before."""
-        return self._procedure.reason
+        reason, repeated = self._procedure.reason, self._silence.repeated
+        if not (reason and repeated):
+            return reason
+        return f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
 
     @property
     def settings(self) -> RelaySettings | None:
@@ -239,10 +240,26 @@ class RelayExperiment:
         :param measurement: the sample [y].
         :returns: the command [u]; after the end that of :meth:`after_end`.
         """
+        return self._take(time, measurement, repeated=False)
+
+    def repeat(self, time: float, measurement: float) -> float:
+        """Take the last measurement for a sample once more, since the sensor has been silent.
+
+        A sensor that speaks only when its value changes says so that it has not. The record holds
+        the sample like any other: it equals the one before.
+
+        :param time: the present time [s], on the axis of :meth:`step`.
+        :param measurement: what the sensor said last [y].
+        :returns: as :meth:`step`.
+        """
+        return self._take(time, measurement, repeated=True)
+
+    def _take(self, time: float, measurement: float, *, repeated: bool) -> float:
         procedure, samples = self._procedure, self._samples
         if procedure.state in _OUTCOMES:
             return self.after_end(measurement)
-        problem = self._unusable(time, measurement)
+        last = samples.time[-1] if samples else -math.inf
+        problem = self._check.problem(time, measurement, last, self._origin)
         if problem is not None:
             procedure.end(State.FAILED, problem)
             return self._ended(math.nan)
@@ -251,7 +268,8 @@ class RelayExperiment:
         t, y = float(time) - self._origin, float(measurement)
         samples.time.append(t)
         samples.measurement.append(y)
-        command = self.baseline if self._passes_limit(t, y) else procedure.answer(t, y)
+        over = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
+        command = self.baseline if over else procedure.answer(t, y)
         if procedure.state in _OUTCOMES:
             command = self._ended(y)
         elif self.parameters.command_rate > 0.0:
@@ -319,35 +337,6 @@ class RelayExperiment:
         step = self.parameters.command_rate * (samples.time[-1] - samples.time[-2])
         return min(max(wanted, before - step), before + step)
 
-    def _unusable(self, time: float, measurement: float) -> str | None:
-        """Say why a sample cannot be used; None if it can."""
-        samples = self._samples
-        if not -_LARGEST < measurement < _LARGEST:
-            return (
-                f"the measurement after {len(samples)} samples is {measurement:g}, expected a "
-                f"finite number: check the sensor"
-            )
-        if not -_LARGEST < time < _LARGEST:
-            return f"the time after {len(samples)} samples is {time:g} s, expected a finite number"
-        if not samples:
-            return None
-        last, t = samples.time[-1], float(time) - self._origin
-        if t > last:
-            self._repeats = 0
-            return None
-        if t < last:
-            return (
-                f"time went backwards, from {last:g} s to {t:g} s after the first sample: check "
-                f"the clock that stamps the measurement"
-            )
-        self._repeats += 1
-        if self._repeats < _LONGEST_REPEAT:
-            return None
-        return (
-            f"{_LONGEST_REPEAT} samples carry the same time, {t:g} s after the first: check the "
-            f"clock that stamps the measurement"
-        )
-
     def _passes_limit(self, t: float, y: float) -> bool:
         """End the experiment if the last sample passes a limit; return True if it does."""
         p, procedure = self.parameters, self._procedure
@@ -370,7 +359,24 @@ class RelayExperiment:
                 f"max_duration {p.max_duration:g} s was over {procedure.where()}: allow more time "
                 f"or fewer cycles",
             )
-        elif self._frozen.add(y, at_rest=resting, in_cycles=bool(procedure.cycles)):
+        return procedure.state in _OUTCOMES
+
+    def _is_dead(self, t: float, y: float, *, repeated: bool) -> bool:
+        """End the experiment if the sensor says no more; return True if so."""
+        procedure = self._procedure
+        if repeated:
+            longest = max((cycle.period for cycle in procedure.cycles), default=math.inf)
+            if self._silence.repeat(t, longest_cycle=longest):
+                procedure.end(
+                    State.FAILED,
+                    f"the measurement does not respond any more: none has come for "
+                    f"{self._silence.silence:.3g} s, much longer than before, "
+                    f"{procedure.where()}; check the sensor",
+                )
+            return procedure.state in _OUTCOMES
+        self._silence.hear(t, relaying=procedure.state is State.RELAY)
+        resting = procedure.state is State.SETTLING
+        if self._frozen.add(y, at_rest=resting, in_cycles=bool(procedure.cycles)):
             procedure.end(
                 State.FAILED,
                 f"the sensor is frozen: its last {self._frozen.run} samples are all {y:g}, "

@@ -27,6 +27,12 @@ _LEVEL = 0.03
 # What is no further than this part of its way from where it went last has not come back.
 _BACK = 0.1
 
+NO_ANSWER = (
+    "it does not respond: it has stood still since the command last changed; check the sensor, "
+    "and that the actuator follows"
+)
+"""What there is to say of a measurement that did nothing."""
+
 
 class RunawayWatch:
     """Recognise exponential growth, as of an unstable process of which the relay has no hold.
@@ -112,6 +118,14 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
         "it moves towards the band, but too slowly for what was seen before: give a larger "
         "amplitude or max_half_cycle, and let the process rest before the start"
     )
+
+
+def has_moved(measurement: FloatArray) -> bool:
+    """Return True if a measurement has changed at all, or there is too little of it to tell.
+
+    :param measurement: the samples since the command last changed [y], shape (n,).
+    """
+    return len(measurement) < _SAMPLES or bool(measurement.max() > measurement.min())
 
 
 def _thirds(time: FloatArray, values: FloatArray) -> list[FloatArray]:

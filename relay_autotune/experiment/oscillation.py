@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 
 from relay_autotune.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.experiment.levels import Levels, clear_swing
-from relay_autotune.experiment.no_return import RunawayWatch, is_growing, why_no_return
+from relay_autotune.experiment.no_return import (
+    NO_ANSWER,
+    RunawayWatch,
+    has_moved,
+    is_growing,
+    why_no_return,
+)
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
-from relay_autotune.record import Cycle, Outcome
+from relay_autotune.record import Cycle, FloatArray, Outcome
 
 # A stay at the low level shorter than this part of the longest stay (less, in proportion to how
 # unequally a biased relay pushes), or of half the time that the process took to respond, cannot be
@@ -113,6 +120,7 @@ class Oscillation:
         self.switches = 0
         """Number of switches so far."""
         self._shifts = 0
+        self._shifted_at = -math.inf
         self._furthest = math.inf
         self._away = 0
         self._begin()
@@ -309,7 +317,9 @@ class Oscillation:
         # A half cycle that is no noise shows that the process goes both ways with the relay.
         stays = self.switches - self._switches_before
         follows = bool(self.cycles) or (stays >= _FOLLOWS and not self._is_noise())
-        if self._doubtful and not follows:
+        # What stands still, and not only saturates, is no answer to anything.
+        moved = has_moved(self._since(self._told_at)[1])
+        if self._doubtful and not follows and moved:
             self._doubtful = False
             self.notes.append(
                 f"the process gain was first taken for {_SIGNS[self.sign]}: the measurement did "
@@ -324,22 +334,36 @@ class Oscillation:
             self.cycle_start.clear()
             self._begin()
             return
-        if follows and self._shifts < _MOST_SHIFTS:
+        if follows and self._shifts < _MOST_SHIFTS and moved:
             # It did oscillate: a load may have come that one of the levels cannot bear.
             before = self.command
             self._shift((_SHIFT if self._is_high else -_SHIFT) * self._levels.amplitude)
             if self.command != before:
                 self._shifts += 1
+                self._shifted_at = t
                 # What it needs now is half of the patience that is used up.
                 self._patient_from = t - 0.5 * self._limit
                 return
         self._end(Outcome.FAILED, self._why_lost(t, y))
 
+    @property
+    def _told_at(self) -> float:
+        """When the process was last told something else [s]."""
+        return max(self._relay.since, self._shifted_at)
+
+    def _since(self, time: float) -> tuple[FloatArray, FloatArray]:
+        """Return time and measurement from an instant on."""
+        first = bisect_left(self._samples.time, time)
+        return self._samples.columns(first, len(self._samples))[:2]
+
     def _why_lost(self, t: float, y: float) -> str:
-        stay = [k for k, s in enumerate(self._samples.time) if s >= self._relay.since]
-        time, measurement, _ = self._samples.columns(stay[0], len(self._samples))
+        time, measurement = self._since(self._relay.since)
         towards = self.sign if self._relay.is_high else -self.sign
-        why = why_no_return(time, towards * measurement, self._rest.noise_std)
+        why = (
+            why_no_return(time, towards * measurement, self._rest.noise_std)
+            if has_moved(self._since(self._told_at)[1])
+            else NO_ANSWER
+        )
         return (
             f"no oscillation after {count_cycles(self.cycles)}: the measurement is {y:g} and did "
             f"not come back to {self._setpoint:g} -/+ {self._hysteresis:g} within "
