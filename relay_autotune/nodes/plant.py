@@ -242,10 +242,13 @@ class PlantNode(ServedNode):
         # Each event that an end watches costs every turn of the executor a little.
         overridable = QoSOverridingOptions.with_default_policies()
         unseen = PublisherEventCallbacks(use_default_callbacks=False)
+        # What is said only once has to stay for who comes later.
+        depth = quality.MEASUREMENT.depth
+        offered = quality.latched(depth) if values["on_change"] else quality.MEASUREMENT
         self._measurement = self.create_publisher(
             Float64,
             "measurement",
-            quality.MEASUREMENT,
+            offered,
             event_callbacks=unseen,
             qos_overriding_options=overridable,
         )

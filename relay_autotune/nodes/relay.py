@@ -14,7 +14,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
-from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import RelayAutotuneError
@@ -35,6 +34,7 @@ from relay_autotune.nodes.readiness import (
     plan_of,
     policy_from,
     require_connections,
+    require_own_time,
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
@@ -47,6 +47,7 @@ from relay_autotune.nodes.reports import (
 from relay_autotune.nodes.session import Session
 from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
 from relay_autotune.nodes.signs_of_life import said_by
+from relay_autotune.nodes.silence import Sensor
 from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
@@ -77,7 +78,6 @@ class RelayNode(ServedNode):
         self._held: float | None = None if math.isnan(initial) else initial
         self._after: Callable[[float], float] | None = None
         self._session: Session | None = None
-        self._watchdog: Timer | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._counter = Counter()
@@ -101,6 +101,10 @@ class RelayNode(ServedNode):
         self._on_setpoint = fixed["relay_on"] == "setpoint"
         takeover = fixed["path"] == "takeover"
         self._loop = LoopEnds(self, self._ends, takeover=takeover, stop=self._stop_now)
+        self._sensor = Sensor(
+            self, self._reader, self._counter, repeat=self._on_silence, stop=self._stop_now
+        )
+        self._hear = self._sensor.hear
         if not self._simulated:
             # With /clock, the time of a sample comes by another callback.
             self.favoured = self._ends.measurement
@@ -121,6 +125,8 @@ class RelayNode(ServedNode):
     def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
         session = self._session
         value = self._value(message)
+        if self._hear is not None:
+            self._hear(value)
         if self._ahead:
             self._ahead -= 1
         elif session is not None:
@@ -128,22 +134,35 @@ class RelayNode(ServedNode):
                 info["source_timestamp"] = self._reader.stamp_ns(message)
             command = session.answer(value, info)
             if command is not None:
-                # Nothing comes before this: the actuator waits for it.
-                self._relay(command)
-                session.answered()
-                self._loop.commanded = command
-                if session.has_news:
-                    self._defer_news(session)
-                if session.experiment.finished:
-                    self._leave(session, command)
+                self._respond(session, command)
             elif session.may_be_no_repeat:
                 self._answer_later(session)
         elif not self._loop.is_driven:
-            if self._after is not None:
-                self._held = self._after(value)
-            if self._held is not None:
-                self._send(self._held)
+            self._answer_idle(value)
         self._counter.add(info["publication_sequence_number"])
+
+    def _on_silence(self, value: float) -> None:
+        """Take the last measurement again, which a sensor that is silent stands by."""
+        if (session := self._session) is not None:
+            self._respond(session, session.repeat(value))
+        elif not self._loop.is_driven:
+            self._answer_idle(value)
+
+    def _respond(self, session: Session, command: float) -> None:
+        # Nothing comes before this: the actuator waits for it.
+        self._relay(command)
+        session.answered()
+        self._loop.commanded = command
+        if session.has_news:
+            self._defer_news(session)
+        if session.experiment.finished:
+            self._leave(session, command)
+
+    def _answer_idle(self, value: float) -> None:
+        if self._after is not None:
+            self._held = self._after(value)
+        if self._held is not None:
+            self._send(self._held)
 
     def _answer_later(self, session: Session) -> None:
         def answer() -> None:
@@ -197,7 +216,8 @@ class RelayNode(ServedNode):
             baseline = baseline_from(values["baseline"], mean, self._held)
         parameters.validate(baseline)
         policy = policy_from(values, connected=self._loop.is_connected)
-        require_connections(self, self._ends, self._counter.age, values["measurement_timeout"])
+        require_connections(self, self._ends, self._sensor.age, values["measurement_timeout"])
+        require_own_time(parameters, repeats=self._hear is not None)
         self._loop.require_alone()
         return parameters, baseline, policy
 
@@ -217,6 +237,7 @@ class RelayNode(ServedNode):
             identity,
             sample_period=parameters.sample_period,
             clock=(lambda: int(clock.now().nanoseconds)) if self._simulated else None,
+            repeats=self._hear is not None,
         )
         sample, recorded = self._recordings.begin(
             identity, self.get_parameter("record_directory").value
@@ -230,8 +251,7 @@ class RelayNode(ServedNode):
         self._counter.begin()
         self._alarm = ""
         self._session = session
-        timeout = self.get_parameter("measurement_timeout").value
-        self._watchdog = self.create_timer(timeout, self._watch, clock=self._steady)
+        self._sensor.watch()
         self._loop.take(session.experiment, gives_back=policy.give_back)
         return identity, recorded
 
@@ -253,17 +273,6 @@ class RelayNode(ServedNode):
         message = cycle_message(session, index)
         self._ends.cycles.publish(message)
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
-
-    def _watch(self) -> None:
-        if (session := self._session) is None or (watchdog := self._watchdog) is None:
-            return
-        timeout, silent = self.get_parameter("measurement_timeout").value, self._counter.age
-        if silent < timeout:
-            watchdog.timer_period_ns = max(int((timeout - silent) * 1e9), 1_000_000)
-            watchdog.reset()
-            return
-        topic = self._ends.measurement.topic_name
-        self._stop(session, f"no measurement on {topic} for {silent:.3g} s")
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         session = self._session
@@ -322,9 +331,7 @@ class RelayNode(ServedNode):
             self._held, self._after = command, session.experiment.after_end
         self._session = None
         session.lost_samples = self._counter.lost if self._counted else 0
-        if self._watchdog is not None:
-            self.destroy_timer(self._watchdog)
-            self._watchdog = None
+        self._sensor.rest()
         self._loop.give_back(session.experiment, command)
         self.defer(partial(self._complete, session))
 
@@ -375,20 +382,13 @@ class RelayNode(ServedNode):
     def _publish_diagnostics(self) -> None:
         session = self._session
         problems = [self._alarm] if self._alarm else []
-        if self._counter.age > self.get_parameter("measurement_timeout").value:
+        if self._sensor.age > self.get_parameter("measurement_timeout").value:
             why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem()))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
         running = "" if session is None else session.id
-        values: dict[str, object] = {
-            "state": idle,
-            "experiment": running,
-            "rate [Hz]": float(self._counter.since_last_asked()),
-            "age of the last sample [s]": self._counter.age,
-        }
-        if session is not None:
-            values |= state_values(session, self._counter.lost if self._counted else 0)
+        values = state_values(self._counter, session, idle=idle, counted=self._counted)
         summary = f"tune {running} is running" if running else self._summary
         now = int(self.get_clock().now().nanoseconds)
         message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)

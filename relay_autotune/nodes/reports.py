@@ -100,18 +100,30 @@ class Counter:
         return count
 
 
-def state_values(session: Session, lost: int) -> dict[str, object]:
-    """Return the facts of a running tune for /diagnostics.
+def state_values(
+    counter: Counter, session: Session | None, *, idle: str, counted: bool
+) -> dict[str, object]:
+    """Return the facts of relay_node for /diagnostics.
 
-    :param session: the tune.
-    :param lost: samples that are known to be lost.
+    :param counter: of the measurements.
+    :param session: the tune that runs; None: none does.
+    :param idle: what the node does while none runs.
+    :param counted: True if the publisher's numbers tell what was lost.
     """
+    values: dict[str, object] = {
+        "state": idle,
+        "experiment": "" if session is None else session.id,
+        "rate [Hz]": float(counter.since_last_asked()),
+        "age of the last sample [s]": counter.age,
+    }
+    if session is None:
+        return values
     experiment = session.experiment
-    return {
+    return values | {
         "state": experiment.state.name.lower(),
         "cycles": experiment.cycle_count,
         "noise standard deviation": experiment.noise_std,
         "samples": session.sample_count,
-        "lost samples": lost,
+        "lost samples": counter.lost if counted else 0,
         "clock drift [s]": session.clocks.drift,
     }

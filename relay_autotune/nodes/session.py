@@ -19,18 +19,22 @@ from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.record import Record
 from relay_autotune.relay import RelayExperiment
 
+# A measurement waits no longer than this for its callback, unless a clock was set back [ns].
+_LONGEST_WAIT_NS = 1_000_000_000
+
 
 class Session:
     """A relay experiment fed with the samples of a topic.
 
     The time of a sample is, in this order of preference: ``k * sample_period`` for sample k where
-    a sample period is given; the node's clock where that is simulated; the middleware's source
-    stamp otherwise.
+    a sample period is given; the node's clock where that is simulated; its arrival where samples
+    are repeated, since both are then of one clock; the middleware's source stamp otherwise.
 
     :param experiment: the state machine.
     :param experiment_id: the id that every message of the experiment carries.
     :param sample_period: period of the samples [s]; 0: they are stamped.
     :param clock: the simulated clock [ns]; None: time is real.
+    :param repeats: True if a measurement is a sample again while the sensor is silent.
     """
 
     def __init__(
@@ -40,6 +44,7 @@ class Session:
         *,
         sample_period: float = 0.0,
         clock: Callable[[], int] | None = None,
+        repeats: bool = False,
     ) -> None:
         self.experiment = experiment
         self.id = experiment_id
@@ -54,6 +59,7 @@ class Session:
         self._count = 0
         self._last = (0, 0, 0.0, 0.0)
         self._first_answer_ns = 0
+        self._repeated_ns = 0
         self.may_be_no_repeat = False
         self._received_ns = array.array("q")
         self._sent_ns = array.array("q")
@@ -63,6 +69,8 @@ class Session:
             self.answer = self._answer_by_number
         elif clock is not None:
             self.answer = self._answer_by_clock
+        elif repeats:
+            self.answer = self._answer_by_arrival
         else:
             self.answer = self._answer_by_stamp
 
@@ -85,6 +93,20 @@ class Session:
         if experiment.cycle_count != self.published_cycles:
             return True
         return self.early is not None and self.early.is_due(experiment)
+
+    def repeat(self, measurement: float) -> float:
+        """Take the last measurement for a sample again, now; return the command.
+
+        :param measurement: what the sensor said last, be it before the tune [y].
+        """
+        now = self.now_ns()
+        if self._count == 0:
+            self.start_ns = now
+        self._count += 1
+        self._repeated_ns = now
+        command = self.experiment.repeat((now - self.start_ns) * 1e-9, measurement)
+        self._last = (now, now, measurement, command)
+        return command
 
     def now_ns(self) -> int:
         """Return the present time on the clock of the experiment [ns]."""
@@ -133,6 +155,18 @@ class Session:
         if stepped:
             command = self.experiment.abort(stepped)
         self._last = (received, source, measurement, command)
+        return command
+
+    def _answer_by_arrival(self, measurement: float, info: Mapping[str, Any]) -> float:
+        received = info["received_timestamp"] or time.time_ns()
+        if self._count == 0:
+            self.start_ns = received
+        elif 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
+            # It has waited while the value before it was repeated.
+            received = self._repeated_ns
+        self._count += 1
+        command: float = self._step((received - self.start_ns) * 1e-9, measurement)
+        self._last = (received, received, measurement, command)
         return command
 
     def _answer_by_clock(self, measurement: float, _: Mapping[str, Any]) -> float:

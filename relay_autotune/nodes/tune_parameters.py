@@ -157,6 +157,15 @@ FIXED_PARAMETERS = (
         "measurement_field", "data", "", "Path of the measurement in it, such as position[2]."
     ),
     NodeParameter(
+        "repeat_period",
+        0.0,
+        "s",
+        "For a sensor that publishes only when its value changes: after each such time of silence "
+        "the last value is a sample again, and measurement_timeout does not count; 0: silence is "
+        "a fault.",
+        0.0,
+    ),
+    NodeParameter(
         "command_type",
         FLOAT64,
         "",

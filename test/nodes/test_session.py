@@ -61,6 +61,30 @@ def test_simulated_time_is_the_clocks() -> None:
     assert record.start == 5.0
 
 
+def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session(experiment(), "one", repeats=True)
+    start = 1_700_000_000_000_000_000
+    kept: list[Any] = []
+    session.record_with(kept.append)
+    # The sensor's own clock is behind, and it was silent when the tune began.
+    steps = [(0, True), (20, True), (33, False), (53, True), (52, False), (52, False), (60, False)]
+    for milliseconds, repeated in steps:
+        now = start + milliseconds * 1_000_000
+        monkeypatch.setattr(time, "time_ns", lambda now=now: now)
+        if repeated:
+            session.repeat(4.0)
+        else:
+            session.answer(4.5, info(now - 5_000_000_000, now))
+        session.answered()
+    # What waited while a value was repeated counts from then on.
+    expected = [0.0, 0.02, 0.033, 0.053, 0.053, 0.053, 0.06]
+    record = session.record()
+    assert record.time == pytest.approx(expected, abs=1e-12)
+    assert record.receive_time == pytest.approx(expected, abs=1e-12)
+    assert not session.experiment.finished, session.experiment.reason
+    assert [k[2] for k in kept] == [4.0, 4.0, 4.5, 4.0, 4.5, 4.5, 4.5]
+
+
 class Lockstep:
     """A session by sample number, whose first sample was answered just now."""
 

@@ -1,0 +1,165 @@
+"""The silence of the measurement: a fault, or a sensor that speaks only when its value changes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+from relay_autotune.experiment.repetition import Repetition
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.live_types import Reader
+from relay_autotune.nodes.reports import Counter
+
+# A timer waits no shorter than this, and the graph is asked so often during a tune [s].
+_LEAST_WAIT = 1e-3
+_LOOK_EVERY = 0.2
+
+
+class Repeater:
+    """Take the last measurement again while the sensor is silent.
+
+    Time is that of the steady clock, or the simulated one. What a sensor said before the node was
+    there is heard if its publisher keeps it (transient local).
+
+    :param node: the node.
+    :param period: silence after which a value is repeated [s], > 0.
+    :param reader: how the measurement is read from its messages.
+    :param repeat: called with the value that is a sample again [y].
+    """
+
+    def __init__(
+        self, node: Any, period: float, reader: Reader, repeat: Callable[[float], None]
+    ) -> None:
+        self._node = node
+        self._reader = reader
+        self._repeat = repeat
+        self._repetition = Repetition(period)
+        if node.get_parameter("use_sim_time").value:
+            clock = node.get_clock()
+            self._now: Callable[[], float] = lambda: float(clock.now().nanoseconds) * 1e-9
+        else:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._now = time.monotonic
+        self._timer = node.create_timer(period, self._look, clock=clock)
+        self._ear: Subscription | None = node.create_subscription(
+            reader.kind,
+            "measurement",
+            self._on_kept,
+            quality.RESULT,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )
+        self._topic = self._ear.topic_name
+        self._direct = False
+
+    def hear(self, value: float) -> None:
+        """Take a measurement that has come [y]."""
+        self._direct = True
+        self._repetition.hear(self._now(), value)
+
+    def age(self, since_last: float) -> float:
+        """Return for how long there has been no value to go by [s]; inf: there was none yet.
+
+        :param since_last: time since the last message came [s].
+        """
+        if not self._repetition.is_heard:
+            return math.inf
+        return since_last if self.why_dead() else 0.0
+
+    def why_dead(self) -> str:
+        """Return a sentence if the silence can only be that of a dead sensor, else ""."""
+        if self._node.count_publishers(self._topic):
+            return ""
+        return f"no measurement on {self._topic} any more: its publisher has left"
+
+    def _on_kept(self, message: Any) -> None:
+        if not self._direct:
+            self._repetition.hear(self._now(), self._reader.value(message))
+
+    def _look(self) -> None:
+        if self._ear is not None and self._direct:
+            self._node.destroy_subscription(self._ear)
+            self._ear = None
+        now = self._now()
+        wait = self._repetition.wait(now)
+        if wait <= 0.0:
+            self._repeat(self._repetition.repeat(now))
+            wait = self._repetition.period
+        _again(self._timer, wait)
+
+
+class Sensor:
+    """Say whether the measurement lives: by its messages, or by its publisher where it repeats.
+
+    :param node: the node.
+    :param reader: how the measurement is read from its messages.
+    :param counter: counts the messages.
+    :param repeat: called with a value that is a sample again [y].
+    :param stop: called with the reason when a tune is to end.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        reader: Reader,
+        counter: Counter,
+        *,
+        repeat: Callable[[float], None],
+        stop: Callable[[str], None],
+    ) -> None:
+        self._node = node
+        self._counter = counter
+        self._stop = stop
+        period = float(node.get_parameter("repeat_period").value)
+        self._repeater = Repeater(node, period, reader, repeat) if period > 0.0 else None
+        self._timer: Timer | None = None
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.hear = self._repeater.hear if self._repeater else None
+        """To be called with each measurement; None: need not be."""
+
+    @property
+    def age(self) -> float:
+        """For how long there has been no value to go by [s]; inf: there was none yet."""
+        age = self._counter.age
+        return age if self._repeater is None else self._repeater.age(age)
+
+    @property
+    def _timeout(self) -> float:
+        return float(self._node.get_parameter("measurement_timeout").value)
+
+    def watch(self) -> None:
+        """Watch from now on, on the steady clock, until :meth:`rest`."""
+        wait = self._timeout if self._repeater is None else _LOOK_EVERY
+        self._timer = self._node.create_timer(wait, self._look, clock=self._steady)
+
+    def rest(self) -> None:
+        """Watch no longer."""
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+
+    def _look(self) -> None:
+        if self._timer is None:
+            return
+        if self._repeater is not None:
+            if reason := self._repeater.why_dead():
+                self._stop(reason)
+            return
+        age = self._counter.age
+        if age < self._timeout:
+            _again(self._timer, self._timeout - age)
+            return
+        topic = self._node.resolve_topic_name("measurement")
+        self._stop(f"no measurement on {topic} for {age:.3g} s")
+
+
+def _again(timer: Any, wait: float) -> None:
+    timer.timer_period_ns = max(int(wait * 1e9), int(_LEAST_WAIT * 1e9))
+    timer.reset()

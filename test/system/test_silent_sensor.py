@@ -1,0 +1,82 @@
+"""A sensor that publishes only when its value changes, over DDS."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+from typing import Any
+
+import numpy as np
+import pytest
+from loop_rig import RELIABLE, Rig
+from std_msgs.msg import Float64
+
+from relay_autotune_msgs.msg import RelayExperiment, TransferFunction
+
+PLANT: dict[str, Any] = {
+    "sample_period": 0.01,
+    "structure": "fopdt",
+    "gain": 2.0,
+    "time_constants": [0.4],
+    "dead_time": 0.2,
+    "operating_point": [5.0, 1.0],
+    "quantisation": 0.01,
+    "on_change": True,
+}
+
+
+def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    models = rig.listen("transfer_function", TransferFunction)
+    commands = rig.listen("command", Float64, RELIABLE)
+    values = rig.listen("measurement", Float64)
+    plant = rig.plant(**PLANT)
+    # It has said all that it says at rest before the relay is there.
+    rig.until(lambda: values, "the measurement at rest")
+    relay = rig.relay(amplitude=0.5, initial_command=1.0, repeat_period=0.02)
+    rig.identifier()
+    answer = rig.tune()
+    rig.until(lambda: "is closed with" in relay.log, "closed bag")
+    experiment, model = experiments[-1], models[-1]
+    assert experiment.outcome == RelayExperiment.COMPLETED, experiment.reason
+    assert "repeat the one before, since the sensor was silent" in experiment.reason
+    assert model.structure == "fopdt"
+    assert model.gain == pytest.approx(2.0, rel=0.15)
+    assert model.dead_time == pytest.approx(0.2, abs=0.03)
+    # At rest nothing came, and the node stood by the last value every 20 ms.
+    time, measurement = np.array(experiment.time), np.array(experiment.measurement)
+    assert np.all(measurement[:20] == measurement[0])
+    assert np.median(np.diff(time[:20])) == pytest.approx(0.02, rel=0.2)
+    done = subprocess.run(
+        [shutil.which("replay") or "replay", "--json", str(rig.bag(answer))],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    shown = json.loads(done.stdout)["experiments"][-1]
+    again = shown["models"][shown["selected"]]
+    assert (again["gain"], again["dead_time"]) == (model.gain, model.dead_time)
+
+    # Silence is no fault, but a sensor whose process has ended is.
+    said = len(values)
+    assert rig.tune().accepted
+    rig.until(lambda: len(values) > said + 50, "the oscillation")
+    plant.signal(signal.SIGTERM)
+    rig.until(lambda: len(experiments) > 1, "the end of the second tune")
+    assert experiments[-1].outcome == RelayExperiment.ABORTED
+    assert "no measurement on /measurement any more" in experiments[-1].reason
+    assert commands[-1].data == 1.0
+
+
+def test_a_number_of_samples_is_no_clock_of_a_silent_sensor(rig: Rig) -> None:
+    rig.plant(**PLANT)
+    rig.relay(amplitude=0.5, initial_command=1.0, repeat_period=0.02, sample_period=0.01)
+
+    def refused() -> str:
+        reason: str = rig.ask_for_tune().reason
+        return reason if "repeat_period" in reason else ""
+
+    reason = rig.until(refused, "the refusal")
+    assert "repeat_period and sample_period 0.01 s are both given" in reason
