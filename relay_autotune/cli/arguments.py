@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -36,10 +37,16 @@ def say(program: str, text: str) -> None:
 def guarded(program: str, work: Callable[[], int]) -> int:
     """Return the exit status of a command's work; an error becomes one line.
 
+    What the work is known to need is loaded before: from here on Ctrl-C is an exception, so that
+    files and processes are left in order, and an import may lose it.
+
     :param program: name of the command.
     :param work: does it, and returns its exit status.
     """
+    left_to_system = signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     try:
+        if left_to_system:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         status = work()
         sys.stdout.flush()
     except SelectionError as error:
@@ -54,6 +61,9 @@ def guarded(program: str, work: Callable[[], int]) -> int:
         return NOTHING_FOUND
     except KeyboardInterrupt:
         return 130
+    finally:
+        if left_to_system:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
     return status
 
 

@@ -28,11 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     given = _joined(list(sys.argv[1:] if arguments is None else arguments))
-
-    def work() -> int:
-        return _run(_parser().parse_args(given))
-
-    return guarded(PROGRAM, work)
+    options = _parser().parse_args(given)
+    return guarded(PROGRAM, lambda: _run(options))
 
 
 def _joined(arguments: list[str]) -> list[str]:

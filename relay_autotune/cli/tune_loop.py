@@ -54,6 +54,8 @@ def main(args: Sequence[str] | None = None) -> int:
     if options.amplitude < 0.0 or options.wait < 0.0:
         parser.error("--amplitude and --wait are at least 0")
     options.typed = given
+    import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
+
     return guarded(PROGRAM, lambda: _tune(options, ros))
 
 

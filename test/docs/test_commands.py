@@ -12,9 +12,12 @@ import pytest
 import yaml
 from pages import PAGES, ROOT, Block, blocks, commands, every_command, parts_of, rows
 
-SCRIPTS = dict(
-    re.findall(r'"(\w+) = (relay_autotune[\w.]+):main"', (ROOT / "setup.py").read_text())
-)
+from relay_autotune import start
+
+SCRIPTS = {
+    name: getattr(start, name).args[0]
+    for name in re.findall(r'"\w+ = relay_autotune.start:(\w+)"', (ROOT / "setup.py").read_text())
+}
 # Each with the options that the pages use, as ros2cli of Jazzy has them.
 VERBS = {
     "run": {"--ros-args"},

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, sessions
 
+from relay_autotune import start
 from relay_autotune.cli import demo
 from relay_autotune.models import TransferFunction
 from relay_autotune.virtual_process import Disturbances, VirtualProcess
@@ -22,10 +23,7 @@ from tools.report_images import tune_as_the_demo
 
 def run(words: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[str, int]:
     """Run an executable of the package in this process; return what it says and its status."""
-    scripts = dict(
-        re.findall(r'"(\w+) = (relay_autotune[\w.]+:main)"', (ROOT / "setup.py").read_text())
-    )
-    module = importlib.import_module(scripts[words[0]].partition(":")[0])
+    module = importlib.import_module(getattr(start, words[0]).args[0])
     capfd.readouterr()
     try:
         status = module.main(words[1:])

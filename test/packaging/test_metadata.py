@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from relay_autotune import start
+
 ROOT = Path(__file__).resolve().parents[2]
 MANIFESTS = [ROOT / "package.xml", ROOT / "relay_autotune_msgs/package.xml"]
 
@@ -45,11 +47,13 @@ def test_versions_agree():
 @pytest.mark.parametrize("script", console_scripts())
 def test_executable_has_a_main(script: str):
     """An installed executable must not be one that cannot start."""
-    name, module, function = re.fullmatch(r"(\w+) = ([\w.]+):(\w+)", script).groups()
+    name, begun = re.fullmatch(r"(\w+) = relay_autotune\.start:(\w+)", script).groups()
+    assert name == begun
+    module = getattr(start, name).args[0]
     file = ROOT / (module.replace(".", "/") + ".py")
     assert file.is_file(), f"{name} names {module}, which does not exist"
     defined = [n.name for n in ast.parse(file.read_text()).body if isinstance(n, ast.FunctionDef)]
-    assert function in defined, f"{name} names {function}, which {module} does not define"
+    assert "main" in defined, f"{name} names {module}, which does not define main"
 
 
 @pytest.mark.parametrize("manifest", MANIFESTS, ids=lambda path: path.parent.name)

@@ -1,0 +1,72 @@
+"""Ctrl-C while an executable starts, or is at work."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+BAG = ROOT / "bags/biased_relay"
+PLANT = ["--ros-args", "-p", "numerator:=[1.0]", "-p", "denominator:=[20.0, 1.0]"]
+
+# As the installed script does it; that one has begun when it says so.
+BEGIN = """
+import sys
+from relay_autotune.start import {0}
+print("begins", flush=True)
+sys.exit({0}())
+"""
+
+
+def interrupted(name: str, words: list[str], delay: float) -> tuple[int, str]:
+    """Return exit status and standard error of an executable that is interrupted after a delay."""
+    given = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", BEGIN.format(name), *words],
+        cwd=ROOT, env=given, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begins\n"
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    return process.returncode, said
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "ends"),
+    [
+        ("replay", [str(BAG)], {-signal.SIGINT, 130, 0}),
+        ("identify", ["--method", "wang_biased"], {-signal.SIGINT, 130, 1, 2}),
+        ("plant_node", PLANT, {-signal.SIGINT, 0}),
+    ],
+)
+def test_no_traceback_at_any_moment(name, words, ends):
+    rng = random.Random(name)
+    for _ in range(4):
+        status, said = interrupted(name, words, rng.uniform(0.01, 0.7))
+        assert status in ends, said
+        assert "Traceback" not in said
+        assert "KeyboardInterrupt" not in said
+
+
+def test_one_that_is_not_to_be_interrupted():
+    """Whoever starts a command with SIGINT ignored, as nohup and `&` in a script do, means it."""
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "import sys; sys.argv[1:] = ['--help']\n"
+        "from relay_autotune.start import csv_to_bag\n"
+        "try:\n"
+        "    csv_to_bag()\n"
+        "finally:\n"
+        "    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
