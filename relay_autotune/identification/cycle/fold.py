@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.cycles import find_cycles, limit_cycle, settings_of
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle.periodic_spline import Basis, Spline
+from relay_autotune.identification.cycle.periodic_spline import Basis, Kinks, Spline
 from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
@@ -279,6 +279,7 @@ def _smoothed(
     floor = n * (_NEGLIGIBLE * float(np.ptp(y))) ** 2 or 1e-300
     best: tuple[Spline, float] | None = None
     least, worse, edge = math.inf, 0, math.nan
+    kinks = Kinks.at(basis, places, x, weight)
     for half in _KNOTS:
         knots = half if mirrored else 2 * half
         if best is not None and (n < _SAMPLES_PER_KNOT * knots or worse > _PATIENCE):
@@ -286,7 +287,7 @@ def _smoothed(
         worse += 1
         spline = Spline(basis, knots, x, value, weight)
         if half <= _SEARCHED:
-            edge = spline.searched(places)
+            edge = spline.searched(kinks)
         edge = spline.refined(edge, places)
         for place in (edge,) if sharp else (math.nan, edge):
             coefficients, cost = spline.fitted(place)
