@@ -1,6 +1,7 @@
 r"""A PI or PID controller as it runs on a loop: from sample to sample, by hand or by itself.
 
-The law is that of :class:`~relay_autotune.tuning.gains.Controller`,
+The law is that of :class:`~relay_autotune.tuning.gains.Controller`, sample by sample as in
+:class:`~relay_autotune.tuning.sampled.PidLaw`,
 
     u = kc (b r - yf + (1/ti) int (r - yf) dt - td dyf/dt),   yf = y/(1 + tf s + (tf s)^2/2),
 
@@ -22,7 +23,7 @@ from relay_autotune.record import FloatArray
 from relay_autotune.simulation import Plant
 from relay_autotune.tuning.closed_loop import ClosedLoop
 from relay_autotune.tuning.gains import Controller
-from relay_autotune.tuning.sampled import UNLIMITED, Limits, filter_matrices
+from relay_autotune.tuning.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
 
 # A sample interval within this part of the nominal one uses the filter of that one.
 _JITTER = 0.2
@@ -51,10 +52,8 @@ class PidController:
         self._limits = limits
         self._automatic = automatic
         self._command = limits.clip(command)
-        self._integral = self._command
+        self._law: PidLaw | None = None
         self._time = math.nan
-        self._filter = np.zeros(2)
-        self._last = math.nan
         self._nominal = math.nan
         self._motion = filter_matrices(0.0, 1.0)
         self._align = True
@@ -115,27 +114,22 @@ class PidController:
         gains = self._gains
         if gains is None:
             return self._command
-        self._advance_filter(gains, interval, measurement)
-        value, slope = float(self._filter[0]), float(self._filter[1])
-        proportional = gains.kc * (gains.b * setpoint - value - gains.td * slope)
+        law = self._heard(gains, interval, measurement)
         if self._align or not self._automatic:
             # The integral is what makes the command go on from where it is.
-            self._integral = self._command - proportional
+            law.integral = self._command - law.proportional(gains, setpoint)
             self._align = False
             return self._command
         if not math.isnan(self._nominal):
             interval = min(interval, _LONGEST_INTERVAL * self._nominal)
-        self._integral += gains.i * interval * (setpoint - value)
-        wanted = proportional + self._integral
-        self._command = self._limits.clip(wanted)
-        tracking = math.sqrt(gains.ti * gains.td) or gains.ti
-        if tracking > 0.0:
-            self._integral += min(1.0, interval / tracking) * (self._command - wanted)
+        self._command = law.command(gains, setpoint, interval, self._limits)
         return self._command
 
-    def _advance_filter(self, gains: Controller, interval: float, measurement: float) -> None:
-        if math.isnan(self._last):
-            self._filter = np.array([measurement, 0.0])
+    def _heard(self, gains: Controller, interval: float, measurement: float) -> PidLaw:
+        """Take a measurement over an interval that may be another one each time."""
+        law = self._law
+        if law is None:
+            self._law = law = PidLaw(measurement, self._command)
         elif interval > 0.0:
             near = abs(interval - self._nominal) <= _JITTER * self._nominal
             motion = self._motion
@@ -143,9 +137,10 @@ class PidController:
                 motion = filter_matrices(gains.tf, interval)
                 if math.isnan(self._nominal):
                     self._nominal, self._motion = interval, motion
-            turn, past, present = motion
-            self._filter = turn @ self._filter + past * self._last + present * measurement
-        self._last = measurement
+            law.hear(motion, measurement)
+        else:
+            law.replace_last(measurement)
+        return law
 
 
 def run_loop(

@@ -19,6 +19,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.tuning.gains import Controller
 
 FloatArray = NDArray[np.float64]
+Motion = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class SampledController(Protocol):
         """Return the command for this sample [u]."""
 
 
-def filter_matrices(tf: float, period: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def filter_matrices(tf: float, period: float) -> Motion:
     """Return how ``(yf, dyf/dt)`` moves on over one period.
 
     ``x = F x + g0 y + g1 y_next`` with ``yf + tf yf' + tf^2/2 yf'' = y``.
@@ -86,6 +87,61 @@ def filter_matrices(tf: float, period: float) -> tuple[FloatArray, FloatArray, F
     # What a measurement leaves that rises from 0 to 1 in the period.
     ramp = np.array([1.0 + (late * cosine - away) / a, step[0] / period])
     return turn, step - ramp, ramp
+
+
+class PidLaw:
+    """The law from one sample to the next: its filter, its integral, and what the limits cut off.
+
+    The gains are given with each sample, so that they may be others from one on.
+
+    :param measurement: at which the filter starts [y].
+    :param integral: at which the integral starts [u].
+    """
+
+    def __init__(self, measurement: float, integral: float) -> None:
+        self.integral = integral
+        """The integral [u]."""
+        self._filter = np.array([measurement, 0.0])
+        self._last = measurement
+
+    def hear(self, motion: Motion, measurement: float) -> None:
+        """Take a measurement, which ran straight from the one before.
+
+        :param motion: of the filter over the interval, see :func:`filter_matrices`.
+        :param measurement: y.
+        """
+        turn, past, present = motion
+        self._filter = turn @ self._filter + past * self._last + present * measurement
+        self._last = measurement
+
+    def replace_last(self, measurement: float) -> None:
+        """Take another measurement of the same instant [y]."""
+        self._last = measurement
+
+    def proportional(self, c: Controller, setpoint: float) -> float:
+        """Return the command without the integral [u].
+
+        :param c: the gains.
+        :param setpoint: y.
+        """
+        value, slope = self._filter
+        return float(c.kc * (c.b * setpoint - value - c.td * slope))
+
+    def command(self, c: Controller, setpoint: float, interval: float, limits: Limits) -> float:
+        """Advance the integral and return the command within the limits [u].
+
+        :param c: the gains.
+        :param setpoint: y.
+        :param interval: since the sample before [s].
+        :param limits: range of the command.
+        """
+        self.integral += float(c.i * interval * (setpoint - self._filter[0]))
+        wanted = self.proportional(c, setpoint) + self.integral
+        given = limits.clip(wanted)
+        tracking = math.sqrt(c.ti * c.td) or c.ti
+        if tracking > 0.0:
+            self.integral += min(1.0, interval / tracking) * (given - wanted)
+        return given
 
 
 class SampledPid:
@@ -112,13 +168,10 @@ class SampledPid:
     ) -> None:
         require_period(period)
         self.period = period
-        self._gains, self._limits = controller, Limits(low, high)
+        self._limits = Limits(low, high)
         self._motion = filter_matrices(controller.tf, period)
-        self._filter = np.array([measurement, 0.0])
-        self._last = measurement
-        self._integral = offset
-        tracking = math.sqrt(controller.ti * controller.td) or controller.ti
-        self._draw = min(1.0, period / tracking) if tracking > 0.0 else 0.0
+        self._law = PidLaw(measurement, offset)
+        self._gains = controller
 
     def step(self, setpoint: float, measurement: float) -> float:
         """Return the command for this sample [u].
@@ -126,12 +179,5 @@ class SampledPid:
         :param setpoint: y.
         :param measurement: y.
         """
-        c, (turn, past, present) = self._gains, self._motion
-        self._filter = turn @ self._filter + past * self._last + present * measurement
-        self._last = measurement
-        value, slope = self._filter
-        self._integral += c.i * self.period * (setpoint - value)
-        wanted = c.kc * (c.b * setpoint - value - c.td * slope) + self._integral
-        given = self._limits.clip(wanted)
-        self._integral += self._draw * (given - wanted)
-        return float(given)
+        self._law.hear(self._motion, measurement)
+        return self._law.command(self._gains, setpoint, self.period, self._limits)
