@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.names import CYCLE, EXPERIMENT
 from relay_autotune.bag.schema import Number, Struct, Text, Type, first_line, message_type
 from relay_autotune.errors import BagError
-
-EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
-CYCLE = "relay_autotune_msgs/msg/RelayCycle"
 
 _LENGTH = Number("uint32", "u4")
 # numpy's types as the module struct names them

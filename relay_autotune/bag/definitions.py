@@ -11,11 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from relay_autotune.bag.names import FLOAT64
 from relay_autotune.errors import BagError
 
 SEPARATOR = "=" * 80
-
-FLOAT64 = "std_msgs/msg/Float64"
 
 # Known without any installed package, so that a CSV becomes a bag on a machine without ROS.
 _BUILT_IN = {

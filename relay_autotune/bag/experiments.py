@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.bag.decode import CYCLE, EXPERIMENT
-from relay_autotune.bag.definitions import FLOAT64
+from relay_autotune.bag.names import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.bag.topics import Topics
-from relay_autotune.bag.writer import EXPERIMENT_METADATA
 from relay_autotune.errors import BagError, RecordError
 from relay_autotune.messages import (
     record_from_message,

@@ -5,32 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.experiments import interrupted_experiment, recorded_experiments
-from relay_autotune.bag.fields import split_name
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.mcap_file import McapFile
-from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
-from relay_autotune.bag.signals import Signal, cut, join, window
+from relay_autotune.bag.signals import join, window
 from relay_autotune.bag.timing import CLOCKS
 from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.excitation import find_experiments
 from relay_autotune.record import Record
 
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
 _WHOLE = ([".mcap", ".zstd"], [".mcap", ".zst"])
-
-# Fewer are not taken apart.
-_FEWEST_SAMPLES = 12
-
-# Beyond this, two topics' lags to the recorder differ by their clocks, not by the transport.
-_CLOCK_DIFFERENCE_NS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -69,6 +57,11 @@ class Selection:
     clock: str = CLOCKS[0]
     largest_chunk: int = LARGEST_CHUNK
 
+    @property
+    def is_part(self) -> bool:
+        """Whether a part of the recording is named."""
+        return self.start is not None or self.end is not None
+
 
 def read_experiments(
     path: Path | str | Sequence[Path | str],
@@ -93,9 +86,7 @@ def read_experiments(
     if len(paths) > 1 and any(part.suffix.lower() == ".csv" for part in paths):
         raise SelectionError("CSV files cannot be joined to one timeline; expected bags")
     if path.suffix.lower() == ".csv":
-        columns = (wanted.measurement, wanted.command, wanted.time)
-        measured, commanded, dated = read_csv(path, *columns)
-        records, notes = _experiments(join(measured, commanded, dated=dated), wanted)
+        records, notes = _of_csv(path, wanted)
     elif wanted.time is not None:
         raise SelectionError(f"--time names a column of a CSV file, but {path} is none")
     else:
@@ -152,7 +143,7 @@ def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[st
     if not topics.types():
         raise BagError("; ".join((f"{topics.path} holds no topic", *topics.notes)))
     if wanted.measurement is not None or wanted.command is not None:
-        records, notes = _joined(topics, wanted, *_named_pair(topics, wanted))
+        records, notes = _of_pair(topics, wanted)
     else:
         records, notes = recorded_experiments(topics)
         if not records:
@@ -160,120 +151,21 @@ def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[st
             if interrupted is not None:
                 records = [interrupted]
             else:
-                records, notes = _joined(topics, wanted, *_found_pair(topics))
+                records, notes = _of_pair(topics, wanted)
     return records, [*topics.notes, *notes]
 
 
-def _joined(
-    topics: Topics, wanted: Selection, pair: Pair, notes: list[str]
-) -> tuple[list[Record], list[str]]:
-    names = (pair.measurement.name, pair.command.name)
-    measured, commanded = topics.signals(names).values()
-    notes = [*notes, *measured.notes, *commanded.notes]
-    signals = [measured.signal, commanded.signal]
-    difference = abs(measured.lag_ns - commanded.lag_ns)
-    if difference > _CLOCK_DIFFERENCE_NS:
-        # The publishers' clocks disagree: both are put on the recorder's.
-        signals = [
-            replace(timed.signal, time_ns=timed.signal.time_ns + timed.lag_ns)
-            for timed in (measured, commanded)
-        ]
-        notes.append(
-            f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
-            f"they are aligned by the recorder's clock"
-        )
-    records, found = _experiments(join(signals[0], signals[1]), wanted)
-    return records, [*notes, *found]
+def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
+    # Our own recordings need neither the search for a pair nor that for experiments.
+    from relay_autotune.bag.foreign import experiments_of_pair
+
+    return experiments_of_pair(topics, wanted.measurement, wanted.command, whole=wanted.is_part)
 
 
-def _experiments(record: Record, wanted: Selection) -> tuple[list[Record], list[str]]:
-    """Take a record of unknown origin apart, unless a part of it was asked for."""
-    if wanted.start is not None or wanted.end is not None or len(record) < _FEWEST_SAMPLES:
-        return [record], []
-    stretches = find_experiments(record)
-    if not stretches:
-        if np.ptp(record.measurement) == 0.0 or np.ptp(record.command) == 0.0:
-            # Why nothing can be told from it is said where that is tried.
-            return [record], []
-        raise BagError(
-            "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
-            "a controller's command follows the measurement, and read as an answer to it would "
-            "give a wrong model; record an experiment, or name a part to be used all the same "
-            "with --start and --end"
-        )
-    records = [cut(record, stretch.first, stretch.last + 1) for stretch in stretches]
-    if len(stretches) == 1 and len(records[0]) == len(record):
-        return records, []
-    begins = record.time[[stretch.first for stretch in stretches]]
-    ends = record.time[[stretch.last for stretch in stretches]]
-    return records, [
-        f"experiment {number} of {len(records)}, {begin:g} s to {end:g} s: {stretch.reason}"
-        for number, (begin, end, stretch) in enumerate(
-            zip(begins, ends, stretches, strict=True), start=1
-        )
-    ]
+def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
+    from relay_autotune.bag.csv_file import read_csv
+    from relay_autotune.bag.foreign import take_apart
 
-
-def _named_pair(topics: Topics, wanted: Selection) -> tuple[Pair, list[str]]:
-    if wanted.measurement is not None and wanted.command is not None:
-        names = (
-            _checked(topics, "measurement", wanted.measurement),
-            _checked(topics, "command", wanted.command),
-        )
-        if names[0] == names[1]:
-            raise SelectionError(
-                f"{names[0]} was named as measurement and as command; expected two topics"
-            )
-        measured, commanded = topics.signals(names).values()
-        return Pair(measured.signal, commanded.signal, "named"), []
-    if wanted.measurement is not None:
-        given = _checked(topics, "measurement", wanted.measurement)
-        fits = [p for p in _plausible(topics, given) if p.measurement.name == given]
-    else:
-        given = _checked(topics, "command", wanted.command or "")
-        fits = [p for p in _plausible(topics, given) if p.command.name == given]
-    return _only(topics, fits)
-
-
-def _checked(topics: Topics, role: str, wanted: str) -> str:
-    types = topics.types()
-    topic, part = split_name(wanted)
-    if topic not in types and f"/{topic}" in types:
-        topic = f"/{topic}"
-    if topic not in types:
-        raise SelectionError(
-            f"{topics.path} has no topic {topic!r} for the {role}; it has {topics.listing()}"
-        )
-    return topics.field_of(topic, part)
-
-
-def _plausible(topics: Topics, given: str | None = None) -> list[Pair]:
-    signals: list[Signal] = [timed.signal for timed in topics.signals().values()]
-    return plausible_pairs(signals, given)
-
-
-def _found_pair(topics: Topics) -> tuple[Pair, list[str]]:
-    return _only(topics, _plausible(topics))
-
-
-def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[Pair, list[str]]:
-    if len(pairs) == 1:
-        pair = pairs[0]
-        names = f"--measurement {pair.measurement.name} --command {pair.command.name}"
-        return pair, [f"using {names}: {pair.reason}"]
-    if pairs:
-        listed = "".join(
-            f"\n  --measurement {pair.measurement.name} --command {pair.command.name}"
-            f"  ({pair.reason})"
-            for pair in pairs
-        )
-        raise SelectionError(
-            f"{topics.path} holds {len(pairs)} pairs of topics that may be measurement and "
-            f"command; choose one:{listed}"
-        )
-    looks = {name: characterise(t.signal).text for name, t in topics.signals().items()}
-    raise SelectionError(
-        f"{topics.path} holds no recorded experiment and no pair of topics that looks like "
-        f"measurement and command; it has {topics.listing(looks)}; name two "
-        f"with --measurement TOPIC[:FIELD] --command TOPIC[:FIELD]"
-    )
+    columns = (wanted.measurement, wanted.command, wanted.time)
+    measured, commanded, dated = read_csv(path, *columns)
+    return take_apart(join(measured, commanded, dated=dated), whole=wanted.is_part)

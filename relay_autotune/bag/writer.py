@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import relay_autotune
-from relay_autotune.bag.definitions import FLOAT64, Definition, find_definition
+from relay_autotune.bag.definitions import Definition, find_definition
 from relay_autotune.bag.metadata import (
     Qos,
     TopicSummary,
@@ -19,13 +19,11 @@ from relay_autotune.bag.metadata import (
     metadata_yaml,
     qos_yaml,
 )
+from relay_autotune.bag.names import EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.errors import BagError
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
-
-# Name of the metadata record that says which topics of a bag are the loop's.
-EXPERIMENT_METADATA = "relay_autotune"
 
 # What is written but not flushed is held in memory, and lost if the process is killed.
 _LARGEST_BUFFER = 1 << 20

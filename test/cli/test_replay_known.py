@@ -10,8 +10,8 @@ import pytest
 from made_bags import START, definition, experiment_message, serialize, write_samples
 
 from relay_autotune.autotune import analyse, analyse_jointly
-from relay_autotune.bag.decode import EXPERIMENT
 from relay_autotune.bag.definitions import Definition
+from relay_autotune.bag.names import EXPERIMENT
 from relay_autotune.bag.writer import BagWriter, Topic
 from relay_autotune.cli import replay
 from relay_autotune.errors import RelayAutotuneError

@@ -1,0 +1,10 @@
+"""What a recording of ours calls the things in it."""
+
+from __future__ import annotations
+
+EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
+CYCLE = "relay_autotune_msgs/msg/RelayCycle"
+FLOAT64 = "std_msgs/msg/Float64"
+
+# The metadata record of the file that names the loop's topics.
+EXPERIMENT_METADATA = "relay_autotune"
