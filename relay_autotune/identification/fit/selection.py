@@ -20,10 +20,12 @@ from relay_autotune.identification.fit.separable import (
 )
 from relay_autotune.identification.fit.starts import (
     Starts,
+    begin,
     coarse,
+    go_on,
+    least_promised,
     refine_all,
     refine_best,
-    refine_roughly,
     start_fopdt,
     time_scales,
 )
@@ -53,6 +55,10 @@ _EVIDENCE = 6.0
 _TRIAL = 1e-6
 # With a mean square so many times the least one, a structure has no support worth telling.
 _BEYOND_HOPE = 4.0
+# A fit that has begun is given up where it promises no less than so many times the least one; of
+# a smaller mean square of the range, what it leaves is curvature that the promise does not know.
+_NO_PROMISE = 6.0
+_CLEAN = 1e-6
 # What is asked for whatever it leaves.
 _ALWAYS = ("fopdt", "ipdt")
 
@@ -91,6 +97,8 @@ class Selection:
         self._problem, self._floor, self._sign = problem, floor, sign
         # The least mean square so far.
         self._least = math.inf
+        # How an unstable fit to a problem begins.
+        self._begun: tuple[Problem, list[State]] | None = None
         self._fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
         self._leave_out_the_unknown()
         self._starts = Starts(self._problem, self._fopdt)
@@ -150,6 +158,9 @@ class Selection:
         for drift in (False, True):
             for relaxation in (False, True):
                 if (drift, relaxation) == (found.problem.drift, found.problem.relaxation):
+                    continue
+                if relaxation and not found.structure.denominator.factors:
+                    # The free state of an integrator is the offset.
                     continue
                 problem = replace(found.problem, drift=drift, relaxation=relaxation)
                 state = refine(problem, found.state.theta, tolerance=_TRIAL)
@@ -279,37 +290,47 @@ class Selection:
             case "integrator_inverse":
                 return [self._best(known_structures.INTEGRATOR_INVERSE, starts.integrator_lag())]
             case "unstable_fopdt":
-                return [self._best(known_structures.UNSTABLE_FOPDT, self._unstable())]
+                return [self._continued(known_structures.UNSTABLE_FOPDT, self._unstable())]
             case "unstable_sopdt":
-                first = refine_roughly(
-                    replace(self._problem, structure=known_structures.UNSTABLE_FOPDT),
-                    self._unstable(),
-                )
-                chosen = starts.unstable_second(first[0].theta)
+                chosen = starts.unstable_second(self._unstable()[0].theta)
                 return [self._best(known_structures.UNSTABLE_SOPDT, chosen)]
         return []
 
-    def _unstable(self) -> list[FloatArray]:
-        return self._starts.unstable(
-            replace(self._problem, structure=known_structures.UNSTABLE_FOPDT)
-        )
+    def _unstable(self) -> list[State]:
+        """Return the beginning of an unstable FOPDT's fit, from which two structures go on."""
+        if self._begun is None or self._begun[0] is not self._problem:
+            problem = replace(self._problem, structure=known_structures.UNSTABLE_FOPDT)
+            self._begun = self._problem, begin(problem, self._starts.unstable(problem))
+        return self._begun[1]
 
     def _best(self, structure: RationalStructure, thetas: list[FloatArray]) -> Candidate | None:
         problem = replace(self._problem, structure=structure)
-        samples = problem.time.size
-        if _SAMPLES_EACH * (structure.order + 4) > samples and structure.order > 1:
+        if _SAMPLES_EACH * (structure.order + 4) > problem.time.size and structure.order > 1:
             # So few samples tell no more than a first order.
             return None
-        rough = refine_roughly(problem, thetas)
-        if structure.name not in _ALWAYS and self._is_hopeless(rough[0]):
+        return self._continued(structure, begin(problem, thetas))
+
+    def _continued(self, structure: RationalStructure, begun: list[State]) -> Candidate | None:
+        """Return the best fit that a beginning leads to; None where it is hopeless."""
+        problem = replace(self._problem, structure=structure)
+        asked = structure.name in _ALWAYS
+        if not asked and self._promises_nothing(problem, begun):
+            return None
+        rough = go_on(problem, begun)
+        if not asked and self._is_hopeless(rough[0]):
+            if self._promises_nothing(problem, rough[:1]):
+                return None
             # Unless it was on its way still.
             best = rough[0]
             rough = [refine(coarse(problem), best.theta, tolerance=_TRIAL, damping=best.damping)]
             if self._is_hopeless(rough[0]):
                 return None
         state = refine_all(problem, rough, _TRIAL)
-        self._least = min(self._least, max(state.cost, self._floor) / samples)
+        self._least = min(self._least, max(state.cost, self._floor) / problem.time.size)
         return self.candidate(problem, state)
+
+    def _promises_nothing(self, problem: Problem, begun: list[State]) -> bool:
+        return least_promised(problem, begun) > _NO_PROMISE * max(self._least, _CLEAN)
 
     def _is_hopeless(self, rough: State) -> bool:
         return rough.cost / rough.residual.size > _BEYOND_HOPE * self._least

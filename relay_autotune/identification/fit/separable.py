@@ -24,6 +24,8 @@ _LEAST_GAIN = 1e-15
 _SMALLEST_STEP = 1e-14
 _FIRST_DAMPING = 1e-3
 _LITTLE_DAMPING = 0.1
+# Trials in a row that gain nothing worth it: a rough fit stands at a kink, as of a dead time.
+_PATIENCE = 10
 _LEAST_DAMPING = 1e-12
 _MOST_DAMPING = 1e12
 _GROWTH = 4.0
@@ -240,12 +242,9 @@ def refine(
     longest = _LONGEST * float(np.ptp(problem.time))
     # A rough answer must not take as many trials as an exact one.
     rough = tolerance > _LEAST_GAIN
+    idle = 0
     for _ in range(min(most, _MOST_ROUGH_ITERATIONS) if rough else most):
-        scale = problem.structure.scale(state.theta)
-        jacobian = state.derivative * scale[:, None]
-        jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
-        normal = jacobian @ jacobian.T
-        gradient = jacobian @ state.residual
+        scale, normal, gradient = _linearised(problem, state)
         step = _solve(normal, gradient, damping)
         least = -float(state.theta[-1] / scale[-1])
         if step[-1] < least:
@@ -257,12 +256,16 @@ def refine(
             break
         trial = evaluate(problem, problem.structure.move(state.theta, step, longest))
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
+        idle = 0 if state.cost - trial.cost > tolerance * state.cost else idle + 1
+        if rough and idle == _PATIENCE:
+            state = min(state, trial, key=lambda s: s.cost)
+            break
         if not trial.cost < state.cost:
             damping *= growth
             growth *= 2.0
             # Where even the undamped step promises less than rounding, no other will be seen.
-            promised = float(gradient @ _solve(normal, gradient, 0.0))
-            if promised <= tolerance * state.cost or damping > _MOST_DAMPING or smallest:
+            undamped = float(gradient @ _solve(normal, gradient, 0.0))
+            if undamped <= tolerance * state.cost or damping > _MOST_DAMPING or smallest:
                 break
             continue
         gained = state.cost - trial.cost
@@ -275,6 +278,24 @@ def refine(
         if smallest or (gained <= tolerance * state.cost and damping <= _LITTLE_DAMPING):
             break
     return replace(state, damping=damping)
+
+
+def promised(problem: Problem, state: State) -> float:
+    """Return how much less the sum of squares would be if the model were linear in theta.
+
+    :param problem: the problem.
+    :param state: any of its states.
+    """
+    _, normal, gradient = _linearised(problem, state)
+    return float(gradient @ _solve(normal, gradient, 0.0))
+
+
+def _linearised(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the units of steps, and the normal equations' matrix and right side in them."""
+    scale = problem.structure.scale(state.theta)
+    jacobian = state.derivative * scale[:, None]
+    jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
+    return scale, jacobian @ jacobian.T, jacobian @ state.residual
 
 
 def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:

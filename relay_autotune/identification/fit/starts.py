@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.fit.separable import Problem, State, evaluate, refine
+from relay_autotune.identification.fit.separable import Problem, State, evaluate, promised, refine
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
 
@@ -58,23 +58,44 @@ def coarse(problem: Problem) -> Problem:
     return problem.thinned(_GRID_SAMPLES)
 
 
-def refine_roughly(problem: Problem, thetas: list[FloatArray]) -> list[State]:
-    """Return the fits to few samples that the starts lead to, the best first.
+def begin(problem: Problem, thetas: list[FloatArray]) -> list[State]:
+    """Return where a few steps on few samples lead from each start, the best first.
+
+    They show which starts are worth more. A single start is followed to its end.
 
     :param problem: the problem.
     :param thetas: starts, at least one.
+    """
+    few, most = coarse(problem), {} if len(thetas) == 1 else {"most": _FIRST_STEPS}
+    begun = [refine(few, theta, tolerance=_COARSE, **most) for theta in thetas]
+    return sorted(begun, key=lambda s: s.cost)
+
+
+def go_on(problem: Problem, begun: list[State]) -> list[State]:
+    """Return the fits to few samples that a beginning leads to, the best first.
+
+    :param problem: the problem.
+    :param begun: from :func:`begin`.
     :return: two where few samples do not tell which of two places is the better one.
     """
+    if len(begun) == 1:
+        return begun
     few = coarse(problem)
-    if len(thetas) == 1:
-        return [refine(few, thetas[0], tolerance=_COARSE)]
-    # A few steps show which starts are worth more.
-    begun = [refine(few, theta, tolerance=_COARSE, most=_FIRST_STEPS) for theta in thetas]
     reached = [
         refine(few, s.theta, tolerance=_COARSE, most=_SECOND_STEPS, damping=s.damping)
         for s in _apart_from_each_other(problem, begun, _HOPELESS)[:_MORE]
     ]
     return _apart_from_each_other(problem, reached, _UNDECIDED)[:2]
+
+
+def least_promised(problem: Problem, begun: list[State]) -> float:
+    """Return the least mean square that any beginning would lead to if models were linear.
+
+    :param problem: the problem.
+    :param begun: from :func:`begin`.
+    """
+    few = coarse(problem)
+    return min(s.cost - promised(few, s) for s in begun) / few.time.size
 
 
 def _apart_from_each_other(problem: Problem, states: list[State], limit: float) -> list[State]:
@@ -96,7 +117,7 @@ def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float 
     :param thetas: starts, at least one.
     :param tolerance: relative gain of a step that is not worth another one; 0: rounding.
     """
-    return refine_all(problem, refine_roughly(problem, thetas), tolerance or _EXACT)
+    return refine_all(problem, go_on(problem, begin(problem, thetas)), tolerance or _EXACT)
 
 
 def refine_all(problem: Problem, rough: list[State], tolerance: float) -> State:
