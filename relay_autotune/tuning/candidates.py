@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,12 @@ class Candidates:
     td: FloatArray
     tf: FloatArray
 
+    @classmethod
+    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
+        """Return all of them, one after the other."""
+        fields = zip(*((c.kp, c.ki, c.td, c.tf) for c in parts), strict=True)
+        return cls(*(np.concatenate(field) for field in fields))
+
     def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
         return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
 
@@ -35,6 +42,18 @@ class Candidates:
         """Return one of them for a process of a sign."""
         kp, ki = float(self.kp[k]), float(self.ki[k])
         return Controller(sign * kp, kp / ki, float(self.td[k]), float(self.tf[k]))
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The controller that a search found.
+
+    :param controller: the gains.
+    :param iae: of a unit step of the load, as the search saw it [y s/u].
+    """
+
+    controller: Controller
+    iae: float
 
 
 @dataclass(frozen=True)

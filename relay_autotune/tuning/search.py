@@ -2,8 +2,8 @@
 
 Where the integral gain is as large as the bounds leave, only kp and td remain to be chosen. A
 scan of both finds the region of the optimum; a pattern search closes in on it, and then tries
-whether a smaller integral gain is better still. The optimum often lies where two bounds meet,
-on a ridge, which is why the directions of the pattern change from step to step.
+whether a smaller integral gain is better still. Models around the process come last, and few at
+first: those that what was found fails are added until it fails no more of all than it may.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
 from relay_autotune.models import TransferFunction
-from relay_autotune.tuning.candidates import Candidates, NoiseLimit
+from relay_autotune.tuning.candidates import Candidates, NoiseLimit, Optimum
 from relay_autotune.tuning.design_grid import design_grid
 from relay_autotune.tuning.frontier import Bounds, Responses
 from relay_autotune.tuning.gain_range import stable_gains
@@ -27,6 +27,7 @@ from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.load_cost import load_iaes
 from relay_autotune.tuning.margins import frequencies, peaks
 from relay_autotune.tuning.noise import filter_for
+from relay_autotune.tuning.pattern_search import pattern_search
 from relay_autotune.tuning.surroundings import Surroundings
 from relay_autotune.ultimate import ultimate_point
 
@@ -37,8 +38,10 @@ _DEPTH = 1e4
 _GAINS = {False: 64, True: 32}
 # Derivative times, in periods of the ultimate point.
 _TIMES = np.geomspace(3e-3, 1.0, 14)
-_FIRST_STEP, _SECOND_STEP, _LAST_STEP, _SHRINK, _GROW = 0.12, 0.08, 1e-3, 0.65, 1.5
-_DIRECTIONS = 16
+# First and last step of a search, and of one that is taken up again.
+_WHOLE, _ROUGH, _FINE = (0.12, 1e-3), (0.12, 0.03), (0.08, 1e-3)
+_AGAIN = 0.67
+_DIRECTIONS = 20
 # Steps of kp, of the share of the largest ki, and of kd, that show whether less of it is better.
 _INWARD = np.array(
     [(p, f, d) for p in (-0.03, 0.0, 0.03) for f in (-0.02, -0.1) for d in (0.0, 0.03)]
@@ -56,18 +59,6 @@ _NO_LIMIT = (
     "nothing limits the gain of a controller on this model, which has no dead time: give the "
     "controller's sampling period or the loop's delay"
 )
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The controller that a search found.
-
-    :param controller: the gains.
-    :param iae: of a unit step of the load, as the search saw it [y s/u].
-    """
-
-    controller: Controller
-    iae: float
 
 
 @dataclass(frozen=True)
@@ -128,21 +119,59 @@ class Search:
             return None
         if np.isinf(scanned.ki).any():
             raise TuningError(_NO_LIMIT)
-        point, iae = alone.descend(bounds, *alone.least(scanned))
-        point, iae = alone.settle(bounds, point, iae)
-        if self.models:
-            found = self._nearby(bounds, point)
+        point, iae = alone.least(scanned)
+        if self.around is None:
+            point, iae = self.settle(bounds, *self.descend(bounds, point, iae))
+            best = self._at(bounds, point[None])
+        else:
+            point, _ = alone.descend(bounds, point, iae, _ROUGH)
+            few = self.around.hardest(bounds, alone._at(bounds, point[None]))
+            found = self._among_models(bounds, point, few)
             if found is None:
-                # Bounds that can just be kept are kept somewhere else, if anywhere.
-                scanned = self.scan(bounds, self._times(derivative))
-                if scanned is None:
-                    return None
-                found = self.least(scanned)
-            point, iae = self.settle(bounds, *self.descend(bounds, *found))
-        best = self._at(bounds, point[None])
+                return None
+            best, iae = found
         if best.kp[0] > _UNLIMITED * self._largest_kp:
             raise TuningError(_NO_LIMIT)
         return Optimum(best.controller(0, self.model.process_sign), iae)
+
+    def _among_models(
+        self, bounds: Bounds, point: FloatArray, asked: Surroundings
+    ) -> tuple[Candidates, float] | None:
+        """Return the best controller and its IAE with the models around the process as well.
+
+        :param bounds: on the sensitivities.
+        :param point: the optimum on the process itself, roughly.
+        :param asked: the few models.
+        :return: None where no controller keeps the bounds.
+        """
+        steps = _ROUGH
+        while True:
+            search = replace(self)
+            known = {"frequency": self.frequency, "responses": self.responses, "around": asked}
+            search.__dict__.update(known)
+            found = search._beginning(bounds, point)
+            if found is None:
+                return None
+            point, iae = search.descend(bounds, *found, steps)
+            if steps == _FINE:
+                point, iae = search.settle(bounds, point, iae)
+            best = search._at(bounds, point[None])
+            more = asked.with_failed(bounds, best)
+            if more is None and steps == _FINE:
+                return best, iae
+            asked, steps = more or asked, _FINE
+
+    def _beginning(self, bounds: Bounds, point: FloatArray) -> tuple[FloatArray, float] | None:
+        """Return a point that keeps the bounds, near another if there is one; and its IAE."""
+        iae = float(self._worth(bounds, point[None], math.inf)[0])
+        if math.isfinite(iae):
+            return point, iae
+        found = self._nearby(bounds, point)
+        if found is None:
+            # Bounds that can just be kept are kept somewhere else, if anywhere.
+            scanned = self.scan(bounds, self._times(point.size > 2))
+            found = None if scanned is None else self.least(scanned)
+        return found
 
     def settle(self, bounds: Bounds, point: FloatArray, iae: float) -> tuple[FloatArray, float]:
         """Return the optimum once the bounds hold between the frequencies of the grid as well.
@@ -196,7 +225,7 @@ class Search:
         """
         derivative = bool(np.any(times))
         count = _GAINS[derivative]
-        kp, td = [], []
+        parts = []
         for time in times.tolist():
             span = stable_gains(self.model, self.responses.grid, time, time / self.filter_ratio)
             if span is None:
@@ -206,14 +235,13 @@ class Search:
                 high = self._largest_kp
             low, high = max(low, high / _DEPTH, gains[0]), min(high, gains[1])
             if low < high:
-                kp.append(np.geomspace(low, high, count + 2)[1:-1])
-                td.append(np.full(count, time))
-        if not kp:
+                kp = np.log(np.geomspace(low, high, count + 2)[1:-1])
+                kd = [kp + math.log(time)] if derivative else []
+                # Arrays for all times at once would be too large for the cache.
+                parts.append(self._at(bounds, np.column_stack((kp, *kd, np.zeros(count)))))
+        if not parts:
             return None
-        points = [np.log(np.concatenate(kp))]
-        if derivative:
-            points.append(points[0] + np.log(np.concatenate(td)))
-        found = self._at(bounds, np.column_stack((*points, np.zeros(points[0].size))))
+        found = Candidates.joined(parts)
         found = found[found.ki > 0.0]
         return found if found.kp.size else None
 
@@ -241,7 +269,7 @@ class Search:
             # The tighter the bound, the narrower the range of gains and times that attain it.
             gains = float(found.kp.min()) / _MARGIN, float(found.kp.max()) * _MARGIN
             if derivative:
-                ends = float(found.td.min()) / _MARGIN, float(found.td.max()) * _MARGIN
+                ends = found.td.min() / _MARGIN, found.td.max() * _MARGIN
                 times = np.geomspace(*ends, _TIMES.size)
         return 1.0 + math.exp(high)
 
@@ -262,49 +290,30 @@ class Search:
         kp, kd = scanned.kp[best], scanned.kp[best] * scanned.td[best]
         return np.log([kp, *([kd] if kd > 0.0 else []), 1.0]), iae
 
-    def descend(self, bounds: Bounds, point: FloatArray, iae: float) -> tuple[FloatArray, float]:
+    def descend(
+        self, bounds: Bounds, point: FloatArray, iae: float, steps: tuple[float, float] = _WHOLE
+    ) -> tuple[FloatArray, float]:
         """Return the optimum near a point, and its IAE.
 
         :param bounds: on the sensitivities.
         :param point: logarithms of kp, of kd (PID only), and of the share of the largest integral
             gain that is used.
         :param iae: there [y s/u].
+        :param steps: the first and the last.
         """
-        free = point.size - 1
-        point, iae = self._pattern(bounds, point, iae, free, _FIRST_STEP)
+        free, costs = point.size - 1, partial(self._worth, bounds)
+        # Each costs more with the models around the process.
+        count = _DIRECTIONS // 2 if self.models else _DIRECTIONS
+        point, iae = pattern_search(costs, point, iae, free, steps, count)
         if self.models and point[-1] == 0.0:
             # On the process itself a smaller integral gain was no better.
             return point, iae
         inward = point + _INWARD[:, [0, *[2] * (free - 1), 1]]
-        if self._worth(bounds, inward, iae).min() < iae:
-            point, iae = self._pattern(bounds, point, iae, free + 1, _FIRST_STEP)
+        if costs(inward, iae).min() < iae:
+            point, iae = pattern_search(costs, point, iae, free + 1, steps, count)
         if free > 1:
-            point, iae = self._pattern(bounds, point, iae, free, _SECOND_STEP)
-        return point, iae
-
-    def _pattern(
-        self, bounds: Bounds, point: FloatArray, iae: float, size: int, first: float
-    ) -> tuple[FloatArray, float]:
-        """Move in the first ``size`` coordinates, by steps of ``first`` and less."""
-        rng = np.random.default_rng(0)
-        step, last = first, np.zeros((0, point.size))
-        # Each costs a hundred times as much with the models around the process.
-        count = _DIRECTIONS // 2 if self.models else _DIRECTIONS
-        while step > _LAST_STEP:
-            moves = np.zeros((count if size > 1 else 0, point.size))
-            moves[:, :size] = rng.standard_normal((len(moves), size))
-            moves /= np.linalg.norm(moves, axis=1)[:, None]
-            axes = np.eye(point.size)[:size]
-            tried = point + step * np.concatenate((axes, -axes, moves, last))
-            tried[:, -1] = np.minimum(tried[:, -1], 0.0)
-            iaes = self._worth(bounds, tried, iae)
-            best = int(np.argmin(iaes))
-            if iaes[best] < iae * (1.0 - 1e-7):
-                # Along a ridge the way that led on once leads on again.
-                last = (tried[best] - point)[None] / step
-                point, iae, step = tried[best], float(iaes[best]), step * _GROW
-            else:
-                step *= _SHRINK
+            again = _AGAIN * steps[0], steps[1]
+            point, iae = pattern_search(costs, point, iae, free, again, count)
         return point, iae
 
     def _nearby(self, bounds: Bounds, point: FloatArray) -> tuple[FloatArray, float] | None:

@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.tuning.candidates import Candidates
 from relay_autotune.tuning.frontier import Bounds, Responses
 
 FloatArray = NDArray[np.floating[Any]]
+IntArray = NDArray[np.integer[Any]]
 
 _SHARE = 0.95
 # So many times the models that may exceed a bound are asked first.
 _FIRST = 3
+# Single precision, and frequencies that depend on what is asked together, move a limit so far.
+_SAME = 1.0 - 1e-5
 
 
 def allowed_outside(count: int) -> int:
@@ -26,12 +30,45 @@ class Surroundings:
     """Models around a process, on all but 5 % of which bounds have to hold.
 
     :param responses: of the models.
+    :param asked: which of them are asked; None: all. The bounds may fail on as many of those as
+        they may fail on of all.
     """
 
-    def __init__(self, responses: Responses) -> None:
+    def __init__(self, responses: Responses, asked: IntArray | None = None) -> None:
         self._responses = responses
         # Those that left the least range for the controllers before come first.
-        self._order = np.arange(responses.count)
+        self._order = np.arange(responses.count) if asked is None else asked
+        self._outside = allowed_outside(responses.count)
+
+    def hardest(self, bounds: Bounds, c: Candidates) -> Surroundings:
+        """Return the few that leave a controller the least range of integral gains.
+
+        :param bounds: on the sensitivities.
+        :param c: the controller.
+        """
+        highs, _ = self._largest_ki(bounds, c)
+        order = np.argsort(highs[0], kind="stable")
+        return Surroundings(self._responses, order[: _FIRST * (self._outside + 1)])
+
+    def with_failed(self, bounds: Bounds, c: Candidates) -> Surroundings | None:
+        """Return these and those of all models that a controller fails; None: it fails no others.
+
+        :param bounds: on the sensitivities.
+        :param c: the controller.
+        """
+        if self._order.size == self._responses.count:
+            return None
+        highs, lows = self._largest_ki(bounds, c)
+        fails = np.flatnonzero((highs[0] < _SAME * c.ki) | (lows[0] >= c.ki))
+        new = np.setdiff1d(fails, self._order)
+        if fails.size <= self._outside or not new.size:
+            return None
+        return Surroundings(self._responses, np.concatenate((new, self._order)))
+
+    def _largest_ki(self, bounds: Bounds, c: Candidates) -> tuple[FloatArray, FloatArray]:
+        """Return what each of all models leaves of the range, shape (k, m)."""
+        kp, td, tf = (x.astype(np.float32) for x in (c.kp, c.td, c.tf))
+        return self._responses.largest_ki(bounds, kp, td, tf)
 
     def limits(
         self,
@@ -52,8 +89,7 @@ class Surroundings:
         :param least: what it has to exceed to be of interest, shape (k,).
         :return: the largest is -inf where there is none, or none of interest.
         """
-        count = self._order.size
-        outside = allowed_outside(count)
+        outside = self._outside
         split = _FIRST * (outside + 1)
         first, rest = self._order[:split], self._order[split:]
         highs, lows = self._responses.largest_ki(bounds, kp, td, tf, first)
@@ -69,7 +105,7 @@ class Surroundings:
             highs, lows = (np.hstack(both) for both in zip((highs, lows), more, strict=True))
             self._order = self._order[np.argsort(highs[0], kind="stable")]
         ends = np.minimum(upper[useful], np.sort(highs, axis=1)[:, outside])
-        within = ((highs >= ends[:, None]) & (lows < ends[:, None])).sum(axis=1)
-        largest[useful] = np.where(within >= count - outside, ends, -math.inf)
+        fails = ((highs < ends[:, None]) | (lows >= ends[:, None])).sum(axis=1)
+        largest[useful] = np.where(fails <= outside, ends, -math.inf)
         lowest[useful] = np.sort(lows, axis=1)[:, -1 - outside]
         return largest, lowest
