@@ -20,6 +20,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import Identification, identify
 from relay_autotune.models import TransferFunction
@@ -118,7 +119,7 @@ def described(found: Identification) -> str:
 def shares(title: str, outcomes: list[Outcome]) -> tuple[object, ...]:
     """Return a row with how many keep the limits."""
     errors = np.abs([o.errors for o in outcomes])
-    covered = [sum(abs(o.deviations[k]) <= 1.96 for o in outcomes) for k in (0, 1)]
+    covered = [sum(abs(o.deviations[k]) <= NORMAL_95 for o in outcomes) for k in (0, 1)]
     return (
         title,
         len(outcomes),

@@ -27,6 +27,7 @@ from functools import partial
 from markdown import table
 
 from relay_autotune import threads  # noqa: F401  before numpy
+from relay_autotune.confidence import NORMAL_95
 
 # isort: split
 import numpy as np
@@ -198,7 +199,7 @@ class Bench:
         longest = _LONGEST * self.classic.time
         tune, _ = self._run(self.noise, seed, None, least=longest)
         times = longest * np.arange(1, round(_LONGEST * _GRID) + 1) / (_LONGEST * _GRID)
-        found = 1.96 * relative_bounds(
+        found = NORMAL_95 * relative_bounds(
             self.case.model, tune.record(), self.noise, tune.kicked_at + times
         )
         enough = np.flatnonzero(found <= self.case.asked)

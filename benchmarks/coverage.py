@@ -18,12 +18,12 @@ from processes import PROCESSES, Process
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification import Identification, Known, identify
 from relay_autotune.identification.result import ultimate_std
 
 RECORDS = 2_000
 RATIO = 0.1
-NORMAL = 1.96
 # An interval wider than this share of the value tells that the data do not hold the parameter.
 DETERMINED = 0.2
 TARGET = (93.0, 97.0)
@@ -43,9 +43,9 @@ def covers(found: Identification, truth: Identification) -> NDArray[np.bool_]:
         same = np.zeros(truth.values.size, dtype=np.bool_)
     else:
         same = (found.ci95_low <= truth.values) & (truth.values <= found.ci95_high)
-    gain = abs(found.ultimate_gain - truth.ultimate_gain) <= NORMAL * found.ultimate_gain_std
+    gain = abs(found.ultimate_gain - truth.ultimate_gain) <= NORMAL_95 * found.ultimate_gain_std
     change = abs(found.ultimate_frequency - truth.ultimate_frequency)
-    return np.append(same, (gain, change <= NORMAL * found.ultimate_frequency_std))
+    return np.append(same, (gain, change <= NORMAL_95 * found.ultimate_frequency_std))
 
 
 def rows(process: Process, records: int) -> list[tuple[object, ...]]:
@@ -60,8 +60,8 @@ def rows(process: Process, records: int) -> list[tuple[object, ...]]:
     half = np.median([(m.ci95_high - m.ci95_low) / 2.0 for m in alike], axis=0)
     widths = half / np.abs(truth.values)
     point = [
-        NORMAL * np.median([m.ultimate_gain_std / m.ultimate_gain for m in models]),
-        NORMAL * np.median([m.ultimate_frequency_std / m.ultimate_frequency for m in models]),
+        NORMAL_95 * np.median([m.ultimate_gain_std / m.ultimate_gain for m in models]),
+        NORMAL_95 * np.median([m.ultimate_frequency_std / m.ultimate_frequency for m in models]),
     ]
     found: list[tuple[object, ...]] = []
     for name, share, width in zip(
@@ -92,7 +92,7 @@ def after_choice(process: Process, records: int) -> tuple[int, ...]:
         alone = ultimate_std(model.build, model.values, model.covariance, *point)
         averaged = (model.ultimate_gain_std, model.ultimate_frequency_std)
         errors = np.abs(np.array((point[0] - truth.gain, point[1] - truth.frequency) * 2))
-        found += errors <= NORMAL * np.array((*alone, *averaged))
+        found += errors <= NORMAL_95 * np.array((*alone, *averaged))
     return tuple(int(k) for k in found)
 
 

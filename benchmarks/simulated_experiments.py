@@ -38,7 +38,6 @@ from relay_autotune.ultimate import ultimate_point
 
 EXPERIMENTS = 10_000
 QUICK = 4
-NORMAL = 1.96
 
 
 @dataclass

@@ -10,12 +10,13 @@ import numpy as np
 from markdown import table
 from random_experiments import DISTURBANCES, FAULTS, HAPPENINGS, NOTHING
 
+from relay_autotune.confidence import NORMAL_95
+
 if TYPE_CHECKING:
     from simulated_experiments import Result
 
 MOST_REFUSED = 5.0
 LEAST_CYCLES = 3
-NORMAL = 1.96
 _RATIOS = (0.0, 0.05, 0.1, 0.15, 0.2)
 
 
@@ -150,7 +151,7 @@ def _held(errors: Sequence[float], stds: Sequence[float]) -> str:
     ]
     if not pairs:
         return "-"
-    return f"{100.0 * np.mean([abs(e) <= NORMAL * s for e, s in pairs]):.0f}"
+    return f"{100.0 * np.mean([abs(e) <= NORMAL_95 * s for e, s in pairs]):.0f}"
 
 
 def _figures(heading: str, results: Sequence[Result], key: Callable[[Result], str]) -> str:

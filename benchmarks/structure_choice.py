@@ -17,13 +17,13 @@ from processes import PROCESSES, Process, same_structure
 # isort: split
 import numpy as np
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
 
 RECORDS = 30
 RATIO = 0.1
 EQUIVALENT = 0.02
-NORMAL = 1.96
 
 
 @dataclass
@@ -60,8 +60,8 @@ def choices(process: Process, records: int) -> Choices:
         tally.errors.append((gain / truth.gain, frequency / truth.frequency))
         tally.covered.append(
             (
-                abs(gain) <= NORMAL * found.ultimate_gain_std,
-                abs(frequency) <= NORMAL * found.ultimate_frequency_std,
+                abs(gain) <= NORMAL_95 * found.ultimate_gain_std,
+                abs(frequency) <= NORMAL_95 * found.ultimate_frequency_std,
             )
         )
         if same_structure(found.model, process.model):

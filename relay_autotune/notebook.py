@@ -6,6 +6,7 @@ import html
 import math
 from typing import TYPE_CHECKING
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.notation import digits, process_mathml
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def _model_rows(found: Identification) -> list[tuple[str, str]]:
         ("w_u", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
     ):
         if math.isfinite(value):
-            interval = f" ± {digits(1.96 * std, 2)}" if math.isfinite(std) else ""
+            interval = f" ± {digits(NORMAL_95 * std, 2)}" if math.isfinite(std) else ""
             rows.append((title, f"{digits(value)}{interval} {unit}"))
     rows += [("warning", html.escape(text)) for text in found.warnings]
     return rows

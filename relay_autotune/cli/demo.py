@@ -16,6 +16,7 @@ from typing import Any
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.autotune import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.document import document, model_fields, to_json
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.models import TransferFunction
@@ -184,7 +185,7 @@ def _show_cycles(onlooker: Any) -> None:
             fits = [m for m in onlooker.models if not m.final]
             so_far = f"{fits[-1].ultimate_gain:.3f}" if fits else ""
             if fits and math.isfinite(fits[-1].ultimate_gain_std):
-                so_far += f" ± {1.96 * fits[-1].ultimate_gain_std:.3f}"
+                so_far += f" ± {NORMAL_95 * fits[-1].ultimate_gain_std:.3f}"
             settled = "   settled" if cycle.converged else ""
             print(
                 f"  {cycle.index + 1:>5}   {cycle.period:>8.2f}   {cycle.period_high:>6.2f}   "
@@ -268,7 +269,9 @@ def _compare(found: Analysis) -> None:
         ("K_u u/y", truth.gain, model.ultimate_gain, model.ultimate_gain_std),
         ("w_u rad/s", truth.frequency, model.ultimate_frequency, model.ultimate_frequency_std),
     ):
-        rows.append((name, value, estimate, (estimate - 1.96 * std, estimate + 1.96 * std)))
+        rows.append(
+            (name, value, estimate, (estimate - NORMAL_95 * std, estimate + NORMAL_95 * std))
+        )
     for name, value, estimate, (low, high) in rows:
         interval = f"{digits(low)} to {digits(high)}"
         error = 100.0 * (estimate / value - 1.0)

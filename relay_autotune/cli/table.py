@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.cycles import limit_cycle
 from relay_autotune.notation import date_text, digits, process_text, unit_of
 from relay_autotune.record import Outcome, Record
@@ -109,7 +110,7 @@ def identification_lines(found: Identification) -> list[str]:
         ("ultimate freq.", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
     ):
         if math.isfinite(value):
-            interval = f"± {digits(1.96 * std, 2)}" if math.isfinite(std) else ""
+            interval = f"± {digits(NORMAL_95 * std, 2)}" if math.isfinite(std) else ""
             lines.append(_row(label, value, unit, interval))
     lines += _known_all_the_same(found)
     lines += _wrapped("fit", _fit(found))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from relay_autotune.cli.table import gains_lines
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.messages import transfer_function_from_message
 from relay_autotune.notation import digits, process_text
 
@@ -85,7 +86,7 @@ def estimate(feedback: Any) -> str:
         return ""
     if not math.isfinite(std):
         return f"K_u {digits(value)} u/y"
-    low, high = value - 1.96 * std, value + 1.96 * std
+    low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
     return f"K_u {digits(value)} u/y (95 %: {digits(low)} to {digits(high)})"
 
 

@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
+from relay_autotune.confidence import NORMAL_95
+
 ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)
 _NAMES = {ULTIMATE_GAIN: "K_u", MS: "the predicted Ms"}
-
-# A 95 % interval of a normal estimate, in standard deviations to either side.
-_NORMAL = 1.96
 
 # Nothing is concluded before the first half cycle.
 _LEAST_SWITCHES = 2
@@ -64,7 +63,7 @@ class Finding:
         :param sought: one of ``SOUGHT``.
         """
         if sought == ULTIMATE_GAIN:
-            value, half = abs(self.ultimate_gain), _NORMAL * self.ultimate_gain_std
+            value, half = abs(self.ultimate_gain), NORMAL_95 * self.ultimate_gain_std
         else:
             value, half = self.ms, 0.5 * (self.ms_high - self.ms_low)
         return half / value if value > 0.0 and half >= 0.0 else math.nan

@@ -10,12 +10,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import ModelError
 from relay_autotune.models import TransferFunction
 
 FloatArray = NDArray[np.float64]
 
-NORMAL = 1.96
 # Logarithms may go so far from the estimate, and steps for derivatives are so long.
 _FAR = 50.0
 _STEPS = (1e-7, 1e-2)
@@ -69,7 +69,7 @@ def is_logarithmic(parameter: str) -> bool:
 def estimate(
     found: Uncertain,
     function: Callable[[TransferFunction], float],
-    quantile: float = NORMAL,
+    quantile: float = NORMAL_95,
 ) -> Estimate:
     """Return a function of the model with its 95 % interval.
 

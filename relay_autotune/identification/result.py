@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
-from relay_autotune.identification.intervals import NORMAL
 from relay_autotune.identification.intervals import is_logarithmic as is_logarithmic
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
@@ -152,7 +152,7 @@ def with_uncertainty(
     parameters: tuple[str, ...],
     values: FloatArray,
     covariance: FloatArray | None = None,
-    quantile: float = NORMAL,
+    quantile: float = NORMAL_95,
     fit: FitReport | None = None,
     warnings: tuple[str, ...] = (),
     fitted: FloatArray | None = None,

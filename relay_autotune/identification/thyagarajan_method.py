@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.cycle.cycle_scatter import NOT_SETTLED, relay_test
 from relay_autotune.identification.cycle.envelope import curvature_time, envelope
@@ -297,7 +298,7 @@ def _identified(
         return replace(model, dead_time=max(model.dead_time - extra, 0.0))
 
     values = scaled(solver.exact(shape))
-    covariance, quantile = None, 1.96
+    covariance, quantile = None, NORMAL_95
     if reading.covariance is not None:
         slopes = _jacobian(lambda s: scaled(solver.exact(s)), reading)
         if slopes is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.autotune import Analysis
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import FitReport, Identification
@@ -300,6 +301,6 @@ def ultimate_estimates(
         ),
     )
     return tuple(
-        Estimate(n, v, v - 1.96 * std, v + 1.96 * std, unit, truth=t)
+        Estimate(n, v, v - NORMAL_95 * std, v + NORMAL_95 * std, unit, truth=t)
         for n, v, std, t, unit in rows
     )

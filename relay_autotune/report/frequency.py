@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.models import TransferFunction
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import (
@@ -191,8 +192,8 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
         style = {"fmt": "D", "ms": 6, "mfc": PAPER, "mec": INK, "mew": 1.4, "ecolor": INK}
         std = np.nan_to_num([p.std for p in points])
         # To first order the two parts' deviations are those of magnitude and angle, too.
-        above.errorbar(at, np.abs(value), yerr=1.96 * std, label="measured, 95 %", **style)
-        below.errorbar(at, lag, yerr=np.degrees(1.96 * std / np.abs(value)), **style)
+        above.errorbar(at, np.abs(value), yerr=NORMAL_95 * std, label="measured, 95 %", **style)
+        below.errorbar(at, lag, yerr=np.degrees(NORMAL_95 * std / np.abs(value)), **style)
     if case.model.ultimate:
         gain, frequency = case.model.ultimate
         above.plot(

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.advice import advice
 from relay_autotune.identification.combinations import determined_combinations, is_determined
 from relay_autotune.identification.fit.fit_covariance import (
@@ -19,7 +20,7 @@ from relay_autotune.identification.fit.fit_covariance import (
 )
 from relay_autotune.identification.fit.profiles import profile_ends
 from relay_autotune.identification.fit.separable import Problem, State, refine
-from relay_autotune.identification.intervals import NORMAL, Estimate, is_logarithmic
+from relay_autotune.identification.intervals import Estimate, is_logarithmic
 from relay_autotune.identification.result import Identification
 from relay_autotune.record import Record
 
@@ -45,7 +46,7 @@ def with_what_is_determined(
     if not found.undetermined:
         return found
     point = tuple(
-        Estimate(value, std, value - NORMAL * std, value + NORMAL * std)
+        Estimate(value, std, value - NORMAL_95 * std, value + NORMAL_95 * std)
         for value, std in (
             (found.ultimate_gain, found.ultimate_gain_std),
             (found.ultimate_frequency, found.ultimate_frequency_std),

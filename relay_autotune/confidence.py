@@ -1,0 +1,6 @@
+"""How wide a 95 % interval is."""
+
+from __future__ import annotations
+
+NORMAL_95 = 1.96
+"""Half of the width of the 95 % interval of a normal estimate, in standard deviations."""
