@@ -40,6 +40,9 @@ _LARGEST, _SMALLEST = 300.0, 1e-300
 _LONGEST = 1e4
 _BEYOND = 1.3
 _STEP = 0.1
+# Of a logarithm, or of a radian's time: for derivatives, and how near an end is at the end.
+_DIFFERENCE = 1e-4
+_AT_END = 1e-6
 
 
 @dataclass(frozen=True)
@@ -260,11 +263,11 @@ class _Fit:
         """Return the least sum of squares and where it is, from a start."""
         if x.size == 0:
             return float(np.sum(self.residual(x, points) ** 2)), x
-        unit = 1.0 / float(points.frequency[points.frequency > 0.0][0])
+        unit = self._unit(points)
         solved = least_squares(
             self.residual,
             x,
-            bounds=(np.where(self.delays, 0.0, -_LARGEST), self._upper(unit)),
+            bounds=self._bounds(unit),
             x_scale=np.where(self.delays, unit, 1.0),
             args=(points,),
             xtol=1e-12,
@@ -273,14 +276,19 @@ class _Fit:
         )
         return 2.0 * float(solved.cost), solved.x
 
-    def _upper(self, unit: float) -> FloatArray:
-        """Return upper ends of the search: a lag so long is an integrator."""
+    def _unit(self, points: _Points) -> float:
+        """Return the time in which a radian passes at the lowest frequency [s]."""
+        return 1.0 / float(points.frequency[points.frequency > 0.0][0])
+
+    def _bounds(self, unit: float) -> tuple[FloatArray, FloatArray]:
+        """Return both ends of the search: a lag so long is an integrator."""
         ends = {
             "gain": _LARGEST,
             "time_constant": math.log(_LONGEST * unit),
             "dead_time": math.inf,
         }
-        return np.array([ends[self.structure.parameters[i]] for i in self.free])
+        high = np.array([ends[self.structure.parameters[i]] for i in self.free])
+        return np.where(self.delays, 0.0, -_LARGEST), high
 
     def best(self, points: _Points) -> tuple[FloatArray, float]:
         """Return the values of the nearest model, and its sum of squares."""
@@ -297,6 +305,8 @@ class _Fit:
             start["dead_time"] = (-float(np.angle(ratio)) % (2.0 * math.pi)) / w
             found.append(self.refined(self.searched(np.array([start[n] for n in names])), points))
         cost, x = min(found, key=lambda each: each[0])
+        # Another period of dead time turns each harmonic by whole turns, and fits as well.
+        x = np.where(self.delays, np.mod(x, 2.0 * math.pi / w), x)
         return self.values(x), cost
 
     def uncertainty(
@@ -304,26 +314,72 @@ class _Fit:
     ) -> tuple[FloatArray, tuple[float, float]]:
         """Return the covariance of the values, and the deviations of K_u and w_u.
 
-        Each measured number is moved by a share of its deviation, and everything fitted again.
+        Each measured number is moved by a share of its deviation; the least of the sum of
+        squares then lies one Newton step away. Of fewer numbers than values the covariance is
+        NaN.
 
         :param points: what was measured.
         :param values: of the nearest model.
         :param between: how the ultimate point follows from model, frequencies and points.
         """
         x = self.searched(values)
+        steps = self._newton_steps(x, points)
+        ends_of_search = self._bounds(self._unit(points))
+        # In the order of the residuals: all real parts, then the imaginary ones.
+        numbers = [(i, 1.0 + 0.0j) for i in range(points.value.size)]
+        numbers += [(int(i), 1.0j) for i in np.flatnonzero(points.frequency > 0.0)]
         rates = []
-        for i, (w, std) in enumerate(zip(points.frequency, points.std, strict=True)):
-            for direction in (1.0,) if w == 0.0 else (1.0, 1.0j):
-                ends = []
-                for side in (_STEP, -_STEP):
-                    moved = points.value.copy()
-                    moved[i] += side * std * direction
-                    near = replace(points, value=moved)
-                    there = self.values(self.refined(x, near)[1])
-                    point = between(self.structure.build(there), near.frequency, moved)
-                    ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
-                    ends.append(np.append(there, ultimate))
-                rates.append((ends[0] - ends[1]) / (2.0 * _STEP))
+        for (i, direction), step in zip(numbers, steps, strict=True):
+            ends = []
+            for side in (_STEP, -_STEP):
+                moved = points.value.copy()
+                moved[i] += side * points.std[i] * direction
+                there = self.values(np.clip(x + side * step, *ends_of_search))
+                point = between(self.structure.build(there), points.frequency, moved)
+                ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
+                ends.append(np.append(there, ultimate))
+            rates.append((ends[0] - ends[1]) / (2.0 * _STEP))
         spread = np.array(rates)
         squares = spread.T @ spread
+        if points.numbers < self.free.size:
+            # A single point does not tell three values apart, whatever comes nearest to it.
+            squares[:-2, :-2] = math.nan
         return squares[:-2, :-2], (math.sqrt(squares[-2, -2]), math.sqrt(squares[-1, -1]))
+
+    def _newton_steps(self, x: FloatArray, points: _Points) -> FloatArray:
+        """Return how the search's end moves with each measured number, by one deviation.
+
+        ``(J'J + sum_i r_i r_i'')^-1 J'`` with the residuals r and their derivatives J; what is at
+        an end of its range stays there.
+
+        :param x: where the sum of squares is least, shape (p,).
+        :param points: what was measured.
+        :return: shape (numbers, p), in the order of :meth:`residual`.
+        """
+        unit = self._unit(points)
+        scale = np.where(self.delays, unit, 1.0)
+        low, high = self._bounds(unit)
+        inside = np.flatnonzero(np.minimum(x - low, high - x) > _AT_END * scale)
+        room = np.where(self.delays, 0.5 * x, math.inf)
+        sides = np.diag(np.minimum(_DIFFERENCE * scale, room))[inside]
+        here = self.residual(x, points)
+        ahead = np.array([self.residual(x + h, points) - here for h in sides])
+        back = np.array([self.residual(x - h, points) - here for h in sides])
+        steps = np.zeros((points.numbers, x.size))
+        if inside.size == 0:
+            return steps
+        size = sides.max(axis=1)[:, None]
+        jacobian = (ahead - back) / (2.0 * size)
+        hessian = jacobian @ jacobian.T
+        for i, a in enumerate(sides):
+            hessian[i, i] += here @ (ahead[i] + back[i]) / size[i, 0] ** 2
+            for k in range(i):
+                both = self.residual(x + a + sides[k], points) - here
+                both += self.residual(x - a - sides[k], points) - here
+                mixed = both - ahead[i] - back[i] - ahead[k] - back[k]
+                hessian[i, k] += 0.5 * (here @ mixed) / (size[i, 0] * size[k, 0])
+                hessian[k, i] = hessian[i, k]
+        units = scale[inside]
+        scaled = np.linalg.pinv(hessian * np.outer(units, units), hermitian=True)
+        steps[:, inside] = jacobian.T @ (scaled * np.outer(units, units))
+        return steps

@@ -12,8 +12,9 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.record import PiecewiseConstant, Record
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
-_SMALL_ANGLE = 0.05
+_SMALL_ANGLE = 0.2
 
 
 @dataclass(frozen=True)
@@ -67,17 +68,28 @@ def fourier_integral_sampled(
     v = np.concatenate((np.interp([start], time, y), y[inside], np.interp([end], time, y)))
     h = np.diff(t)
     angle = w * h
-    # The integrals of exp(-j angle x) and x exp(-j angle x) over 0 < x < 1.
-    small = np.abs(angle) < _SMALL_ANGLE
-    a = np.where(small, 1.0, angle)
-    turn = np.exp(-1j * a)
-    level = (1.0 - turn) / (1j * a)
-    ramp = (turn * (1.0 + 1j * a) - 1.0) / (a * a)
-    terms = [(-1j * angle) ** k / math.factorial(k) for k in range(10)]
-    level = np.where(small, sum(c / (k + 1) for k, c in enumerate(terms)), level)
-    ramp = np.where(small, sum(c / (k + 2) for k, c in enumerate(terms)), ramp)
+    level, ramp = _polygon(angle)
     parts = h * np.exp(-1j * w * t[:-1]) * (v[:-1] * level + np.diff(v) * ramp)
     return complex(np.sum(parts))
+
+
+def _polygon(angle: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return the integrals of ``exp(-j angle x)`` and ``x exp(-j angle x)`` over 0 < x < 1.
+
+    About the middle they are ``sin(b)/b`` and ``-j (sin(b) - b cos(b))/(2 b^2)`` with half the
+    angle b, whose difference is a series where b is small.
+    """
+    b = 0.5 * angle
+    square = b * b
+    odd = b * (1.0 / 6.0 - square * (1.0 / 60.0 - square * (1.0 / 1680.0 - square / 90720.0)))
+    even = np.sinc(b / math.pi)
+    large = np.abs(angle) >= _SMALL_ANGLE
+    if np.any(large):
+        c = b[large]
+        odd[large] = 0.5 * (np.sin(c) - c * np.cos(c)) / (c * c)
+    middle = np.exp(-1j * b)
+    level = middle * even
+    return level, 0.5 * level - 1j * odd * middle
 
 
 def cycle_window(record: Record, first: int = 0) -> tuple[float, float, int]:
