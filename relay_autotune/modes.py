@@ -34,6 +34,7 @@ _EPSILON = 1e-17
 _MOST_TERMS = 120
 _UNDERFLOW = 745.0
 _OVERFLOW = 300.0
+_ONE = np.ones(1)
 
 
 @dataclass(frozen=True)
@@ -229,15 +230,14 @@ class Modes:
         """Return exp(centre t), and t in units of the cluster."""
         x = times * cluster.scale
         if cluster.centre == 0j:
-            return np.ones(times.size), x
-        if cluster.centre.real != 0.0:
+            return _ONE, x
+        centre = cluster.centre / cluster.scale
+        if centre.real != 0.0:
             # Beyond this the exponential is zero, or infinite for all that matters; a large
             # power must not make it nan.
-            real = cluster.centre.real / cluster.scale
-            low, high = sorted((-_UNDERFLOW / real, _OVERFLOW / real))
-            x = np.clip(x, low, high)
-        centre = self._cast(np.asarray(cluster.centre / cluster.scale))
-        return np.exp(centre * x), x
+            low, high = sorted((-_UNDERFLOW / centre.real, _OVERFLOW / centre.real))
+            x = np.minimum(np.maximum(x, low), high)
+        return np.exp((centre.real if self._dtype is np.float64 else centre) * x), x
 
     def move(self, z: Coordinates, time: float) -> Coordinates:
         """Return the coordinates ``time`` [s] later, with the input held.

@@ -48,7 +48,7 @@ class Fopdt(RationalStructure):
             state.append(s)
             slope.append(q)
         delayed = time - dead_time
-        segment = np.searchsorted(u.times, delayed, side="right") - 1
+        segment = u.times.searchsorted(delayed, side="right") - 1
         k = np.maximum(segment, 0)
         delta = (delayed - u.times[k]) / tau
         e = np.exp(-np.maximum(delta, 0.0))

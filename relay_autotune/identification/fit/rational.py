@@ -39,11 +39,10 @@ def responses(
     changes = u.times + dead_time
     ramps = isinstance(u, PiecewiseLinear)
     # A ramp is a step that is integrated once more.
-    steps = (
-        np.diff(u.slopes, prepend=0.0)
-        if isinstance(u, PiecewiseLinear)
-        else np.diff(u.values, prepend=u.initial)
-    )
+    before, levels = (0.0, u.slopes) if isinstance(u, PiecewiseLinear) else (u.initial, u.values)
+    steps = levels.copy()
+    steps[:1] -= before
+    steps[1:] -= levels[:-1]
     unstable = any(f.unstable for f in denominator.factors)
     if unstable:
         first, last = min(time[0], changes[0]) - 1.0, max(time[-1], changes[-1]) + 1e-9
@@ -130,8 +129,8 @@ def _follow(
     """Return the outputs at the samples, shape (outputs, n); zero before the first change."""
     horizon = max(float(max(time[-1], changes[-1]) - changes[0]), np.finfo(float).tiny)
     constants = denominator.extended_constants(own)
-    segment = np.searchsorted(changes, time, side="right") - 1
-    first = int(np.searchsorted(segment, 0))
+    segment = changes.searchsorted(time, side="right") - 1
+    first = int(segment.searchsorted(0))
     integrators = denominator.integrators + ramps
     poles = partial_fractions(constants, integrators, numerators, horizon)
     values = np.zeros((numerators.shape[0], time.size))

@@ -211,14 +211,25 @@ def evaluate(problem: Problem, theta: FloatArray) -> State:
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((columns / size[:, None]).T)
-    # A column that the others make up carries no information: its coefficient stays zero.
-    weak = np.abs(np.diag(r)) < _WEAK
-    r[np.diag_indices_from(r)] += weak
-    coefficients = np.linalg.solve(r, np.where(weak, 0.0, q.T @ y)) / size
+    coefficients = _backward(r.tolist(), (q.T @ y).tolist()) / size
     residual = y - coefficients @ columns
     derivative = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
     cost = float(residual @ residual)
     return State(theta, coefficients, residual, cost, q, derivative, columns)
+
+
+def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
+    """Solve ``r c = right`` for an upper triangle r of a few columns, each of length one.
+
+    A column that the others make up carries no information: its coefficient stays zero.
+    """
+    # Of so few, plain numbers are quicker than arrays.
+    found = [0.0] * len(right)
+    for i in range(len(right) - 1, -1, -1):
+        if abs(r[i][i]) >= _WEAK:
+            rest = sum(a * c for a, c in zip(r[i][i + 1 :], found[i + 1 :], strict=True))
+            found[i] = (right[i] - rest) / r[i][i]
+    return np.array(found)
 
 
 def refine(
@@ -243,8 +254,8 @@ def refine(
     # A rough answer must not take as many trials as an exact one.
     rough = tolerance > _LEAST_GAIN
     idle = 0
+    scale, normal, gradient = _linearised(problem, state)
     for _ in range(min(most, _MOST_ROUGH_ITERATIONS) if rough else most):
-        scale, normal, gradient = _linearised(problem, state)
         step = _solve(normal, gradient, damping)
         least = -float(state.theta[-1] / scale[-1])
         if step[-1] < least:
@@ -277,6 +288,7 @@ def refine(
         # A step that damping made small gains little wherever it begins.
         if smallest or (gained <= tolerance * state.cost and damping <= _LITTLE_DAMPING):
             break
+        scale, normal, gradient = _linearised(problem, state)
     return replace(state, damping=damping)
 
 
@@ -300,9 +312,9 @@ def _linearised(problem: Problem, state: State) -> tuple[FloatArray, FloatArray,
 
 def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
     """Solve the normal equations, each direction in its own units, with Marquardt's damping."""
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal / size[:, None] / size
-    scaled[np.diag_indices_from(scaled)] += damping
+    scaled.flat[:: size.size + 1] += damping
     try:
         step = np.linalg.solve(scaled, gradient / size)
     except np.linalg.LinAlgError:

@@ -25,6 +25,10 @@ _LOG_DAMPING = (math.log(0.005), math.log(50.0))
 _LOG_RANGE = 30.0
 
 
+def _clip(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
 @dataclass(frozen=True)
 class Reading:
     """A fitted structure in the terms of the field.
@@ -90,7 +94,7 @@ class RationalStructure:
     def scale(self, theta: FloatArray) -> FloatArray:
         """Return the size of a unit step in each direction; of the dead time, all lags [s]."""
         lags = sum(abs(c) for c in self.denominator.constants(theta[:-1]))
-        return np.append(np.ones(theta.size - 1), lags + theta[-1] or 1.0)
+        return np.array([*[1.0] * (theta.size - 1), lags + float(theta[-1]) or 1.0])
 
     def move(self, theta: FloatArray, step: FloatArray, longest: float = math.inf) -> FloatArray:
         """Return theta after a step in units of :meth:`scale`, within its bounds.
@@ -99,16 +103,22 @@ class RationalStructure:
         :param step: shape (m,).
         :param longest: time constant beyond which a lag is an integrator [s].
         """
-        logs = theta[:-1] + np.clip(step[:-1], -_LOG_STEP, _LOG_STEP)
-        logs = np.clip(logs, -_LOG_RANGE, _LOG_RANGE)
+        # Of so few, plain numbers are quicker than arrays.
+        *logs, dead_time = theta.tolist()
+        *moves, by_dead_time = step.tolist()
+        logs = [
+            _clip(at + _clip(by, -_LOG_STEP, _LOG_STEP), -_LOG_RANGE, _LOG_RANGE)
+            for at, by in zip(logs, moves, strict=True)
+        ]
         first, limit = 0, math.log(longest)
         for factor in self.denominator.factors:
             logs[first] = min(logs[first], limit)
             if isinstance(factor, Quadratic):
-                logs[first + 1] = np.clip(logs[first + 1], *_LOG_DAMPING)
+                logs[first + 1] = _clip(logs[first + 1], *_LOG_DAMPING)
             first += factor.parameters
-        limited = float(np.clip(step[-1], -_DEAD_TIME_STEP, _DEAD_TIME_STEP))
-        return np.append(logs, max(theta[-1] + limited * self.scale(theta)[-1], 0.0))
+        limited = _clip(by_dead_time, -_DEAD_TIME_STEP, _DEAD_TIME_STEP)
+        later = dead_time + limited * float(self.scale(theta)[-1])
+        return np.array([*logs, max(later, 0.0)])
 
     def read(
         self, theta: FloatArray, coefficients: FloatArray, like: FloatArray | None = None
