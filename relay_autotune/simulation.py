@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -181,8 +181,15 @@ class _HalfCycle:
     when_max: float = 0.0
     when_min: float = 0.0
     area: float = 0.0
+    # The motion with its length, and when each piece of it begins.
+    pieces: list[tuple[_Segment, float, float]] = field(default_factory=list)
 
-    def add(self, segment: _Segment, grid: FloatArray, begin: float) -> None:
+    def measure(self) -> None:
+        """Find the peaks and the area."""
+        for segment, length, begin in self.pieces:
+            self._add(segment, segment.grid(length), begin)
+
+    def _add(self, segment: _Segment, grid: FloatArray, begin: float) -> None:
         at = np.unique(np.concatenate((grid, segment.turning_points(grid))))
         y = segment.output(at)
         if y.max() > self.peak_max:
@@ -204,6 +211,7 @@ def simulate_relay(
     time: ArrayLike = (),
     operating_point: float | None = None,
     kick: float | None = None,
+    told: int | None = None,
     most_switches: int = 20_000,
 ) -> RelayRun:
     """Run an ideal relay on a process, from switch to switch, without any time step.
@@ -221,6 +229,7 @@ def simulate_relay(
     :param operating_point: measurement at rest [y]; default: the set-point.
     :param kick: how far above the set-point the measurement must rise before the first
         switch [y]; default: the hysteresis.
+    :param told: how many of the cycles are told, the last ones; default: all of them.
     :param most_switches: more than these are taken for chatter.
     :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
     """
@@ -262,7 +271,7 @@ def simulate_relay(
             )
         step = crossing if switching else length
         if step > 0.0:
-            half.add(segment, segment.grid(step), now)
+            half.pieces.append((segment, step, now))
             inside = (samples >= now) & (samples <= now + step) & np.isnan(measured)
             measured[inside] = segment.output(samples[inside] - now)
             z, now = modes.move(z, step), now + step
@@ -292,19 +301,24 @@ def simulate_relay(
     times, levels = np.array([s[0] for s in switches]), np.array([s[1] for s in switches])
     command = PiecewiseConstant(times, levels, settings.baseline)
     known = ~np.isnan(measured)
-    found = _whole_cycles(halves, settings)
+    found = _whole_cycles(halves, settings, told)
     return RelayRun(settings, command, found, samples[known], measured[known])
 
 
-def _whole_cycles(halves: list[_HalfCycle], settings: RelaySettings) -> tuple[Cycle, ...]:
+def _whole_cycles(
+    halves: list[_HalfCycle], settings: RelaySettings, told: int | None
+) -> tuple[Cycle, ...]:
     # The first half starts from rest and belongs to no cycle.
     usable = halves[1:] if not settings.reverse_acting else halves
     usable = usable[next((i for i, h in enumerate(usable) if h.level_is_high), 0) :]
     if usable and usable[0].start == 0.0:
         usable = usable[2:]
     cycles = []
-    for index in range(len(usable) // 2):
+    whole = len(usable) // 2
+    for index in range(0 if told is None else max(whole - told, 0), whole):
         high, low = usable[2 * index], usable[2 * index + 1]
+        high.measure()
+        low.measure()
         # Low turns a direct process down, high a reverse one.
         down, up = (high, low) if settings.reverse_acting else (low, high)
         t_high, t_low = high.end - high.start, low.end - low.start
@@ -345,7 +359,7 @@ def exact_limit_cycle(
     """
     count = 8
     while True:
-        run = simulate_relay(model, settings, cycles=count)
+        run = simulate_relay(model, settings, cycles=count, told=2)
         a, b = run.cycles[-2], run.cycles[-1]
         change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
         if change <= tolerance * b.period:
