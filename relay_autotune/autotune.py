@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.cycles import cycles_of, limit_cycle
-from relay_autotune.disturbance import is_far_off, without_disturbance
+from relay_autotune.disturbance import is_far_off, with_its_load, without_disturbance
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
 from relay_autotune.experiment.early_end import Finding
 from relay_autotune.identification import (
@@ -155,17 +155,26 @@ def analyse(
     chosen = without_disturbance(
         chosen, record, cycles, lambda part: _guarded(part, method, known)
     )
+    # The record as the process was driven, with a load that came.
+    driven = record
+    if chosen.method == DEFAULT_METHOD and not known.structure:
+        chosen, driven = with_its_load(
+            chosen,
+            record,
+            cycles,
+            lambda part, kind: _guarded(part, method, replace(known, structure=kind)),
+        )
     if not final and is_far_off(chosen, record):
         # Its interval is that of a model which the record contradicts: nothing to end a test on.
         chosen = replace(chosen, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
     models = [chosen]
     if final:
         if not alone:
-            models += _others(record, method, known, chosen)
+            models += _others(driven, method, known, chosen)
         models = list(assess(models, record))
     simple = next((m.model for m in models if m.structure == "fopdt"), None)
     if (alone or predict) and simple is None and rule != DEFAULT_RULE:
-        simple = _simple((record,), known, chosen)
+        simple = _simple((driven,), known, chosen)
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
         return _with_prediction(found, rule, rng, simple, options) if predict else found

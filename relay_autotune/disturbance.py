@@ -19,9 +19,14 @@ from relay_autotune.record import Cycle, PiecewiseConstant, Record
 _MORE_THAN_NOISE = 1.3
 _MORE_THAN_SPREAD = 0.02
 _BETTER = 0.5
+# What is less probable than this as noise is looked at again for a load.
+_NOT_WHITE = 1e-6
 # With so many times the noise, and so much of the spread, left over, a model is another process's.
 _FAR_OFF_NOISE = 2.0
 _FAR_OFF_SPREAD = 0.05
+
+# A load is looked for in these structures, the second one being what was found without it.
+_SIMPLE = ("sopdt", "", "fopdt")
 
 # So many last cycles are kept.
 KEPT_CYCLES = 3
@@ -39,6 +44,18 @@ def fits_badly(found: Identification, record: Record) -> bool:
     if residual <= _MORE_THAN_SPREAD * float(np.std(record.measurement)):
         return False
     return math.isnan(noise) or residual > _MORE_THAN_NOISE * noise
+
+
+def is_contradicted(found: Identification, record: Record) -> bool:
+    """Return True if the model fits badly, or what it leaves is clearly no noise.
+
+    :param found: what was identified from the whole record.
+    :param record: the record.
+    """
+    if fits_badly(found, record):
+        return True
+    large = found.fit.residual_rms > _MORE_THAN_SPREAD * float(np.std(record.measurement))
+    return large and found.fit.whiteness_p < _NOT_WHITE
 
 
 def is_far_off(found: Identification, record: Record) -> bool:
@@ -122,3 +139,39 @@ def without_disturbance(
         f"with the last {KEPT_CYCLES} cycles: a load or another disturbance came"
     )
     return replace(alone, fitted=fitted, warnings=(*alone.warnings, warning))
+
+
+def with_its_load(
+    found: Identification,
+    record: Record,
+    cycles: tuple[Cycle, ...],
+    identify: Callable[[Record, str], Identification],
+) -> tuple[Identification, Record]:
+    """Estimate a load step together with the model, where no model fits without one.
+
+    It is looked for in a simple structure first, since a model that was fitted without the load
+    has been bent to follow it.
+
+    :param found: what was identified.
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param identify: identifies a record in a structure, "": in the one that explains it, by the
+        method that fits samples.
+    :return: the identification and the record as it was driven; those given, where a load does
+        not explain what no model does.
+    """
+    samples = bool(cycles) and len(found.fitted) == len(record)
+    if not samples or record.continuous_command or not is_contradicted(found, record):
+        return found, record
+    # Imported here, since few records need it.
+    from relay_autotune.load import identify_with_load
+
+    for structure in _SIMPLE:
+        try:
+            start = identify(record, structure) if structure else found
+            chosen = identify_with_load(start, record, lambda part: identify(part, ""))
+        except RelayAutotuneError:
+            continue
+        if chosen is not None and not is_contradicted(chosen[0], record):
+            return chosen
+    return found, record

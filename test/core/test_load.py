@@ -1,0 +1,80 @@
+"""A load that comes early in a test, where too few cycles follow to leave it out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relay_autotune.autotune import analyse
+from relay_autotune.identification import Known, identify
+from relay_autotune.load import LoadStep, identify_with_load
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant
+from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.ultimate import ultimate_point
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+FIRST_ORDER = TransferFunction.from_structure(
+    "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0
+)
+SECOND_ORDER = TransferFunction.from_structure(
+    "sopdt", gain=1.0, time_constants=[20.0, 8.0], dead_time=4.0
+)
+PERIOD = 0.2
+
+
+def run(model, *, load_time, load_size, noise_std, seed):
+    acting = Disturbances(noise_std=noise_std, load_time=load_time, load_size=load_size)
+    plant = VirtualProcess(model, disturbances=acting, seed=seed)
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0), 0.0)
+    for k in range(20_000):
+        plant.command(tune.step(k * PERIOD, plant.measure(k * PERIOD)))
+        if tune.finished:
+            break
+    return tune
+
+
+@pytest.mark.parametrize(
+    ("model", "load_time", "load_size", "noise_std"),
+    [
+        # Without the load in the model, K_u was 13 % and 8 % off.
+        (FIRST_ORDER, 22.8, 0.4, 0.0),
+        (SECOND_ORDER, 25.6, 0.2, 0.0114),
+    ],
+)
+def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size, noise_std):
+    tune = run(model, load_time=load_time, load_size=load_size, noise_std=noise_std, seed=1003)
+    assert tune.cycle_count == 3
+    found = analyse(tune.record(), alone=True, final=False).model
+    assert found is not None
+    truth = ultimate_point(model)
+    error = found.ultimate_gain / truth.gain - 1.0
+    assert abs(error) < 0.015
+    if noise_std:
+        assert abs(error) < 3.0 * found.ultimate_gain_std / truth.gain
+    said = next(text for text in found.warnings if text.startswith("a load step of"))
+    size, time = (float(said.split()[k]) for k in (4, 7))
+    assert size == pytest.approx(load_size, rel=0.1)
+    assert time == pytest.approx(load_time, abs=3.0)
+
+
+def test_what_is_not_known_of_the_load_widens_the_intervals():
+    tune = run(SECOND_ORDER, load_time=25.6, load_size=0.2, noise_std=0.0114, seed=1003)
+    known = Known(structure="sopdt")
+
+    def fit(record):
+        return identify(record, "waveform", known)
+
+    loaded, driven = identify_with_load(fit(tune.record()), tune.record(), fit)
+    as_if_known = fit(driven)
+    assert list(loaded.values) == list(as_if_known.values)
+    assert loaded.ultimate_gain_std > as_if_known.ultimate_gain_std
+    assert np.all(np.diag(loaded.covariance) > np.diag(as_if_known.covariance))
+    assert np.all(loaded.ci95_low < as_if_known.ci95_low)
+    assert np.all(loaded.ci95_high > as_if_known.ci95_high)
+
+
+def test_a_load_is_added_to_the_command():
+    u = PiecewiseConstant(np.array([1.0, 3.0]), np.array([2.0, -2.0]), 0.5)
+    loaded = LoadStep(time=2.0, size=0.25).added_to(u)
+    assert list(loaded(np.array([0.0, 1.5, 2.0, 2.5, 3.5]))) == [0.5, 2.0, 2.25, 2.25, -1.75]
