@@ -243,7 +243,7 @@ class RelayNode(ServedNode):
             identity, self.get_parameter("record_directory").value
         )
         session.record_with(sample)
-        if not converged and not self._on_setpoint:
+        if not converged:
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
         # Numbers of several publishers cannot be told apart.

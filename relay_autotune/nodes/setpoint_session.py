@@ -74,9 +74,13 @@ class SetpointSession(Session):
     def record(self) -> Record:
         """Return the record, with the controller's commands.
 
+        While the experiment runs, the answer to the last sample may still be to come; until then
+        it is taken to be the command before.
+
         :raises RecordError: if there was no sample.
         """
-        self._hand_on()
+        if self.experiment.finished:
+            self._hand_on()
         record = super().record()
         told = np.array(self._told[: len(record)])
         if told.size < len(record):

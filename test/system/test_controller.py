@@ -200,12 +200,7 @@ rclpy.spin(node)
     assert values() == [1.0, 1.0, 1.0]
 
 
-def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
-    commands = rig.listen("command", Float64, RELIABLE)
-    wanted = rig.listen("controller_command", Float64, RELIABLE)
-    setpoints = rig.listen("setpoint", Float64, RELIABLE)
-    models = rig.listen("transfer_function", TransferFunction)
-    experiments = rig.listen("relay_experiment", RelayExperiment)
+def set_point_relay(rig: Rig, **relay: Any) -> None:
     rig.plant(**PLANT)
     rig.relay(
         use_sim_time=True,
@@ -215,9 +210,19 @@ def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
         settle_time=1.0,
         measurement_timeout=3.0,
         controller_timeout=3.0,
+        **relay,
     )
     rig.start("controller_node", **CONTROLLER)
     rig.identifier(use_sim_time=True)
+
+
+def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
+    commands = rig.listen("command", Float64, RELIABLE)
+    wanted = rig.listen("controller_command", Float64, RELIABLE)
+    setpoints = rig.listen("setpoint", Float64, RELIABLE)
+    models = rig.listen("transfer_function", TransferFunction)
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    set_point_relay(rig)
     rig.until(lambda: len(wanted) > 300 and len(commands) > 300, "a closed loop")
     rig.tune()
     rig.until(lambda: models and models[-1].final, "the model")
@@ -233,4 +238,23 @@ def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
     assert ended.settings.baseline == pytest.approx(1.0, abs=0.03)
     # So the model is that of the process, not of the closed loop.
     assert models[-1].gain == pytest.approx(2.0, rel=0.1)
+    assert models[-1].dead_time == pytest.approx(0.4, abs=0.06)
+
+
+def test_a_relay_on_the_set_point_ends_when_it_knows_enough(rig: Rig) -> None:
+    wanted = rig.listen("controller_command", Float64, RELIABLE)
+    models = rig.listen("transfer_function", TransferFunction)
+    experiments = rig.listen("relay_experiment", RelayExperiment)
+    set_point_relay(rig, stop_when="confident", confidence=0.05, max_cycles=40)
+    rig.until(lambda: len(wanted) > 300, "a closed loop")
+    rig.tune()
+    rig.until(lambda: models and models[-1].final, "the model")
+    (ended,) = experiments
+    assert ended.outcome == RelayExperiment.COMPLETED, ended.reason
+    assert "as narrow as asked, 0.05" in ended.reason
+    # What was judged while it ran was the process, by the commands of its controller.
+    judged = next(m for m in reversed(models) if not m.final)
+    assert 1.96 * judged.ultimate_gain_std <= 0.05 * judged.ultimate_gain
+    assert judged.ultimate_gain == pytest.approx(models[-1].ultimate_gain, rel=0.1)
+    assert models[-1].gain == pytest.approx(2.0, rel=0.15)
     assert models[-1].dead_time == pytest.approx(0.4, abs=0.06)
