@@ -21,6 +21,8 @@ _FIRST_STEPS = 5
 _SECOND_STEPS = 8
 _MORE = 3
 _HOPELESS = 4.0
+# A relay switches at no more than this part of the samples.
+_MOST_SWITCHES = 0.5
 # Nearer in every direction two are one; of two whose sums differ by less, all samples decide.
 _SAME = 0.02
 _UNDECIDED = 1.05
@@ -46,8 +48,9 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         shortest = float(np.median(gaps[gaps > 0.0]))
         inside = u.times[(u.times >= time[0]) & (u.times < time[-1])]
         rest = float(time[-1] - inside[0])
-        if inside.size >= 4:
-            # In a relay test the process answers one switch before the next.
+        if 4 <= inside.size < _MOST_SWITCHES * time.size:
+            # In a relay test the process answers one switch before the next; a controller's
+            # command changes with each sample.
             rest = min(1.1 * float(np.max(np.diff(inside))), rest)
         scales.append((shortest, rest))
     return min(s for s, _ in scales), min(longest for _, longest in scales)

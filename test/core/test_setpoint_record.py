@@ -1,0 +1,47 @@
+"""The record of a relay on the set-point, whose command is that of the present controller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relay_autotune.autotune import analyse
+from relay_autotune.models import TransferFunction
+from relay_autotune.pid import PidController
+from relay_autotune.record import Record
+from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.ultimate import ultimate_point
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+PERIOD = 0.02
+
+
+@pytest.mark.parametrize("dead_time", [0.4, 0.9])
+def test_the_process_is_told_from_its_controller_read_backward(dead_time):
+    model = TransferFunction.fopdt(2.0, 1.0, dead_time)
+    truth = ultimate_point(model)
+    plant = VirtualProcess(model, disturbances=Disturbances(noise_std=0.02), seed=1)
+    controller = PidController(Controller(kc=0.25 * truth.gain, ti=1.0 + 0.3 * dead_time), 0.0)
+    given = ExperimentParameters(amplitude=0.5, setpoint=0.0, process_gain_sign=1)
+    tune = RelayExperiment(given, 0.0, until_converged=False)
+    rows = []
+    while tune.switches < 4:
+        t = len(rows) * PERIOD
+        y = plant.measure(t)
+        # Noise goes through to the command, which changes with each sample.
+        u = controller.step(t, tune.step(t, y), y)
+        plant.command(u)
+        rows.append((t, y, u))
+    time, measurement, command = np.array(rows).T
+    record = Record(
+        time=time,
+        measurement=measurement,
+        command=command,
+        settings=tune.settings,
+        noise_std=tune.noise_std,
+    )
+    found = analyse(record, alone=True, final=False).model
+    assert found is not None
+    assert found.ultimate_gain == pytest.approx(truth.gain, rel=0.03)
+    assert abs(found.ultimate_gain - truth.gain) < 3.0 * found.ultimate_gain_std
