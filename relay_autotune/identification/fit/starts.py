@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.fit.separable import Problem, State, evaluate, promised, refine
 from relay_autotune.models import TransferFunction
+from relay_autotune.record import PiecewiseConstant
 from relay_autotune.ultimate import ultimate_point
 
 FloatArray = NDArray[np.float64]
@@ -21,8 +22,10 @@ _FIRST_STEPS = 5
 _SECOND_STEPS = 8
 _MORE = 3
 _HOPELESS = 4.0
-# A relay switches at no more than this part of the samples.
+# A relay switches at no more than this part of the samples. Where a command changes more often,
+# the changes that count are those by this part of its range.
 _MOST_SWITCHES = 0.5
+_SWITCH = 0.25
 # Nearer in every direction two are one; of two whose sums differ by less, all samples decide.
 _SAME = 0.02
 _UNDECIDED = 1.05
@@ -48,9 +51,13 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         shortest = float(np.median(gaps[gaps > 0.0]))
         inside = u.times[(u.times >= time[0]) & (u.times < time[-1])]
         rest = float(time[-1] - inside[0])
-        if 4 <= inside.size < _MOST_SWITCHES * time.size:
-            # In a relay test the process answers one switch before the next; a controller's
-            # command changes with each sample.
+        if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
+            # A controller answers each sample, and now and then a set-point that is switched.
+            steps = np.abs(np.diff(u.values, prepend=u.initial))
+            large = u.times[steps >= _SWITCH * float(np.ptp(u.values))]
+            inside = large[(large >= time[0]) & (large < time[-1])]
+        if inside.size >= 4:
+            # In a relay test the process answers one switch before the next.
             rest = min(1.1 * float(np.max(np.diff(inside))), rest)
         scales.append((shortest, rest))
     return min(s for s, _ in scales), min(longest for _, longest in scales)
