@@ -49,7 +49,8 @@ _RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
 
 # An oscillation shows in the samples' standard deviation, which must be so many times that of the
 # noise; a relay without a process switches on noise alone, too, and its cycles agree at last.
-_ABOVE_NOISE = 1.5
+# So many samples tell it before there are MIN_CYCLES.
+_ABOVE_NOISE, _TELL = 1.5, 50
 
 _SIGNS = {1: "positive", -1: "negative"}
 
@@ -210,6 +211,8 @@ class Oscillation:
                 f"the oscillation grows faster and faster, after {count_cycles(self.cycles)}: an "
                 f"unstable process of which the relay cannot get hold; give a larger amplitude",
             )
+        elif noise := self._only_noise(_TELL):
+            self._end(Outcome.FAILED, noise)
         elif self._until_converged and cycle.converged:
             self._complete(
                 f"{len(self.cycles)} cycles, of which the last {p.min_cycles} agree within "
@@ -291,17 +294,27 @@ class Oscillation:
 
     def _complete(self, reason: str) -> None:
         """Complete, unless the last cycles cannot be told from noise."""
-        last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
-        spread = float(self._samples.columns(last_cycles[0], last_cycles[-1])[1].std())
-        noise = self._rest.noise_std
-        if spread >= _ABOVE_NOISE * noise:
+        if noise := self._only_noise(1):
+            self._end(Outcome.FAILED, noise)
+        else:
             self._end(Outcome.COMPLETED, reason)
-            return
-        self._end(
-            Outcome.FAILED,
+
+    def _only_noise(self, least: int) -> str:
+        """Return why the last cycles are no oscillation.
+
+        :param least: how many samples it takes to tell where there are not MIN_CYCLES yet.
+        :returns: empty: they are one, or it cannot be told yet.
+        """
+        last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
+        measurement = self._samples.columns(last_cycles[0], last_cycles[-1])[1]
+        spread, noise = float(measurement.std()), self._rest.noise_std
+        few = len(self.cycles) < MIN_CYCLES and measurement.size < least
+        if few or spread >= _ABOVE_NOISE * noise:
+            return ""
+        return (
             f"no oscillation after {count_cycles(self.cycles)}, only noise: the measurement's "
             f"standard deviation is {spread:.3g}, that of its noise at rest {noise:.3g}; give a "
-            f"larger amplitude, or check that the actuator follows its command",
+            f"larger amplitude, or check that the actuator follows its command"
         )
 
     def _end(self, outcome: Outcome, reason: str) -> None:
