@@ -52,10 +52,11 @@ def is_contradicted(found: Identification, record: Record) -> bool:
     :param found: what was identified from the whole record.
     :param record: the record.
     """
-    if fits_badly(found, record):
-        return True
-    large = found.fit.residual_rms > _MORE_THAN_SPREAD * float(np.std(record.measurement))
-    return large and found.fit.whiteness_p < _NOT_WHITE
+    if not found.fit.residual_rms > _MORE_THAN_SPREAD * float(np.std(record.measurement)):
+        return False
+    # Where the noise is not known, only its shape tells.
+    known = not math.isnan(record.noise_std)
+    return (known and fits_badly(found, record)) or found.fit.whiteness_p < _NOT_WHITE
 
 
 def is_far_off(found: Identification, record: Record) -> bool:

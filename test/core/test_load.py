@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from relay_autotune.autotune import analyse
+from relay_autotune.disturbance import with_its_load
 from relay_autotune.identification import Known, identify
 from relay_autotune.load import LoadStep, identify_with_load
 from relay_autotune.models import TransferFunction
@@ -56,6 +60,19 @@ def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size
     size, time = (float(said.split()[k]) for k in (4, 7))
     assert size == pytest.approx(load_size, rel=0.1)
     assert time == pytest.approx(load_time, abs=3.0)
+
+
+@pytest.mark.parametrize("noise_std", [0.0114, math.nan])
+def test_no_load_is_looked_for_where_noise_explains_what_is_left(noise_std):
+    # The cycles of a running test do not tell how large the noise is.
+    tune = run(SECOND_ORDER, load_time=0.0, load_size=0.0, noise_std=0.0114, seed=1003)
+    record = replace(tune.record(), noise_std=noise_std)
+    found = identify(record, "waveform", Known(structure="sopdt"))
+
+    def unwanted(record, structure):
+        raise AssertionError(structure)
+
+    assert with_its_load(found, record, tune.cycles, unwanted) == (found, record)
 
 
 def test_what_is_not_known_of_the_load_widens_the_intervals():
