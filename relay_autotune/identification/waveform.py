@@ -149,8 +149,11 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
         )
         whole = after_the_unknown(whole, chosen.state)
         state = refine(whole, chosen.state.theta)
-        # With a drift beside it, a fit may still run off to where it is no process any more.
-        if selection.candidate(whole, state) is not None:
+        # With a drift beside it, a fit may still run off to where it is no process any more; and
+        # where no structure holds what came, the simplest may leave all of it.
+        if selection.candidate(whole, state) is not None and (
+            known.structure or len(rest) == 1 or _responds(whole, state)
+        ):
             return Fit(whole, state, (chosen,) if known.structure else tuple(rest), scale)
         rest = [c for c in rest if c is not picked]
     raise IdentificationError(
@@ -298,13 +301,18 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
         )
 
 
-def _require_response(problem: Problem, state: State) -> None:
+def _responds(problem: Problem, state: State) -> bool:
+    """Return whether a fit explains more than its parameters cost, beside drift and the like."""
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
     nuisance = state.columns[len(problem.structure.powers) :]
     y = problem.y if problem.weight is None else problem.y * problem.weight
     left = y - np.linalg.lstsq(nuisance.T, y, rcond=None)[0] @ nuisance
     without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
-    if not information_criterion(state.cost, n, state.parameters, floor) < without:
+    return information_criterion(state.cost, n, state.parameters, floor) < without
+
+
+def _require_response(problem: Problem, state: State) -> None:
+    if not _responds(problem, state):
         raise IdentificationError(
             "the measurement shows no response to the command beyond its noise: raise the "
             "amplitude, or check that both topics belong to one loop"

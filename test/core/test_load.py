@@ -62,6 +62,14 @@ def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size
     assert time == pytest.approx(load_time, abs=3.0)
 
 
+def test_a_load_that_no_structure_explains_does_not_pass_for_no_response():
+    # What the models leave is so correlated that the simplest was chosen, which leaves all of it.
+    tune = run(SECOND_ORDER, load_time=70.17, load_size=-0.4, noise_std=0.0, seed=1000)
+    found = analyse(tune.record(), alone=True, final=False).model
+    assert found is not None
+    assert found.ultimate_gain == pytest.approx(ultimate_point(SECOND_ORDER).gain, rel=1e-3)
+
+
 @pytest.mark.parametrize("noise_std", [0.0114, math.nan])
 def test_no_load_is_looked_for_where_noise_explains_what_is_left(noise_std):
     # The cycles of a running test do not tell how large the noise is.
