@@ -15,6 +15,7 @@ from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.parameters import merged
 from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber
+from relay_autotune.nodes.silence import Sensor
 from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.relay import SafePolicy
 
@@ -23,18 +24,20 @@ class NotReadyError(RelayAutotuneError):
     """A tune that cannot start."""
 
 
-def require_connections(node: Node, ends: Ends, age: float, timeout: float) -> None:
+def require_connections(node: Node, ends: Ends, sensor: Sensor, timeout: float) -> None:
     """Refuse a start without measurements, or with nobody who takes the commands.
 
     :param node: the node that would tune.
     :param ends: its topics.
-    :param age: time since the last measurement came [s]; inf: none has come.
-    :param timeout: the greatest age that counts as "arriving" [s].
+    :param sensor: tells whether measurements come.
+    :param timeout: the greatest age of the last one that counts as "arriving" [s].
     :raises NotReadyError: with the reason, as far as the graph tells it.
     """
     if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
         raise NotReadyError("use_sim_time is true, but no time has come on /clock")
-    if age > timeout:
+    if dead := sensor.why_dead():
+        raise NotReadyError(dead)
+    if (age := sensor.age) > timeout:
         when = "yet" if math.isinf(age) else f"for {age:.3g} s"
         why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
         raise NotReadyError(f"no measurement has come {when}: {why}")

@@ -216,7 +216,7 @@ class RelayNode(ServedNode):
             baseline = baseline_from(values["baseline"], mean, self._held)
         parameters.validate(baseline)
         policy = policy_from(values, connected=self._loop.is_connected)
-        require_connections(self, self._ends, self._sensor.age, values["measurement_timeout"])
+        require_connections(self, self._ends, self._sensor, values["measurement_timeout"])
         require_own_time(parameters, repeats=self._hear is not None)
         self._loop.require_alone()
         return parameters, baseline, policy

@@ -75,7 +75,7 @@ class Repeater:
 
     def why_dead(self) -> str:
         """Return a sentence if the silence can only be that of a dead sensor, else ""."""
-        if self._node.count_publishers(self._topic):
+        if not self._repetition.is_heard or self._node.count_publishers(self._topic):
             return ""
         return f"no measurement on {self._topic} any more: its publisher has left"
 
@@ -130,6 +130,10 @@ class Sensor:
         age = self._counter.age
         return age if self._repeater is None else self._repeater.age(age)
 
+    def why_dead(self) -> str:
+        """Return a sentence if a silence can only be that of a dead sensor, else ""."""
+        return "" if self._repeater is None else self._repeater.why_dead()
+
     @property
     def _timeout(self) -> float:
         return float(self._node.get_parameter("measurement_timeout").value)
@@ -149,7 +153,7 @@ class Sensor:
         if self._timer is None:
             return
         if self._repeater is not None:
-            if reason := self._repeater.why_dead():
+            if reason := self.why_dead():
                 self._stop(reason)
             return
         age = self._counter.age

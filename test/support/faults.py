@@ -165,6 +165,26 @@ def wrong_sign(loop: Loop, _: Random) -> None:
     loop.gain = -2.0
 
 
+def before_a_cycle(loop: Loop, random: Random) -> None:
+    """Let the sensor say no more once the process has followed the relay, before a whole cycle."""
+    # Within the dead time no further switch can come.
+    samples = random.randint(0, 9)
+
+    def silent(y: float) -> float | None:
+        nonlocal samples
+        if loop.switches < 3:
+            return y
+        samples -= 1
+        return None if samples < 0 else y
+
+    loop.alter = silent
+
+
+def sensor_leaves(loop: Loop, _: Random) -> Callable[[], None]:
+    loop.sensor_leaves()
+    return loop.sensor_comes
+
+
 def growing(loop: Loop, random: Random) -> None:
     """Let each swing be larger than the one before, by the same factor."""
     factor, seen, scale = random.uniform(1.2, 1.4), len(loop.commands), 1.0
@@ -322,6 +342,15 @@ FAULTS = {
         clock_step(-1.0), "time went backwards", kind="stamped"
     ),
     "/clock that goes back": in_a_tune(clock_step(-1.0), "time went backwards", kind="clock"),
+    "sensor on change that has left": in_a_tune(
+        sensor_leaves, "no measurement on /measurement any more", kind="on change"
+    ),
+    "sensor on change, silent in a cycle": in_a_tune(
+        altered(lambda _, y: None), "does not respond any more", kind="on change"
+    ),
+    "sensor on change, silent before a cycle": in_a_tune(
+        before_a_cycle, "it does not respond", kind="on change", at_start=True, max_half_cycle=0.6
+    ),
     "second publisher of command": in_a_tune(second_publisher, "/command is also published by "),
     "controller silent in a tune": Fault(partial(controller, in_tune=True)),
     "controller silent when idle": Fault(partial(controller, in_tune=False)),

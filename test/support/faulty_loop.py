@@ -1,8 +1,8 @@
 """A loop about a relay_node that is played by its user, fast enough for a fault in half a second.
 
 The process is of first order with dead time, and goes on while the machine is busy. The relay is a
-process of its own. The loop's three kinds differ in the message types, and in what tells the time
-of a sample.
+process of its own. The loop's kinds differ in the message types, in what tells the time of a
+sample, and in when the sensor speaks.
 """
 
 from __future__ import annotations
@@ -63,12 +63,17 @@ KINDS: dict[str, dict[str, Any]] = {
         "command_type": "std_msgs/msg/Float64MultiArray",
     },
     "clock": {"use_sim_time": True, "command_type": "std_msgs/msg/Float32"},
+    # 20 repetitions are the silence for which a busy machine may keep this loop waiting.
+    "on change": {"repeat_period": 0.025},
 }
 _COMMANDS: dict[str, tuple[Any, Callable[[Any], float]]] = {
     "plain": (Float64, lambda message: message.data),
     "stamped": (Float64MultiArray, lambda message: message.data[0]),
     "clock": (Float32, lambda message: message.data),
+    "on change": (Float64, lambda message: message.data),
 }
+# A sensor that speaks on change has this resolution, and a process that much slower.
+_RESOLUTION, _SLOWER = 0.01, 2.0
 _CLOCK_START = 100.0
 
 _TYPES = {
@@ -96,16 +101,31 @@ class Loop:
         rig.node.create_subscription(
             command, "command", lambda m: self.commands.append(value(m)), RELIABLE
         )
-        message = RelayCycle if kind == "stamped" else Float64
-        self.publisher = rig.node.create_publisher(message, "measurement", 100)
+        self.speaks_on_change = kind == "on change"
+        self.slower = _SLOWER if self.speaks_on_change else 1.0
+        self.publisher: Any = None
+        self.sensor_comes()
         self.clock = rig.node.create_publisher(Clock, "/clock", 10) if kind == "clock" else None
         self.process: Process | None = None
         self.values = dict(DEFAULTS)
         self.count = 0
         self.reset()
-        self.timer = rig.node.create_timer(PERIOD, self.step)
+        self.timer = rig.node.create_timer(PERIOD * self.slower, self.step)
 
     # The process.
+
+    def sensor_comes(self) -> None:
+        """Let there be a sensor."""
+        kind = RelayCycle if self.kind == "stamped" else Float64
+        # What is said only once has to stay for a relay that comes later.
+        profile = LATCHED if self.speaks_on_change else 100
+        self.publisher = self.rig.node.create_publisher(kind, "measurement", profile)
+        self.said = math.nan
+
+    def sensor_leaves(self) -> None:
+        """Let the sensor's end of the topic be gone."""
+        self.rig.node.destroy_publisher(self.publisher)
+        self.publisher = None
 
     def reset(self) -> None:
         """Bring the process to rest, and undo what a fault has changed of it."""
@@ -122,14 +142,21 @@ class Loop:
         if command == SAFE:
             # The next tune begins at rest at the baseline.
             command = BASELINE
-        self.on_the_way.append((self.now + DEAD_TIME, command - BASELINE))
+        self.on_the_way.append((self.now + DEAD_TIME * self.slower, command - BASELINE))
         while self.on_the_way[1][0] <= self.now:
             self.on_the_way.popleft()
         pushed = self.gain * self.on_the_way[0][1]
-        self.state += (pushed - self.state) * -math.expm1((before - self.now) / TIME_CONSTANT)
+        passed = (self.now - before) / (TIME_CONSTANT * self.slower)
+        self.state += (pushed - self.state) * -math.expm1(-passed)
         y = self.alter(REST + self.state + self.noise())
-        if y is not None:
-            self.publish(float(y))
+        if y is None or self.publisher is None:
+            return
+        if self.speaks_on_change:
+            y = _RESOLUTION * round(y / _RESOLUTION)
+            if y == self.said:
+                return
+            self.said = y
+        self.publish(float(y))
 
     def noise(self) -> float:
         return 1e-4 * math.sin(7.0 * self.count**2)
@@ -182,19 +209,22 @@ class Loop:
     def begin(self) -> None:
         """Bring all to the state before a tune, and remember what came before it."""
         self.reset()
-        del self.experiments[:], self.status[:], self.commands[:-1], self.gains[:]
+        del self.experiments[:], self.status[:], self.gains[:]
+        # The first tune begins like those that follow another one.
+        self.commands[:] = self.commands[-1:] or [SAFE]
 
     def tune(self) -> Any:
         self.begin()
         return self.rig.tune()
 
-    def until_it_oscillates(self, switches: int = 5) -> None:
-        def switched() -> bool:
-            changes = sum(a != b for a, b in itertools.pairwise(self.commands))
-            # To the baseline and to the kick's level before the first switch.
-            return changes >= switches + 2
+    @property
+    def switches(self) -> int:
+        """Number of switches of the relay that have come; below zero before the kick."""
+        # To the baseline and to the kick's level before the first switch.
+        return sum(a != b for a, b in itertools.pairwise(self.commands)) - 2
 
-        self.rig.until(lambda: switched() or self.experiments, "an oscillation")
+    def until_it_oscillates(self, switches: int = 5) -> None:
+        self.rig.until(lambda: self.switches >= switches or self.experiments, "an oscillation")
         assert not self.experiments, self.experiments[-1].reason
 
     def ended(self) -> Any:
