@@ -321,7 +321,6 @@ class PlantNode(ServedNode):
         wall = time.monotonic()
         if self._waiting and wall - self._ticked < LONGEST_WAIT:
             return
-        self._waiting, self._answered = self._answered, False
         self._ticked = wall
         now = self._samples * self._period
         self._samples += 1
@@ -329,7 +328,10 @@ class PlantNode(ServedNode):
         message = ClockMessage()
         set_stamp(message.clock, round((CLOCK_START + now) * 1e9))
         self._clock.publish(message)
+        # Nobody need answer what is not said.
+        self._waiting = False
         if self._sensor.speaks(value):
+            self._waiting, self._answered = self._answered, False
             self._publish(value)
 
     def _on_command_with_clock(self, message: Float64) -> None:
