@@ -23,35 +23,39 @@ class Repetition:
         self.period = period
         self.value = math.nan
         """The last measurement [y]; NaN: none has come."""
-        self._due = math.inf
+        self._since = math.nan
 
     @property
     def is_heard(self) -> bool:
         """True once a measurement has come."""
-        return self._due < math.inf
+        return not math.isnan(self._since)
 
     def hear(self, now: float, value: float) -> None:
         """Take a measurement that has come.
 
-        :param now: the time [s], on a clock that only goes forward.
+        :param now: the time [s].
         :param value: [y].
         """
         self.value = value
-        self._due = now + self.period
+        self._since = now
 
     def wait(self, now: float) -> float:
         """Return the time until the value is to be repeated [s]; 0: now; the period: unheard.
 
+        A clock that has gone back makes it 0, so that who takes the sample gets to know.
+
         :param now: the time [s].
         """
-        return max(self._due - now, 0.0) if self.is_heard else self.period
+        if now < self._since:
+            return 0.0
+        return max(self._since + self.period - now, 0.0) if self.is_heard else self.period
 
     def repeat(self, now: float) -> float:
         """Return the value, which is a sample now [y].
 
         :param now: the time [s].
         """
-        self._due = now + self.period
+        self._since = now
         return self.value
 
 

@@ -93,6 +93,10 @@ def test_a_value_is_repeated_after_each_period_of_silence():
     assert repetition.wait(9.1) == pytest.approx(0.4)
     repetition.hear(9.2, 4.0)
     assert repetition.repeat(9.8) == 4.0
+    # A clock that has gone back.
+    assert repetition.wait(2.0) == 0.0
+    assert repetition.repeat(2.0) == 4.0
+    assert repetition.wait(2.1) == pytest.approx(0.4)
 
 
 def test_a_silence_is_measured_by_those_since_the_relay_began():

@@ -85,6 +85,21 @@ def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.Monk
     assert [k[2] for k in kept] == [4.0, 4.0, 4.5, 4.0, 4.5, 4.5, 4.5]
 
 
+def test_a_simulated_clock_that_goes_back_is_noticed_while_the_sensor_is_silent() -> None:
+    now = [5_000_000_000]
+    session = Session(experiment(), "one", clock=lambda: now[0], repeats=True)
+    session.answer(4.0, info(time.time_ns(), time.time_ns()))
+    session.answered()
+    now[0] = 5_400_000_000
+    assert session.repeat(4.0) == 0.5
+    session.answered()
+    assert session.record().time == pytest.approx([0.0, 0.4])
+    now[0] = 1_000_000_000
+    session.repeat(4.0)
+    assert session.experiment.finished
+    assert "time went backwards" in session.experiment.reason
+
+
 class Lockstep:
     """A session by sample number, whose first sample was answered just now."""
 
