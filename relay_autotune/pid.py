@@ -38,6 +38,7 @@ class PidController:
     :param command: command from which it starts [u].
     :param limits: range of the command.
     :param automatic: False: it starts in manual.
+    :param usual_interval: an interval of samples that is no gap [s]; 0: the first one tells.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class PidController:
         *,
         limits: Limits = UNLIMITED,
         automatic: bool = True,
+        usual_interval: float = 0.0,
     ) -> None:
         self._gains = gains
         self._limits = limits
@@ -55,6 +57,7 @@ class PidController:
         self._law: PidLaw | None = None
         self._time = math.nan
         self._nominal = math.nan
+        self._usual = usual_interval
         self._motion = filter_matrices(0.0, 1.0)
         self._align = True
 
@@ -121,7 +124,7 @@ class PidController:
             self._align = False
             return self._command
         if not math.isnan(self._nominal):
-            interval = min(interval, _LONGEST_INTERVAL * self._nominal)
+            interval = min(interval, _LONGEST_INTERVAL * max(self._nominal, self._usual))
         self._command = law.command(gains, setpoint, interval, self._limits)
         return self._command
 

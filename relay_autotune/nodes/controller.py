@@ -22,6 +22,7 @@ from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop
+from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
 from relay_autotune.pid import PidController
 from relay_autotune.tuning.gains import Controller
@@ -44,6 +45,7 @@ class ControllerNode(ServedNode):
         declare(self, (*GAINS, *OTHERS))
         declare(self, FIXED, read_only=True)
         values = values_of(self, (*GAINS, *OTHERS, *FIXED))
+        require_own_time(values["sample_period"], values["repeat_period"])
         self._gains = gains_from(values)
         self._pending: Any = None
         self._previous: Controller | None = None
@@ -54,6 +56,7 @@ class ControllerNode(ServedNode):
             values["initial_command"],
             limits=self._limits,
             automatic=not values["manual"],
+            usual_interval=values["repeat_period"],
         )
         self._setpoint: float = values["initial_setpoint"]
         self._period: float = values["sample_period"]
@@ -79,6 +82,9 @@ class ControllerNode(ServedNode):
             self._remote = RemoteLoop(self, gains, self._setpoint, self._verifier.interrupt)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
+        self._repeater: Repeater | None = None
+        if values["repeat_period"] > 0.0:
+            self._repeater = Repeater(self, values["repeat_period"], reader, self._on_silence)
         self._commands = self.create_publisher(
             Float64,
             "controller_command",
@@ -112,17 +118,30 @@ class ControllerNode(ServedNode):
 
     def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
         value = self._value(message)
-        if math.isnan(self._setpoint) and math.isfinite(value):
-            self._setpoint = value
+        if self._repeater is not None:
+            self._repeater.hear(value)
         if self._period > 0.0:
             at = self._count * self._period
             self._count += 1
-        elif self._simulated:
+        elif self._simulated or self._repeater is not None:
+            # A repetition has no time but that of this clock.
             at = self.get_clock().now().nanoseconds * 1e-9
         elif self._stamp is not None:
             at = self._stamp(message) * 1e-9
         else:
             at = (info["source_timestamp"] or time.time_ns()) * 1e-9
+        self._take(at, value)
+
+    def _on_silence(self, value: float) -> None:
+        """Take the last measurement again, which a sensor that is silent stands by."""
+        assert self._repeater is not None
+        # Without a sensor the integral would run away on a value that nobody stands by.
+        if not self._repeater.why_dead():
+            self._take(self.get_clock().now().nanoseconds * 1e-9, value)
+
+    def _take(self, at: float, value: float) -> None:
+        if math.isnan(self._setpoint) and math.isfinite(value):
+            self._setpoint = value
         if self._remote is not None:
             command = self._remote.command
         else:

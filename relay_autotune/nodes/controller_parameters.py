@@ -63,6 +63,14 @@ FIXED = (
     ),
     NodeParameter("measurement_field", "data", "", "Path of the measurement in it."),
     NodeParameter(
+        "repeat_period",
+        0.0,
+        "s",
+        "For a sensor that publishes only when its value changes: after each such time of silence "
+        "the last value is a sample again; 0: only what comes is one.",
+        0.0,
+    ),
+    NodeParameter(
         "apply_to",
         "",
         "",

@@ -48,21 +48,6 @@ def require_connections(node: Node, ends: Ends, sensor: Sensor, timeout: float) 
         raise NotReadyError(f"no command would arrive: {why}")
 
 
-def require_own_time(parameters: ExperimentParameters, *, repeats: bool) -> None:
-    """Refuse to repeat measurements where their number is the only clock.
-
-    :param parameters: what the user set.
-    :param repeats: True if measurements are repeated.
-    :raises NotReadyError: if they are, and ``sample_period`` is given.
-    """
-    if repeats and parameters.sample_period > 0.0:
-        raise NotReadyError(
-            f"repeat_period and sample_period {parameters.sample_period:g} s are both given: a "
-            "sensor that is silent while nothing changes has no constant sample period; set "
-            "sample_period to 0"
-        )
-
-
 def baseline_from(parameter: float, mean: float, held: float | None) -> float:
     """Return the command of the operating point.
 

@@ -34,7 +34,6 @@ from relay_autotune.nodes.readiness import (
     plan_of,
     policy_from,
     require_connections,
-    require_own_time,
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
@@ -47,7 +46,7 @@ from relay_autotune.nodes.reports import (
 from relay_autotune.nodes.session import Session
 from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
 from relay_autotune.nodes.signs_of_life import said_by
-from relay_autotune.nodes.silence import Sensor
+from relay_autotune.nodes.silence import Sensor, require_own_time
 from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
@@ -217,7 +216,7 @@ class RelayNode(ServedNode):
         parameters.validate(baseline)
         policy = policy_from(values, connected=self._loop.is_connected)
         require_connections(self, self._ends, self._sensor, values["measurement_timeout"])
-        require_own_time(parameters, repeats=self._hear is not None)
+        require_own_time(parameters.sample_period, self._sensor.repeat_period)
         self._loop.require_alone()
         return parameters, baseline, policy
 

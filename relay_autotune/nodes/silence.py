@@ -13,6 +13,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.repetition import Repetition
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import Reader
@@ -21,6 +22,22 @@ from relay_autotune.nodes.reports import Counter
 # A timer waits no shorter than this, and the graph is asked so often during a tune [s].
 _LEAST_WAIT = 1e-3
 _LOOK_EVERY = 0.2
+# Two times as numbers of seconds since 1970 differ by so much where they are the same [s].
+_ROUNDING = 1e-6
+
+
+def require_own_time(sample_period: float, repeat_period: float) -> None:
+    """Refuse to repeat measurements where their number is the only clock.
+
+    :param sample_period: as the user set it [s].
+    :param repeat_period: likewise [s].
+    :raises ParameterError: if both are given.
+    """
+    if sample_period > 0.0 and repeat_period > 0.0:
+        raise ParameterError(
+            f"repeat_period and sample_period {sample_period:g} s are both given: a sensor that "
+            "is silent while nothing changes has no constant sample period; set sample_period to 0"
+        )
 
 
 class Repeater:
@@ -89,7 +106,7 @@ class Repeater:
             self._ear = None
         now = self._now()
         wait = self._repetition.wait(now)
-        if wait <= 0.0:
+        if wait <= _ROUNDING:
             self._repeat(self._repetition.repeat(now))
             wait = self._repetition.period
         _again(self._timer, wait)
@@ -117,7 +134,8 @@ class Sensor:
         self._node = node
         self._counter = counter
         self._stop = stop
-        period = float(node.get_parameter("repeat_period").value)
+        self.repeat_period = period = float(node.get_parameter("repeat_period").value)
+        """Silence after which a value is repeated [s]; 0: never."""
         self._repeater = Repeater(node, period, reader, repeat) if period > 0.0 else None
         self._timer: Timer | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)

@@ -104,6 +104,20 @@ def test_without_gains_it_holds():
     assert not controller.is_automatic
 
 
+def test_a_usual_interval_is_no_gap_whatever_the_first_one_was():
+    known = PidController(GAINS, 0.0, usual_interval=0.5)
+    unknown = PidController(GAINS, 0.0)
+    for controller in (known, unknown):
+        controller.step(0.0, 1.0, 0.0)
+        controller.step(0.01, 1.0, 0.0)
+    rate = GAINS.kc / GAINS.ti
+    assert known.step(0.51, 1.0, 0.0) == pytest.approx(rate * 0.51)
+    # Five times the first one is all that it runs on by itself.
+    assert unknown.step(0.51, 1.0, 0.0) == pytest.approx(rate * (0.01 + 0.05))
+    # A gap is one for both.
+    assert known.step(9.0, 1.0, 0.0) == pytest.approx(rate * (0.51 + 2.5))
+
+
 def test_jitter_changes_little():
     rng = np.random.default_rng(3)
     steady = np.arange(400) * 0.05

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_rig import RELIABLE, Rig
+from loop_rig import LATCHED, RELIABLE, Rig
+from rclpy.action import ActionClient
 from std_msgs.msg import Float64
 
+from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import RelayExperiment, TransferFunction
 
 PLANT: dict[str, Any] = {
@@ -80,3 +82,42 @@ def test_a_number_of_samples_is_no_clock_of_a_silent_sensor(rig: Rig) -> None:
 
     reason = rig.until(refused, "the refusal")
     assert "repeat_period and sample_period 0.01 s are both given" in reason
+
+
+def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
+    commands = rig.listen("command", Float64, RELIABLE)
+    values = rig.listen("measurement", Float64, RELIABLE)
+    # In simulated time, of which more passes.
+    rig.plant(**PLANT | {"mode": "clock", "speed": 4.0, "sample_period": 0.02})
+    rig.start(
+        "controller_node",
+        "-r",
+        "controller_command:=command",
+        use_sim_time=True,
+        repeat_period=0.03,
+        kc=0.3,
+        ti=0.4,
+        initial_command=1.0,
+        initial_setpoint=5.0,
+    )
+    models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+    models.publish(
+        TransferFunction(final=True, numerator=[2.0], denominator=[0.4, 1.0], dead_time=0.2)
+    )
+    rig.until(lambda: len(commands) > 60, "a closed loop")
+    # All that the sensor has said at rest.
+    assert len(values) < 10
+    client = ActionClient(rig.node, Verify, "controller_node/verify")
+    rig.until(client.server_is_ready, "the action")
+    sent = client.send_goal_async(Verify.Goal(setpoint_step=0.5))
+    rig.until(sent.done, "the goal")
+    answer = sent.result().get_result_async()
+    rig.until(answer.done, "the result")
+    client.destroy()
+    result = answer.result().result
+    assert result.passed, result.reason
+    (step,) = result.steps
+    assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
+    # Without a gap, though the sensor has nothing to say once the loop has settled.
+    assert np.median(np.diff(step.time)[-20:]) == pytest.approx(0.04, abs=0.021)
+    assert np.count_nonzero(np.diff(step.measurement)[-20:]) < 10
