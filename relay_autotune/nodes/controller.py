@@ -132,12 +132,12 @@ class ControllerNode(ServedNode):
             at = (info["source_timestamp"] or time.time_ns()) * 1e-9
         self._take(at, value)
 
-    def _on_silence(self, value: float) -> None:
+    def _on_silence(self, value: float, ago: float) -> None:
         """Take the last measurement again, which a sensor that is silent stands by."""
         assert self._repeater is not None
         # Without a sensor the integral would run away on a value that nobody stands by.
         if not self._repeater.why_dead():
-            self._take(self.get_clock().now().nanoseconds * 1e-9, value)
+            self._take(self.get_clock().now().nanoseconds * 1e-9 - ago, value)
 
     def _take(self, at: float, value: float) -> None:
         if math.isnan(self._setpoint) and math.isfinite(value):

@@ -140,10 +140,10 @@ class RelayNode(ServedNode):
             self._answer_idle(value)
         self._counter.add(info["publication_sequence_number"])
 
-    def _on_silence(self, value: float) -> None:
+    def _on_silence(self, value: float, ago: float) -> None:
         """Take the last measurement again, which a sensor that is silent stands by."""
         if (session := self._session) is not None:
-            self._respond(session, session.repeat(value))
+            self._respond(session, session.repeat(value, ago))
         elif not self._loop.is_driven:
             self._answer_idle(value)
 

@@ -94,12 +94,13 @@ class Session:
             return True
         return self.early is not None and self.early.is_due(experiment)
 
-    def repeat(self, measurement: float) -> float:
-        """Take the last measurement for a sample again, now; return the command.
+    def repeat(self, measurement: float, ago: float = 0.0) -> float:
+        """Take the last measurement for a sample again; return the command.
 
         :param measurement: what the sensor said last, be it before the tune [y].
+        :param ago: how long ago it was one [s].
         """
-        now = self.now_ns()
+        now = self.now_ns() - round(1e9 * ago)
         if self._count == 0:
             self.start_ns = now
         self._count += 1

@@ -43,29 +43,34 @@ def require_own_time(sample_period: float, repeat_period: float) -> None:
 class Repeater:
     """Take the last measurement again while the sensor is silent.
 
-    Time is that of the steady clock, or the simulated one. What a sensor said before the node was
-    there is heard if its publisher keeps it (transient local).
+    Time is that of the steady clock, or the simulated one. That one goes in steps, and what is
+    measured at a step comes after it: so that a step was silent is known at the next one, and the
+    value is then a sample of the step before. What a sensor said before the node was there is
+    heard if its publisher keeps it (transient local).
 
     :param node: the node.
     :param period: silence after which a value is repeated [s], > 0.
     :param reader: how the measurement is read from its messages.
-    :param repeat: called with the value that is a sample again [y].
+    :param repeat: called with the value that is a sample again [y], and how long ago it was [s].
     """
 
     def __init__(
-        self, node: Any, period: float, reader: Reader, repeat: Callable[[float], None]
+        self, node: Any, period: float, reader: Reader, repeat: Callable[[float, float], None]
     ) -> None:
         self._node = node
         self._reader = reader
         self._repeat = repeat
         self._repetition = Repetition(period)
-        if node.get_parameter("use_sim_time").value:
+        self._simulated = bool(node.get_parameter("use_sim_time").value)
+        self._silent_at = math.nan
+        if self._simulated:
             clock = node.get_clock()
             self._now: Callable[[], float] = lambda: float(clock.now().nanoseconds) * 1e-9
         else:
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             self._now = time.monotonic
-        self._timer = node.create_timer(period, self._look, clock=clock)
+        wait = _LEAST_WAIT if self._simulated else period
+        self._timer = node.create_timer(wait, self._look, clock=clock)
         self._ear: Subscription | None = node.create_subscription(
             reader.kind,
             "measurement",
@@ -79,6 +84,7 @@ class Repeater:
     def hear(self, value: float) -> None:
         """Take a measurement that has come [y]."""
         self._direct = True
+        self._silent_at = math.nan
         self._repetition.hear(self._now(), value)
 
     def age(self, since_last: float) -> float:
@@ -105,11 +111,24 @@ class Repeater:
             self._node.destroy_subscription(self._ear)
             self._ear = None
         now = self._now()
+        if self._simulated:
+            self._look_at_step(now)
+            _again(self._timer, _LEAST_WAIT)
+            return
         wait = self._repetition.wait(now)
-        if wait <= _ROUNDING:
-            self._repeat(self._repetition.repeat(now))
+        if wait <= 0.0:
+            self._repeat(self._repetition.repeat(now), 0.0)
             wait = self._repetition.period
         _again(self._timer, wait)
+
+    def _look_at_step(self, now: float) -> None:
+        if self._is_due(now) and now > self._silent_at:
+            at = self._silent_at
+            self._repeat(self._repetition.repeat(at), now - at)
+        self._silent_at = now if self._is_due(now) else math.nan
+
+    def _is_due(self, now: float) -> bool:
+        return self._repetition.wait(now) <= _ROUNDING
 
 
 class Sensor:
@@ -118,7 +137,7 @@ class Sensor:
     :param node: the node.
     :param reader: how the measurement is read from its messages.
     :param counter: counts the messages.
-    :param repeat: called with a value that is a sample again [y].
+    :param repeat: called as by :class:`Repeater`.
     :param stop: called with the reason when a tune is to end.
     """
 
@@ -128,7 +147,7 @@ class Sensor:
         reader: Reader,
         counter: Counter,
         *,
-        repeat: Callable[[float], None],
+        repeat: Callable[[float, float], None],
         stop: Callable[[str], None],
     ) -> None:
         self._node = node

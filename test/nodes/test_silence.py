@@ -68,6 +68,10 @@ class Simulated:
         self.world.destroy_node()
 
 
+def now(loop: Simulated) -> float:
+    return float(loop.node.get_clock().now().nanoseconds) * 1e-9
+
+
 @pytest.fixture
 def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Simulated]]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -90,10 +94,12 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Simulat
 def test_with_simulated_time_a_silence_is_as_long_as_that_clock_says(
     simulated: Callable[..., Simulated],
 ) -> None:
-    repeated: list[float] = []
+    repeated: list[tuple[float, float]] = []
     reader = reader_of(FLOAT64, "data")
     loop = simulated(lambda: Node("hearer"))
-    repeater = Repeater(loop.node, PERIOD, reader, repeated.append)
+    repeater = Repeater(
+        loop.node, PERIOD, reader, lambda y, ago: repeated.append((y, now(loop) - ago))
+    )
     loop.at(10.0)
     assert not repeated
     assert not repeater.why_dead()
@@ -105,17 +111,21 @@ def test_with_simulated_time_a_silence_is_as_long_as_that_clock_says(
     assert not repeated
     for k in range(1, 7):
         loop.at(10.0 + 0.25 * k)
-    # After each period, as soon as the clock shows it.
-    assert repeated == [5.0] * 3
+    # Each period, rounded up to what the clock shows: it was silent then, too.
+    assert repeated == [(5.0, 10.5), (5.0, 11.0)]
+    # What was said at a step is no silence, however late it comes.
     repeater.hear(6.0)
-    loop.at(11.75)
-    assert len(repeated) == 3
-    loop.at(12.0)
-    assert repeated == [5.0] * 3 + [6.0]
+    for time in (11.75, 12.0):
+        loop.at(time)
+    assert len(repeated) == 2
+    loop.at(12.25)
+    assert repeated[2:] == [(6.0, 12.0)]
     # A clock that goes back is told by a sample with that time, not by none for nine seconds.
-    loop.at(3.0)
-    loop.at(3.0 + PERIOD)
-    assert len(repeated) > 4
+    for time in (3.0, 3.5, 4.0):
+        loop.at(time)
+    value, at = repeated[3]
+    assert value == 6.0
+    assert at in (3.0, 3.5)
     loop.world.destroy_publisher(loop.sensor)
     loop.until(lambda: "its publisher has left" in repeater.why_dead())
 
@@ -143,8 +153,9 @@ def test_the_controller_integrates_while_the_sensor_stands_by_its_value(
     loop.until(lambda: commands)
     loop.rest()
     del commands[:]
+    loop.at(10.5)
     for k in range(1, 6):
-        loop.at(10.0 + 0.5 * k)
+        loop.at(10.5 + 0.5 * k)
         loop.until(lambda k=k: len(commands) >= k)
     # kc/ti e dt for each half second; the first sample makes no bump.
     assert commands == pytest.approx([1.0 + 2.0 / 4.0 * 1.0 * 0.5 * k for k in range(1, 6)])
@@ -152,7 +163,7 @@ def test_the_controller_integrates_while_the_sensor_stands_by_its_value(
     loop.world.destroy_publisher(loop.sensor)
     loop.until(lambda: loop.node.count_publishers("measurement") == 0)
     for k in range(6, 9):
-        loop.at(10.0 + 0.5 * k)
+        loop.at(10.5 + 0.5 * k)
     assert len(commands) == 5
 
 
