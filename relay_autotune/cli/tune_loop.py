@@ -104,6 +104,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _tune(options: argparse.Namespace, ros: list[str]) -> int:
+    interrupted: list[int] = []
+
+    def heed(*numbers: int) -> None:
+        for number in numbers:
+            signal.signal(number, lambda n, _: interrupted.append(n))
+
+    # An exception could be lost in an import or in a callback of rclpy.
+    heed(signal.SIGINT)
     # What a command needs is imported when it is needed: --help waits for no rclpy.
     from relay_autotune.nodes.tune_client import TuneClient
 
@@ -118,11 +126,15 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         return USAGE
     with client:
         deadline = time.monotonic() + options.wait
-        client.find(options.wait, needs_identifier=not (options.dry_run or options.record_only))
+        client.find(
+            options.wait,
+            needs_identifier=not (options.dry_run or options.record_only),
+            leave=lambda: bool(interrupted),
+        )
         # Until here there is nothing that could be left half done.
-        interrupted: list[int] = []
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda n, _: interrupted.append(n))
+        heed(signal.SIGTERM)
+        if interrupted:
+            raise KeyboardInterrupt
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")

@@ -81,15 +81,16 @@ class TuneClient:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def find(self, patience: float, *, needs_identifier: bool) -> None:
+    def find(self, patience: float, *, needs_identifier: bool, leave: Callable[[], bool]) -> None:
         """Wait for the relay_node, and for the identifier_node if it is needed.
 
         :param patience: how long [s].
         :param needs_identifier: whether model and gains are wanted.
+        :param leave: whether nobody waits any more; this returns then.
         :raises LoopError: if they are not there; the sentence says who is.
         """
         deadline = time.monotonic() + patience
-        if not self._wait(self._client.server_is_ready, deadline):
+        if not self._wait(lambda: leave() or self._client.server_is_ready(), deadline):
             # This client itself is in the graph under the name that it looks for.
             others = ", ".join(n for n in self._owners("/tune") if n != self.name) or "none"
             raise LoopError(
@@ -98,7 +99,7 @@ class TuneClient:
             )
         gains = self._resolved("pi_gains")
         if needs_identifier and not self._wait(
-            lambda: self._node.count_publishers(gains) > 0, deadline
+            lambda: leave() or self._node.count_publishers(gains) > 0, deadline
         ):
             raise LoopError(
                 f"no identifier_node publishes {gains}, so that no model and no gains would come; "
