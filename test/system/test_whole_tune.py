@@ -50,6 +50,8 @@ def tune_in_lockstep(rig: Rig, **plant: Any) -> tuple[Results, Path]:
     rig.identifier()
     answer = rig.tune()
     rig.until(lambda: results.gains, "gains")
+    # They come by topics of their own.
+    rig.until(lambda: results.models and results.models[-1].final, "the final model")
     rig.until(lambda: "is closed with model and gains" in relay.log, "closed bag")
     return results, rig.bag(answer)
 
@@ -168,6 +170,8 @@ def test_real_time(rig: Rig) -> None:
     rig.identifier()
     answer = rig.tune()
     rig.until(lambda: results.gains, "gains")
+    # They come by topics of their own.
+    rig.until(lambda: results.models and results.models[-1].final, "the final model")
     rig.until(lambda: "is closed with model and gains" in relay.log, "closed bag")
     experiment, model = results.experiments[-1], results.models[-1]
     assert experiment.outcome == RelayExperiment.COMPLETED
