@@ -212,8 +212,10 @@ def second_publisher(loop: Loop, _: Random) -> Callable[[], None]:
 
 def abort(loop: Loop, _: Random) -> None:
     answer = loop.rig.call(Trigger, "relay_node/abort", Trigger.Request())
+    # A busy listener may acknowledge later than relay_node waits for it; whether the command has
+    # arrived is seen at the end.
     assert answer.success
-    assert "not acknowledged" not in answer.message
+    assert "the safe command" in answer.message
 
 
 def actuator(loop: Loop, random: Random) -> float:
