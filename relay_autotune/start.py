@@ -24,7 +24,10 @@ def start(module: str) -> int:
     """
     # One that was started with SIGINT ignored, as by nohup, goes on ignoring it.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # One that comes in between waits: noted for a handler that is gone, it would be lost.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     status: int = import_module(module).main()
     return status
 

@@ -32,6 +32,8 @@ from relay_autotune.nodes.parameters import Entry, unknown_parameters
 
 # How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
+# What the pipe of signals says at the end.
+_NO_SIGNAL = 0
 
 
 class ServedNode(Node):
@@ -126,10 +128,7 @@ def run(
     for unknown in unknown_parameters(_typed_parameters(words), parameters):
         print(f"{name}: {unknown}", file=sys.stderr)
         return 2
-    stopped: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # A second signal changes nothing: the end below is bounded in time.
-        signal.signal(number, lambda n, _: stopped.append(n))
+    signals = _Signals()
     try:
         rclpy.init(
             args=None if args is None else list(args),
@@ -149,7 +148,7 @@ def run(
         for unknown in unknown_parameters(list(node._parameter_overrides), parameters):
             # A file may hold what is meant for others.
             node.get_logger().warning(unknown)
-        return _serve(node, stopped)
+        return _serve(node, signals)
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
@@ -194,12 +193,12 @@ def _help(name: str, purpose: str, parameters: Sequence[Entry]) -> str:
     return "\n".join(lines)
 
 
-def _serve(node: ServedNode, stopped: list[int]) -> int:
+def _serve(node: ServedNode, signals: _Signals) -> int:
     executor = Executor()
     executor.add_node(node)
     if node.favoured is not None:
         executor.favour(node.favoured)
-    stop_waking = _wake_on_signal(executor)
+    signals.wake(executor)
     # What was imported stays: the collector need not look at it again and again.
     gc.collect()
     gc.freeze()
@@ -207,10 +206,10 @@ def _serve(node: ServedNode, stopped: list[int]) -> int:
     status, reason = 0, ""
     try:
         more = False
-        while not stopped:
+        while not signals.came:
             busy = executor.turn(0.0 if more else None)
             more = node.work(idle=not busy)
-        reason = f"the node was stopped by {signal.Signals(stopped[0]).name}"
+        reason = f"the node was stopped by {signal.Signals(signals.came[0]).name}"
     except Exception as error:
         status, reason = 1, f"the node failed: {_where(error)}"
     # The safe command goes out before anything is said about why.
@@ -221,36 +220,53 @@ def _serve(node: ServedNode, stopped: list[int]) -> int:
         node.get_logger().fatal(f"could not end in order: {_where(error)}")
     if status:
         node.get_logger().fatal(reason)
-    # `ros2 launch` sends a second SIGINT beside the terminal's, which may come as late as while
-    # the interpreter ends: there a handler of Python's is undone, and the signal would kill.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    stop_waking()
+    signals.end()
     executor.shutdown(timeout_sec=0.0)
     return status
 
 
-def _wake_on_signal(executor: Executor) -> Callable[[], None]:
-    # A Python signal handler does not interrupt the executor's wait in C. The interpreter writes
-    # the number of a signal into this pipe at once; a thread reads it and gives the executor
-    # something to do.
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+class _Signals:
+    """SIGINT and SIGTERM, from now on: which came, in their order.
 
-    def read() -> None:
-        while os.read(reader, 64):
-            executor.create_task(lambda: None)
+    A second one changes nothing: the end of a node is bounded in time. The interpreter notes a
+    signal in a pipe at once, whatever its main thread does, and a thread reads it there: a handler
+    in Python waits until the main thread is back from C, where the executor waits.
+    """
 
-    thread = threading.Thread(target=read, name="signals", daemon=True)
-    thread.start()
+    _HEEDED = (signal.SIGINT, signal.SIGTERM)
 
-    def stop() -> None:
+    def __init__(self) -> None:
+        self.came: list[int] = []
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._writer, False)
+        signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
+        for number in self._HEEDED:
+            signal.signal(number, lambda n, _: self.came.append(n))
+        self._thread: threading.Thread | None = None
+
+    def wake(self, executor: Executor) -> None:
+        """Give an executor something to do as soon as one comes, or has come."""
+
+        def read() -> None:
+            while _NO_SIGNAL not in (numbers := os.read(self._reader, 64)):
+                self.came += [n for n in numbers if n in self._HEEDED]
+                executor.create_task(lambda: None)
+
+        self._thread = threading.Thread(target=read, name="signals", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Ignore those that still come."""
+        # `ros2 launch` sends a second SIGINT beside the terminal's, which may come as late as
+        # while the interpreter ends: there a handler of Python's is undone, and the signal would
+        # kill.
+        for number in self._HEEDED:
+            signal.signal(number, signal.SIG_IGN)
         signal.set_wakeup_fd(-1)
-        os.close(writer)  # the thread wakes the executor for what has come, and ends
-        thread.join()
-
-    return stop
+        # The pipe stays open: a handler that has begun in another thread may still write to it.
+        os.write(self._writer, bytes([_NO_SIGNAL]))
+        if self._thread is not None:
+            self._thread.join()
 
 
 def _where(error: BaseException) -> str:
