@@ -35,6 +35,7 @@ from relay_autotune.identification.fit.separable import (
     problem_of,
     refine,
 )
+from relay_autotune.identification.fit.starts import changes_within
 from relay_autotune.identification.fit.waveform_report import report
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
@@ -283,7 +284,7 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
         )
     if not np.ptp(time) > 0.0:
         raise IdentificationError("all samples of the record have the same time")
-    if not bool(np.any((u.times >= time[0]) & (u.times < time[-1]))):
+    if not changes_within(u, time).size:
         raise IdentificationError(
             "the command never changes within the record: nothing excites the process, "
             "so that no model can be told; record a relay test or a step"

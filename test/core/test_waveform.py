@@ -288,3 +288,18 @@ def test_clean_records_have_no_outliers():
     for seed in range(20):
         found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)
         assert not any("left out" in w for w in found.warnings)
+
+
+def test_a_record_that_begins_in_a_movement_and_ends_as_its_command_does():
+    # What is left once the movement is over holds no change of the command that a sample follows,
+    # so that the model is that of the whole record.
+    time = np.arange(400) * 0.1
+    command = np.where(time >= 0.5, 1.0, 0.0)
+    command[-1] = 0.0
+    step = PiecewiseConstant(np.array([0.5]), np.array([1.0]), 0.0)
+    measurement = response(TransferFunction.fopdt(2.0, 1.0, 0.2), time, step)
+    measurement += 3.0 * np.exp(-time / 0.7)
+    measurement += 0.05 * np.random.default_rng(1).standard_normal(400)
+    found = identify_waveform(Record(time=time, measurement=measurement, command=command))
+    assert len(found.fitted) == 400
+    assert found.fit.residual_rms < 0.1

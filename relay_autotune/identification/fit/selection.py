@@ -21,6 +21,7 @@ from relay_autotune.identification.fit.separable import (
 from relay_autotune.identification.fit.starts import (
     Starts,
     begin,
+    changes_within,
     coarse,
     go_on,
     least_promised,
@@ -108,10 +109,7 @@ class Selection:
         whole = replace(self._problem, relaxation=True)
         _, longest = time_scales(whole)
         later = whole.part(whole.time >= whole.starts + longest)
-        if 2 * later.time.size < whole.time.size or not all(
-            part.stop > part.start and np.any(u.times > later.time[part][0])
-            for part, u in zip(later.experiments, later.inputs, strict=True)
-        ):
+        if 2 * later.time.size < whole.time.size or not _is_driven(later):
             return
         first = refine(whole, self._fopdt.theta, tolerance=_TRIAL)
         if first.cost <= _MUCH_BETTER * self._floor:
@@ -347,11 +345,17 @@ def after_the_unknown(problem: Problem, state: State) -> Problem:
     """
     if not problem.relaxation:
         return problem
-    known = problem.time >= problem.starts + float(state.theta[-1])
-    some = problem.part(known)
-    if min(part.stop - part.start for part in some.experiments) <= 4 * state.parameters:
-        return problem
-    return some
+    some = problem.part(problem.time >= problem.starts + float(state.theta[-1]))
+    least = min(part.stop - part.start for part in some.experiments)
+    return some if least > 4 * state.parameters and _is_driven(some) else problem
+
+
+def _is_driven(problem: Problem) -> bool:
+    """Return whether the command changes within the samples of each experiment."""
+    return all(
+        part.stop > part.start and changes_within(u, problem.time[part]).size > 0
+        for part, u in zip(problem.experiments, problem.inputs, strict=True)
+    )
 
 
 def choose(candidates: list[Candidate]) -> Candidate:

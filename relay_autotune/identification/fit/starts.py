@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.fit.separable import Problem, State, evaluate, promised, refine
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
+from relay_autotune.record import Input, PiecewiseConstant
 from relay_autotune.ultimate import ultimate_point
 
 FloatArray = NDArray[np.float64]
@@ -39,6 +39,15 @@ _SHARES = (
 )
 
 
+def changes_within(u: Input, time: FloatArray) -> FloatArray:
+    """Return when an input changes within samples, so that one of them follows [s].
+
+    :param u: the input.
+    :param time: of the samples [s], shape (n,).
+    """
+    return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
+
+
 def time_scales(problem: Problem) -> tuple[float, float]:
     """Return the shortest time that samples resolve, and the longest that a dead time can be.
 
@@ -49,7 +58,7 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         time = problem.time[part]
         gaps = np.diff(time)
         shortest = float(np.median(gaps[gaps > 0.0]))
-        inside = u.times[(u.times >= time[0]) & (u.times < time[-1])]
+        inside = changes_within(u, time)
         rest = float(time[-1] - inside[0])
         if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
             # A controller answers each sample, and now and then a set-point that is switched.
