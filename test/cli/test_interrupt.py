@@ -31,6 +31,8 @@ def interrupted(name: str, words: list[str], delay: float) -> tuple[int, str]:
     process = subprocess.Popen(
         [sys.executable, "-c", BEGIN.format(name), *words],
         cwd=ROOT, env=given, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        # Tests in the background of a script ignore it, and what they start would go on so.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None
     assert process.stdout.readline() == "begins\n"
