@@ -105,6 +105,13 @@ class Search:
         some = grid[grid > 0.03 * self.frequency][::2].astype(np.float32)
         return Surroundings(Responses(self.models, some, self.frequency))
 
+    def _among(self, around: Surroundings | None) -> Search:
+        """Return this search with others around the process, whose own responses are kept."""
+        search = replace(self, models=self.models if around else ())
+        known = {"frequency": self.frequency, "responses": self.responses, "around": around}
+        search.__dict__.update(known)
+        return search
+
     def optimum(self, bounds: Bounds, *, derivative: bool) -> Optimum | None:
         """Return the controller of least IAE, or None where none keeps the bounds.
 
@@ -112,8 +119,7 @@ class Search:
         :param derivative: True: PID, False: PI.
         :raises TuningError: if nothing limits the gain.
         """
-        alone = replace(self, models=())
-        alone.__dict__.update(frequency=self.frequency, responses=self.responses)
+        alone = self._among(None)
         scanned = alone.scan(bounds, self._times(derivative))
         if scanned is None:
             return None
@@ -146,9 +152,7 @@ class Search:
         """
         steps = _ROUGH
         while True:
-            search = replace(self)
-            known = {"frequency": self.frequency, "responses": self.responses, "around": asked}
-            search.__dict__.update(known)
+            search = self._among(asked)
             found = search._beginning(bounds, point)
             if found is None:
                 return None
