@@ -228,9 +228,10 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
 class _Signals:
     """SIGINT and SIGTERM, from now on: which came, in their order.
 
-    A second one changes nothing: the end of a node is bounded in time. The interpreter notes a
-    signal in a pipe at once, whatever its main thread does, and a thread reads it there: a handler
-    in Python waits until the main thread is back from C, where the executor waits.
+    A second one changes nothing: the end of a node is bounded in time. A handler in Python waits
+    until the main thread is back from C, where the executor waits. The interpreter writes the
+    number of a signal into a pipe at once; a thread reads it and gives the executor something to
+    do.
     """
 
     _HEEDED = (signal.SIGINT, signal.SIGTERM)
@@ -248,8 +249,7 @@ class _Signals:
         """Give an executor something to do as soon as one comes, or has come."""
 
         def read() -> None:
-            while _NO_SIGNAL not in (numbers := os.read(self._reader, 64)):
-                self.came += [n for n in numbers if n in self._HEEDED]
+            while _NO_SIGNAL not in os.read(self._reader, 64):
                 executor.create_task(lambda: None)
 
         self._thread = threading.Thread(target=read, name="signals", daemon=True)
