@@ -106,9 +106,8 @@ def _parser() -> argparse.ArgumentParser:
 def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     interrupted: list[int] = []
 
-    def heed(*numbers: int) -> None:
-        for number in numbers:
-            signal.signal(number, lambda n, _: interrupted.append(n))
+    def heed(number: int) -> None:
+        signal.signal(number, lambda n, _: interrupted.append(n))
 
     # An exception could be lost in an import or in a callback of rclpy.
     heed(signal.SIGINT)
