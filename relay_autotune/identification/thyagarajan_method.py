@@ -305,12 +305,8 @@ def _identified(
             covariance = slopes @ reading.covariance @ slopes.T
         quantile = float(stdtrit(reading.cycles - 1, 0.975))
     found = with_uncertainty(METHOD, build, solver.parameters, values, covariance, quantile)
-    remarks = (
-        *warnings,
-        *_literal(solver, shape, scaled, build, found),
-        *_sensitive(solver, shape),
-    )
-    return replace(found, warnings=(*found.warnings, *remarks))
+    remarks = (*_literal(solver, shape, scaled, build, found), *_sensitive(solver, shape))
+    return replace(found, warnings=(*found.warnings, *warnings, *remarks))
 
 
 def _jacobian(solve: Callable[[Shape], FloatArray], reading: Reading) -> FloatArray | None:
