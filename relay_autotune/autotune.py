@@ -23,6 +23,7 @@ from relay_autotune.identification import (
 )
 from relay_autotune.identification.assessment import assess
 from relay_autotune.identification.checks import unequal_amplitudes
+from relay_autotune.identification.direction import speaks_for_other, wrong_direction
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Cycle, Outcome, Record
@@ -44,6 +45,8 @@ _NO_GAINS = {
     Outcome.ABORTED: "the experiment was aborted",
     Outcome.FAILED: "the experiment failed",
 }
+# Parameters of a load step: its instant and size.
+_LOAD = 2
 _OPEN_DEAD_TIME = (
     "no gains: the record goes with a dead time of any length, so that it bounds no gain; record "
     "a relay test, or a step that stands clear of the noise"
@@ -168,6 +171,10 @@ def analyse(
         # Its interval is that of a model which the record contradicts: nothing to end a test on.
         chosen = replace(chosen, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
     models = [chosen]
+    if final and not known.structure and _tells_direction(chosen, record):
+        other = speaks_for_other(chosen, record, beside=0 if driven is record else _LOAD)
+        if other is not None:
+            return Analysis(record, cycles, reason=wrong_direction(other))
     if final:
         if not alone:
             models += _others(driven, method, known, chosen)
@@ -184,6 +191,12 @@ def analyse(
             record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
         )
     return _tuned(found, (rule,) if alone else _first(rule), rng, simple, options)
+
+
+def _tells_direction(chosen: Identification, record: Record) -> bool:
+    """Return whether to ask a record if its relay worked in the right direction."""
+    gains = record.settings is not None and record.outcome not in _NO_GAINS
+    return gains and chosen.method == DEFAULT_METHOD
 
 
 def analyse_jointly(

@@ -1,0 +1,82 @@
+"""A relay of the wrong direction, which oscillates on the first answer of an inverse response."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relay_autotune.autotune import analyse
+from relay_autotune.identification import identify
+from relay_autotune.identification.direction import speaks_for_other
+from relay_autotune.models import TransferFunction
+from relay_autotune.record import Outcome
+from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+SECOND_ORDER = TransferFunction.from_structure(
+    "sopdt_zero", gain=0.38, time_constants=[1.3, 0.32], zeros=[-1.2], dead_time=0.09
+)
+SLOWER = TransferFunction.from_structure(
+    "sopdt_zero", gain=-2.1, time_constants=[1.1, 0.28], zeros=[-2.9], dead_time=0.47
+)
+INTEGRATOR = TransferFunction.from_structure(
+    "integrator_inverse", gain=0.4, time_constants=[0.38], zeros=[-1.4], dead_time=0.1
+)
+
+
+def run(model, *, sign, period, **acting):
+    plant = VirtualProcess(model, disturbances=Disturbances(**acting), seed=11)
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0, process_gain_sign=sign), 0.0)
+    for k in range(20_000):
+        plant.command(tune.step(k * period, plant.measure(k * period)))
+        if tune.finished:
+            break
+    return tune
+
+
+@pytest.mark.parametrize(
+    ("model", "period", "noise_std"),
+    [
+        (SECOND_ORDER, 0.015, 0.0),
+        (SECOND_ORDER, 0.015, 0.03),
+        (SLOWER, 0.04, 0.0),
+        (SLOWER, 0.04, 0.5),
+        (INTEGRATOR, 0.015, 0.03),
+    ],
+)
+def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, period, noise_std):
+    tune = run(model, sign=-model.process_sign, period=period, noise_std=noise_std)
+    assert tune.outcome is Outcome.COMPLETED
+    found = analyse(tune.record(), alone=True)
+    assert found.best_gains is None
+    assert f"process_gain_sign {model.process_sign};" in found.reason
+    # What the relay's own direction would have given is a model of the wrong sign.
+    wrong = identify(tune.record(), "waveform")
+    assert wrong.model.process_sign == -model.process_sign
+
+
+@pytest.mark.parametrize(("model", "period"), [(SECOND_ORDER, 0.05), (SLOWER, 0.1)])
+def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
+    noise = {"noise_std": 0.01 * abs(model.gain)}
+    tune = run(model, sign=model.process_sign, period=period, **noise)
+    found = analyse(tune.record(), alone=True)
+    assert found.best_gains is not None
+    assert np.sign(found.best_gains.kc) == model.process_sign
+
+
+@pytest.mark.parametrize(
+    "acting",
+    [
+        {"drift": 0.003, "noise_std": 0.01},
+        {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01},
+        {"quantisation": 0.1},
+        {"noise_std": 0.1},
+    ],
+)
+def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting):
+    model = TransferFunction.fopdt(1.0, 1.0, 0.7)
+    tune = run(model, sign=1, period=0.03, **acting)
+    assert tune.outcome is Outcome.COMPLETED
+    record = tune.record()
+    assert speaks_for_other(identify(record, "waveform"), record) is None
+    assert analyse(record, alone=True).best_gains is not None
