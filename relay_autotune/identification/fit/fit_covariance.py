@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ FloatArray = NDArray[np.float64]
 
 # Parts of the measurement's range that are rounding.
 NEGLIGIBLE = 1e-10
+_EPSILON = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
 def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
     """Return the covariance of the parameters of the field, to first order, shape (p, p).
 
+    NaN: what is not determined is so large that numbers do not hold it.
+
     :param problem: what was fitted.
     :param state: its fit.
     :param fit: where scale and loss are told.
@@ -89,7 +93,15 @@ def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise)
     """
     scale = fit.scale
     gradient = _gradient(problem, state, scale)
-    return np.asarray(gradient @ _covariance(problem, state, fit, noise) @ gradient.T)
+    with np.errstate(over="ignore", invalid="ignore"):
+        inner = _covariance(problem, state, fit, noise)
+        covariance = np.asarray(gradient @ inner @ gradient.T)
+        # Differences of large numbers leave a variance of rounding, on either side of zero.
+        rounding = _EPSILON * np.diag(np.abs(gradient) @ np.abs(inner) @ np.abs(gradient).T)
+    if not np.all(np.isfinite(covariance)):
+        return np.full_like(covariance, math.nan)
+    np.fill_diagonal(covariance, np.maximum(np.diag(covariance), rounding))
+    return covariance
 
 
 def _covariance(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:

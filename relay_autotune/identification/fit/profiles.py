@@ -193,7 +193,10 @@ def _constrained(
     along = np.linalg.qr(slope[:, None], mode="complete")[0][:, 1:]
     rest = residual - onto @ scaled
     solved = np.linalg.lstsq((along.T @ scaled).T, rest, rcond=1e-14)[0]
-    return np.asarray((onto + along @ solved) / size)
+    with np.errstate(over="ignore"):
+        step = np.asarray((onto + along @ solved) / size)
+    # A direction that the samples hardly show may ask for more than numbers hold.
+    return step if np.all(np.isfinite(step)) else None
 
 
 def _gradient(point: FloatArray, k: int, parameter: Callable[[FloatArray], float]) -> FloatArray:
