@@ -101,7 +101,11 @@ class RelayExperiment:
         reason, repeated = self._procedure.reason, self._silence.repeated
         if not (reason and repeated):
             return reason
-        return f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
+        told = f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
+        silent = self._silence.silence
+        if self.outcome is Outcome.COMPLETED or not silent > 0.0:
+            return told
+        return f"{told}, at the end for {silent:.3g} s: check it first"
 
     @property
     def settings(self) -> RelaySettings | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -79,6 +80,7 @@ def test_a_sensor_that_dies_in_its_silence(dies, says):
     assert says in tune.reason
     # What moves nothing any more is no reason to take the gain for one of the other sign.
     assert "taken as negative" not in tune.reason
+    assert re.search(r"silent, at the end for [\d.]+ s: check it first", tune.reason)
     assert tune.after_end(math.nan) == 0.0
 
 
