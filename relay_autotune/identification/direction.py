@@ -27,7 +27,7 @@ from relay_autotune.identification.fit.separable import (
 from relay_autotune.identification.fit.starts import Starts, refine_best, start_fopdt
 from relay_autotune.identification.result import Identification
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record
+from relay_autotune.record import Input, PiecewiseConstant, Record
 from relay_autotune.response import response
 
 FloatArray = NDArray[np.float64]
@@ -61,15 +61,16 @@ def speaks_for_other(
     :param record: the relay test.
     :param beside: number of parameters that were estimated beside the model, as those of a load.
     """
+    drive = record.drive()
     residual = (record.measurement - found.fitted)[np.isfinite(found.fitted)]
-    moved, left_out = _moved_beside(found, record), residual.size < len(record)
+    moved, left_out = _moved_beside(found, record, drive), residual.size < len(record)
     if not (moved or left_out or beside or _is_correlated(residual)):
         return None
     sign, scale = found.model.process_sign, float(np.ptp(record.measurement))
     y = (record.measurement - record.measurement[0]) / scale
-    whole = problem_of([(record.time, y, record.drive())], FOPDT)
+    whole = problem_of([(record.time, y, drive)], FOPDT)
     problem = whole.thinned(_MOST_SAMPLES)
-    horizon = _HORIZON * float(record.time[-1] - record.drive().times[0])
+    horizon = _HORIZON * float(record.time[-1] - drive.times[0])
     inverse = [
         f
         for f in _inverse(problem, sign)
@@ -107,9 +108,8 @@ def wrong_direction(other: TransferFunction) -> str:
     )
 
 
-def _moved_beside(found: Identification, record: Record) -> bool:
+def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:
     """Return whether more than an offset was estimated beside the model."""
-    drive = record.drive()
     stable = all(t.real > 0.0 for t in found.model.time_constants)
     if not (stable and isinstance(drive, PiecewiseConstant)):
         return True

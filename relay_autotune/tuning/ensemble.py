@@ -58,6 +58,8 @@ def ensemble(
         np.zeros(values.size),
         covariance / np.outer(scale, scale),
         count - len(rivals),
+        # What is not determined has variances whose rounding is no small number.
+        check_valid="ignore",
         method="eigh",
     )
     models = []

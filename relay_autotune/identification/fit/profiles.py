@@ -184,9 +184,10 @@ def _constrained(
     """Return the least-squares step on the plane where the parameter meets its target."""
     size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
     size[size == 0.0] = 1.0
-    scaled, slope = jacobian / size[:, None], gradient / size
-    power = float(slope @ slope)
-    if power == 0.0:
+    with np.errstate(over="ignore"):
+        scaled, slope = jacobian / size[:, None], gradient / size
+        power = float(slope @ slope)
+    if not 0.0 < power < math.inf:
         return None
     onto = slope * (miss / power)
     # The directions in which the parameter stays: all but the first of an orthonormal basis.
