@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.fit.choice import choose
 from relay_autotune.identification.fit.fit_covariance import NEGLIGIBLE, Fit, raw_residual
 from relay_autotune.identification.fit.lags import FOPDT
 from relay_autotune.identification.fit.robust import scale_of, weights
@@ -26,7 +27,6 @@ from relay_autotune.identification.fit.selection import (
     Candidate,
     Selection,
     after_the_unknown,
-    choose,
 )
 from relay_autotune.identification.fit.separable import (
     Problem,

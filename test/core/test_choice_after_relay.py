@@ -54,6 +54,33 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     assert not any("drift" in w for w in found.warnings)
 
 
+@pytest.mark.parametrize(("noise_std", "within"), [(0.0, 1e-9), (0.002, 3e-3)])
+@pytest.mark.parametrize(
+    "model",
+    [
+        TransferFunction.from_structure(
+            "sopdt_zero",
+            gain=0.186,
+            zeros=[-0.771],
+            time_constants=[1.248, 0.183],
+            dead_time=0.071,
+        ),
+        TransferFunction.from_structure(
+            "sopdt_zero",
+            gain=-0.271,
+            zeros=[-0.702],
+            time_constants=[1.968, 0.318],
+            dead_time=0.05,
+        ),
+    ],
+)
+def test_an_inverse_response_is_found_that_a_fopdt_does_not_show(model, noise_std, within):
+    # Two equal lags and a zero were chosen, with a K_u up to 5 % off.
+    found = identify_waveform(_record(model, noise_std * abs(model.gain), 1))
+    assert found.structure == "sopdt_zero"
+    assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=within)
+
+
 @pytest.mark.parametrize("seed", [3, 15])
 def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
     model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)

@@ -1,4 +1,4 @@
-"""Which structure the data speak for: every one fitted, the simplest that explains them chosen."""
+"""The structures that may explain the data, every one fitted, with the criterion of its fit."""
 
 from __future__ import annotations
 
@@ -41,15 +41,11 @@ FloatArray = NDArray[np.float64]
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
-_INDIFFERENT = 2.0
 _SAMPLES_EACH = 8
 # How many times smaller the mean square must be for the beginning to be left out.
 _MUCH_BETTER = 4.0
 # Standard errors from which a correlation of neighbours counts as one.
 _CORRELATED = 4.0
-# Parts of the measurement's range: left by an exact structure, and by one that is good enough.
-_EXACT = 1e-7
-_ENOUGH = 4e-3
 # Drift and initial state belong to a fit only on strong evidence, since they blur the gain.
 _EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
@@ -276,7 +272,8 @@ class Selection:
             case "sopdt":
                 return [self._best(known_structures.SOPDT, starts.sopdt())]
             case "sopdt_zero":
-                return [self._best(known_structures.SOPDT_ZERO, starts.sopdt())]
+                thetas = [*starts.sopdt(), self._two_equal_lags()]
+                return [self._best(known_structures.SOPDT_ZERO, thetas)]
             case "two_equal_one":
                 return [self._best(known_structures.TWO_EQUAL_ONE, starts.two_equal_one())]
             case "three_lags" | "lag_complex":
@@ -293,6 +290,15 @@ class Selection:
                 chosen = starts.unstable_second(self._unstable()[0].theta)
                 return [self._best(known_structures.UNSTABLE_SOPDT, chosen)]
         return []
+
+    def _two_equal_lags(self) -> FloatArray:
+        """Return a start of two lags and a zero: the two equal ones that fit best.
+
+        From a FOPDT, which answers the right way at once, not every inverse response is found.
+        """
+        problem = replace(self._problem, structure=lag_n_zero(2))
+        best = go_on(problem, begin(problem, self._starts.lag_n_zero(2)))[0]
+        return np.array((best.theta[0], 0.0, best.theta[1]))
 
     def _unstable(self) -> list[State]:
         """Return the beginning of an unstable FOPDT's fit, from which two structures go on."""
@@ -356,45 +362,3 @@ def _is_driven(problem: Problem) -> bool:
         part.stop > part.start and changes_within(u, problem.time[part]).size > 0
         for part, u in zip(problem.experiments, problem.inputs, strict=True)
     )
-
-
-def choose(candidates: list[Candidate]) -> Candidate:
-    """Return the simplest structure that the criterion cannot tell from the best.
-
-    :param candidates: the best first, at least one.
-    """
-    best = candidates[0].criterion
-    enough = _good_enough(candidates)
-    if enough is not None:
-        return enough
-    rivals = [c for c in candidates if c.criterion <= best + _INDIFFERENT]
-    return min(rivals, key=lambda c: (c.state.parameters, c.structure.order, c.criterion))
-
-
-def _good_enough(candidates: list[Candidate]) -> Candidate | None:
-    """Return a FOPDT that leaves so little that jitter or rounding explains the rest as well.
-
-    Below that, what the criterion prefers is made of the errors of the instants, which are
-    not white. Where a structure is exact, nothing is left to such errors.
-    """
-
-    def rms(candidate: Candidate) -> float:
-        return math.sqrt(candidate.state.cost / candidate.problem.time.size)
-
-    fopdt = next((c for c in candidates if c.structure.name == "fopdt"), None)
-    integrator = next((c for c in candidates if c.structure.name == "ipdt"), None)
-    if fopdt is None or rms(candidates[0]) < _EXACT or rms(fopdt) > _ENOUGH:
-        return None
-    slower = integrator is not None and integrator.criterion < fopdt.criterion
-    return None if slower else fopdt
-
-
-def support(candidates: list[Candidate]) -> list[float]:
-    """Return the weight of each candidate, from its criterion; their sum is 1.
-
-    :param candidates: the best first.
-    """
-    best = candidates[0].criterion
-    weights = [math.exp(-0.5 * min(c.criterion - best, 1400.0)) for c in candidates]
-    total = sum(weights)
-    return [w / total for w in weights]

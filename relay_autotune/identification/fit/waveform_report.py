@@ -13,6 +13,7 @@ from scipy.special import stdtrit
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.checks import disagreeing_point, unequal_gains
 from relay_autotune.identification.fit.averaging import averaged_point
+from relay_autotune.identification.fit.choice import support
 from relay_autotune.identification.fit.determination import with_what_is_determined
 from relay_autotune.identification.fit.fit_covariance import (
     NEGLIGIBLE,
@@ -23,7 +24,7 @@ from relay_autotune.identification.fit.fit_covariance import (
     raw_residual,
 )
 from relay_autotune.identification.fit.residuals import ljung_box
-from relay_autotune.identification.fit.selection import Candidate, support
+from relay_autotune.identification.fit.selection import Candidate
 from relay_autotune.identification.fit.separable import Problem, State, evaluate, refine
 from relay_autotune.identification.fit.structures import Reading
 from relay_autotune.identification.result import (
