@@ -128,7 +128,7 @@ def run(seed: int, state: str) -> Result:
         result.delay = experiment.ended_at - experiment.caused_at
     if tune.outcome is Outcome.COMPLETED:
         judge(result, experiment, analyse(tune.record(), alone=True))
-    elif tune.sample_count:
+    elif tune.finished and tune.sample_count:
         # What identifier_node would publish; one structure is enough to see that there is none.
         known = Known(structure="fopdt")
         result.gains = analyse(tune.record(), known=known, alone=True).best_gains is not None
