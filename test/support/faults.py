@@ -180,6 +180,12 @@ def before_a_cycle(loop: Loop, random: Random) -> None:
     loop.alter = silent
 
 
+def silent_in_a_cycle(loop: Loop, _: Random) -> None:
+    """Let the sensor say no more after a whole cycle, from which its silence is judged."""
+    loop.rig.until(lambda: loop.cycles, "a whole cycle")
+    loop.alter = lambda _: None
+
+
 def sensor_leaves(loop: Loop, _: Random) -> Callable[[], None]:
     loop.sensor_leaves()
     return loop.sensor_comes
@@ -348,7 +354,7 @@ FAULTS = {
         sensor_leaves, "no measurement on /measurement any more", kind="on change"
     ),
     "sensor on change, silent in a cycle": in_a_tune(
-        altered(lambda _, y: None), "does not respond any more", kind="on change"
+        silent_in_a_cycle, "does not respond any more", kind="on change"
     ),
     "sensor on change, silent before a cycle": in_a_tune(
         before_a_cycle, "it does not respond", kind="on change", at_start=True, max_half_cycle=0.6

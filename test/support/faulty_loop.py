@@ -96,6 +96,7 @@ class Loop:
         self.commands: list[float] = []
         self.experiments: list[Any] = rig.listen("relay_experiment", RelayExperiment)
         self.gains = rig.listen("pi_gains", PidGains)
+        self.cycles = rig.listen("relay_cycle", RelayCycle)
         self.status = rig.listen("/diagnostics", DiagnosticArray, QoSProfile(depth=50))
         command, value = _COMMANDS[kind]
         rig.node.create_subscription(
@@ -209,7 +210,7 @@ class Loop:
     def begin(self) -> None:
         """Bring all to the state before a tune, and remember what came before it."""
         self.reset()
-        del self.experiments[:], self.status[:], self.gains[:]
+        del self.experiments[:], self.status[:], self.gains[:], self.cycles[:]
         # The first tune begins like those that follow another one.
         self.commands[:] = self.commands[-1:] or [SAFE]
 
