@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from relay_autotune.record import FloatArray
+from relay_autotune.record import Cycle, FloatArray
 
 # A growth is taken for that of an instability after so many steps, each of which is larger than
 # the one before by this factor, to so many times the first swing: the transient of a stable loop
@@ -145,3 +145,8 @@ def is_growing(swings: Sequence[float]) -> bool:
         return False
     steps = [b - a for a, b in pairwise(last)]
     return steps[0] > 0.0 and all(b >= _FASTER * a for a, b in pairwise(steps))
+
+
+def count_cycles(cycles: list[Cycle]) -> str:
+    """Say how many cycles there are."""
+    return f"{len(cycles)} whole cycle{'' if len(cycles) == 1 else 's'}"

@@ -12,10 +12,12 @@ from relay_autotune.experiment.levels import Levels, clear_swing
 from relay_autotune.experiment.no_return import (
     NO_ANSWER,
     RunawayWatch,
+    count_cycles,
     has_moved,
     is_growing,
     why_no_return,
 )
+from relay_autotune.experiment.noise_alone import TELL, why_noise_alone
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
@@ -34,11 +36,9 @@ _ROUNDING = 1e-6
 # The part of a period at the high level is known when two cycles agree in it this far; a load has
 # come when it then differs by more than the other. A load that stops the oscillation altogether
 # is borne by shifts of this part of the amplitude, so many at a time.
-_SAME_SHARE = 0.03
-_OTHER_SHARE = 0.08
-_MOST_SHIFTS = 2
+_SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
+_MOST_SHIFTS, _SHIFT = 2, 0.7
 _FOLLOWS = 2
-_SHIFT = 0.7
 
 # Once a whole cycle was seen, this part of the patience is enough.
 _PATIENCE_IN_CYCLES = 0.4
@@ -47,10 +47,8 @@ _PATIENCE_IN_CYCLES = 0.4
 # for so many samples, since a sensor has spikes.
 _RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
 
-# An oscillation shows in the samples' standard deviation, which must be so many times that of the
-# noise; a relay without a process switches on noise alone, too, and its cycles agree at last.
-# So many samples tell it before there are MIN_CYCLES.
-_ABOVE_NOISE, _TELL = 1.5, 50
+# What did not move during so many stays of the relay in a row does not follow it.
+_STAYS = 2
 
 _SIGNS = {1: "positive", -1: "negative"}
 
@@ -114,6 +112,7 @@ class Oscillation:
         self._first_limit = first_limit
         self._until_converged = until_converged
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
+        self._switched_at: deque[int] = deque(maxlen=_STAYS + 1)
         self._limit = first_limit
         self._patient_from = -math.inf
         self._share = math.nan
@@ -145,6 +144,8 @@ class Oscillation:
             begins = relay.is_high and not self._is_noise()
             due = t + self._parameters.extra_delay
             self._on_the_way.append((due, relay.is_high, begins))
+            self._switched_at.append(len(self._samples) - 1)
+            self._look_for_noise()
         elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
         elif self._runs_away(t, y):
@@ -172,6 +173,7 @@ class Oscillation:
         floor = max(self._hysteresis, abs(y - self._setpoint), 3.0 * self._rest.noise_std)
         self._watch = RunawayWatch(floor)
         self._on_the_way.clear()
+        self._switched_at.clear()
         self._switches_before = self.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
         p = self._parameters
@@ -211,7 +213,7 @@ class Oscillation:
                 f"the oscillation grows faster and faster, after {count_cycles(self.cycles)}: an "
                 f"unstable process of which the relay cannot get hold; give a larger amplitude",
             )
-        elif noise := self._only_noise(_TELL):
+        elif noise := self._only_noise(TELL):
             self._end(Outcome.FAILED, noise)
         elif self._until_converged and cycle.converged:
             self._complete(
@@ -230,6 +232,21 @@ class Oscillation:
             swing = max(c.peak_max - c.peak_min for c in self.cycles)
             self._furthest = 0.5 * _RUNAWAY * swing
             self._bear_load()
+
+    def _look_for_noise(self) -> None:
+        """Make the amplitude larger, or fail, where the last stays at a level moved nothing."""
+        first, last = self._switched_at[0], self._switched_at[-1]
+        if len(self._switched_at) <= _STAYS or last - first < TELL:
+            return
+        # While the process passes the band, noise may switch the relay many times.
+        time = self._samples.time[last] - self._samples.time[first]
+        noise = self._noise_alone(first, last) if time >= _STAYS * self._response_time else ""
+        if noise and self._levels.can_grow:
+            self._levels.grow()
+            self.cycle_start.clear()
+            self._begin()
+        elif noise:
+            self._end(Outcome.FAILED, noise)
 
     def _has_grown(self) -> bool:
         """Make an amplitude that is being found larger if the last cycle was too small."""
@@ -306,16 +323,14 @@ class Oscillation:
         :returns: empty: they are one, or it cannot be told yet.
         """
         last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
-        measurement = self._samples.columns(last_cycles[0], last_cycles[-1])[1]
-        spread, noise = float(measurement.std()), self._rest.noise_std
-        few = len(self.cycles) < MIN_CYCLES and measurement.size < least
-        if few or spread >= _ABOVE_NOISE * noise:
-            return ""
-        return (
-            f"no oscillation after {count_cycles(self.cycles)}, only noise: the measurement's "
-            f"standard deviation is {spread:.3g}, that of its noise at rest {noise:.3g}; give a "
-            f"larger amplitude, or check that the actuator follows its command"
-        )
+        first, last = last_cycles[0], last_cycles[-1]
+        few = len(self.cycles) < MIN_CYCLES and last - first < least
+        return "" if few else self._noise_alone(first, last)
+
+    def _noise_alone(self, first: int, last: int) -> str:
+        """Return why the samples first to last - 1 are no oscillation; empty: they may be one."""
+        measurement = self._samples.columns(first, last)[1]
+        return why_noise_alone(measurement, self._rest.noise_std, count_cycles(self.cycles))
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self.cycles)
@@ -383,8 +398,3 @@ class Oscillation:
             f"{t - self._relay.since:.3g} s; {why} (process_gain_sign was taken as "
             f"{_SIGNS[self.sign]})"
         )
-
-
-def count_cycles(cycles: list[Cycle]) -> str:
-    """Say how many cycles there are."""
-    return f"{len(cycles)} whole cycle{'' if len(cycles) == 1 else 's'}"

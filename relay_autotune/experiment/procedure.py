@@ -23,7 +23,8 @@ from functools import partial
 
 from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
 from relay_autotune.experiment.levels import Levels
-from relay_autotune.experiment.oscillation import Oscillation, count_cycles
+from relay_autotune.experiment.no_return import count_cycles
+from relay_autotune.experiment.oscillation import Oscillation
 from relay_autotune.experiment.relay_law import Relay
 from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
