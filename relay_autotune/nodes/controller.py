@@ -208,7 +208,11 @@ class ControllerNode(ServedNode):
 
     async def _apply_and_tell(self) -> None:
         done, reason = await self._apply()
-        (self.get_logger().info if done else self.get_logger().error)(reason)
+        # A line of code has one severity; with another one the logger raises.
+        if done:
+            self.get_logger().info(reason)
+        else:
+            self.get_logger().error(reason)
 
     async def _apply(self) -> tuple[bool, str]:
         message = self._pending

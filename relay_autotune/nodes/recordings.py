@@ -178,11 +178,17 @@ class Recordings:
             missing = " and ".join(recording.missing)
             cause = f": {recording.reason}" if recording.reason else ""
             recording.closed(f"{missing} did not come{cause}" if missing else "")
-        log = self._node.get_logger()
-        say = log.warning if recording.waiting and recording.missing else log.info
-        recording.recorder.close(
-            lambda: say(f"the recording {recording.recorder.path} is closed {why}")
-        )
+        log, lacks = self._node.get_logger(), recording.waiting and recording.missing
+
+        def say() -> None:
+            told = f"the recording {recording.recorder.path} is closed {why}"
+            # A line of code has one severity; with another one the logger raises.
+            if lacks:
+                log.warning(told)
+            else:
+                log.info(told)
+
+        recording.recorder.close(say)
 
     def close_all(self, why: str, timeout: float) -> None:
         """Close all recordings and wait for the newest to be finished.

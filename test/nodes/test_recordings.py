@@ -1,0 +1,69 @@
+"""How the recordings of a node end."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import Float64
+
+from relay_autotune import nodes
+from relay_autotune.nodes.domain import free_domain
+from relay_autotune.nodes.recordings import RESULTS, Recordings
+from relay_autotune_msgs.msg import PidGains, TransferFunction
+
+PATIENCE = 500
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with free_domain() as domain:
+        rclpy.init(domain_id=domain)
+        node = Node("recorder", use_global_arguments=False)
+        yield node
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
+    node: Node, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    results = dict(zip(RESULTS, (TransferFunction, PidGains), strict=True))
+    topics = {"measurement": Float64, "command": Float64, **results}
+    ends = {name: node.create_publisher(kind, name, 10) for name, kind in topics.items()}
+    recordings = Recordings(node, ends)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    for experiment, complete in (("whole", True), ("lacking", False)):
+        take, said = recordings.begin(experiment, str(tmp_path))
+        assert "recorded in" in said
+        take((1, 1, 1.0, 1, 0.5))
+        if complete:
+            for name, kind in results.items():
+                recordings.message(experiment, name, 2, kind(final=True))
+        closed: list[str] = []
+        recordings.close_with_results(experiment, 0.05, closed.append)
+        for _ in range(PATIENCE):
+            if closed:
+                break
+            executor.spin_once(timeout_sec=0.02)
+        assert ("did not come" in closed[0]) is not complete
+        recordings.close_all("", 10.0)
+        assert recordings.problem() == ""
+    executor.shutdown()
+    told = capfd.readouterr().err
+    assert "[INFO]" in told and "whole is closed with model and gains" in told
+    assert "[WARN]" in told and "lacking is closed without" in told
+
+
+def test_each_line_that_logs_has_one_severity() -> None:
+    # A logger raises where a line of code logs with another severity than before.
+    for path in sorted(Path(nodes.__file__).parent.glob("*.py")):
+        chosen = re.findall(r"(?:get_logger\(\)|\blog)\.\w+\b(?!\()", path.read_text())
+        assert not chosen, path.name
