@@ -49,8 +49,8 @@ class LoopEnds:
         self._gives_back = False
         self._driven = False
         self._silent = ""
-        self._feedback = math.nan
-        self._feedback_at = -math.inf
+        # When it was heard last; inf: there is none to be heard.
+        self._feedback_at = math.inf
         self._follow: FollowWatch | None = None
         self._own: deque[float] = deque(maxlen=_OWN_KEPT)
         self._guard = Guard(node, stop)
@@ -156,10 +156,10 @@ class LoopEnds:
             checks.append(Silence(f"no command on {topic}", timeout, lambda: self.handover.age))
         timeout = self._value("feedback_timeout")
         self._follow = None
-        # One that was heard and is late is a fault, too.
-        heard = not math.isnan(self._feedback)
-        fed_back = heard and self._node.count_publishers("command_feedback") > 0
-        if fed_back and self._ends.setpoint is None:
+        if self._ends.setpoint is None:
+            if not self._node.count_publishers("command_feedback"):
+                # What has left is not late; what comes during the tune is heeded from then on.
+                self._feedback_at = math.inf
             self._follow = FollowWatch(self._tolerance(experiment), timeout)
             checks.append(
                 Silence(
@@ -212,13 +212,13 @@ class LoopEnds:
         self.handover.note(message.data)
 
     def _on_feedback(self, message: Float64) -> None:
-        self._feedback, self._feedback_at = message.data, time.monotonic()
+        self._feedback_at = time.monotonic()
         if self._follow is None or math.isnan(self.commanded):
             return
-        if self._follow.add(self._feedback_at, self.commanded, self._feedback):
+        if self._follow.add(self._feedback_at, self.commanded, message.data):
             self._stop(
                 f"the actuator does not follow: it is told {self.commanded:g} and says that it is "
-                f"at {self._feedback:g}"
+                f"at {message.data:g}"
             )
 
     def _look(self) -> None:

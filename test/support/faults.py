@@ -226,28 +226,39 @@ def abort(loop: Loop, _: Random) -> None:
 
 def actuator(loop: Loop, random: Random) -> float:
     """Tell the position of an actuator, which then stays where it is."""
-    stuck = False
-    publisher = loop.rig.node.create_publisher(Float64, "command_feedback", 10)
+    stuck, node = False, loop.rig.node
+    ends: list[Any] = []
 
     def feed() -> None:
-        if loop.commands:
-            publisher.publish(Float64(data=BASELINE - 0.35 if stuck else loop.commands[-1]))
+        for end in ends:
+            if loop.commands:
+                end.publish(Float64(data=BASELINE - 0.35 if stuck else loop.commands[-1]))
 
-    timer = loop.rig.node.create_timer(0.01, feed)
+    def speak() -> None:
+        ends.append(node.create_publisher(Float64, "command_feedback", 10))
+        loop.rig.until(ends[0].get_subscription_count, "the relay")
+        loop.rig.run_for(0.05)
+
+    timer = node.create_timer(0.01, feed)
+    # It may speak for the first time in the midst of the tune.
+    late = random.random() < 0.5
     try:
         have_relay(loop)
         loop.set(**DEFAULTS)
-        loop.rig.until(publisher.get_subscription_count, "the relay")
-        loop.rig.run_for(0.05)
+        if not late:
+            speak()
         loop.tune()
         wait_for_a_moment(loop, random)
+        if late:
+            speak()
         stuck, began = True, time.monotonic()
         taken = until_safe(loop, began)
         loop.check_the_end("the actuator does not follow")
         loop.check_that_it_stays()
     finally:
-        loop.rig.node.destroy_timer(timer)
-        loop.rig.node.destroy_publisher(publisher)
+        node.destroy_timer(timer)
+        for end in ends:
+            node.destroy_publisher(end)
     loop.rig.run_for(0.9)
     return taken
 
