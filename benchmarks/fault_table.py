@@ -37,6 +37,8 @@ from loop_rig import Rig
 from ros_domain import free_domain
 
 RUNS = 200
+# For so long what an ended process has said may be on its way [s].
+_LAST_WORDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,8 @@ def work(names: list[str], runs: int, deadline: float) -> list[Run]:
                     if loop.process is not None:
                         loop.process.end()
                         loop.process = None
+                        # What it said at its end is not of the next one.
+                        loop.rig.run_for(_LAST_WORDS)
                 else:
                     found.append(Run(name, taken))
     return found
