@@ -172,6 +172,7 @@ class Oscillation:
         self._is_high = self._relay.is_high
         floor = max(self._hysteresis, abs(y - self._setpoint), 3.0 * self._rest.noise_std)
         self._watch = RunawayWatch(floor)
+        self.cycle_start.clear()
         self._on_the_way.clear()
         self._switched_at.clear()
         self._switches_before = self.switches
@@ -243,7 +244,6 @@ class Oscillation:
         noise = self._noise_alone(first, last) if time >= _STAYS * self._response_time else ""
         if noise and self._levels.can_grow:
             self._levels.grow()
-            self.cycle_start.clear()
             self._begin()
         elif noise:
             self._end(Outcome.FAILED, noise)
@@ -354,12 +354,10 @@ class Oscillation:
                 f"not come back; give process_gain_sign to spare the process that"
             )
             self.sign = -self.sign
-            self.cycle_start.clear()
             self._begin()
             return
         if self._levels.can_grow:
             self._levels.grow()
-            self.cycle_start.clear()
             self._begin()
             return
         if follows and self._shifts < _MOST_SHIFTS and moved:

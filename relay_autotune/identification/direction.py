@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from relay_autotune.identification.fit import structures
 from relay_autotune.identification.fit.fit_covariance import NEGLIGIBLE
 from relay_autotune.identification.fit.lags import FOPDT
-from relay_autotune.identification.fit.residuals import autocorrelation
+from relay_autotune.identification.fit.residuals import worth
 from relay_autotune.identification.fit.separable import (
     Problem,
     State,
     information_criterion,
     problem_of,
 )
-from relay_autotune.identification.fit.starts import Starts, refine_best, start_fopdt
+from relay_autotune.identification.fit.starts import Starts, refine_best, start_fopdt, two_lags
 from relay_autotune.identification.result import Identification
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Input, PiecewiseConstant, Record
@@ -64,7 +64,7 @@ def speaks_for_other(
     drive = record.drive()
     residual = (record.measurement - found.fitted)[np.isfinite(found.fitted)]
     moved, left_out = _moved_beside(found, record, drive), residual.size < len(record)
-    if not (moved or left_out or beside or _is_correlated(residual)):
+    if not (moved or left_out or beside or worth(residual, _CORRELATED) < 1.0):
         return None
     sign, scale = found.model.process_sign, float(np.ptp(record.measurement))
     y = (record.measurement - record.measurement[0]) / scale
@@ -84,12 +84,11 @@ def speaks_for_other(
         inverse, key=lambda f: information_criterion(f[1].cost, n, f[1].parameters, floor)
     )
     # Both by what the samples are worth to the other one.
-    rho = max(float(autocorrelation(state.residual, 1)[0]), 0.0)
-    worth = max((1.0 - rho) / (1.0 + rho), 1.0 / n)
+    each = worth(state.residual)
     parameters = len(found.parameters) + 1 + beside + moved + left_out
     left = n * float(np.mean(residual**2)) / scale**2
-    told = information_criterion(left, n, parameters, floor, worth)
-    other = information_criterion(state.cost, n, state.parameters, floor, worth)
+    told = information_criterion(left, n, parameters, floor, each)
+    other = information_criterion(state.cost, n, state.parameters, floor, each)
     return model if other < told + _CLEAR else None
 
 
@@ -117,13 +116,6 @@ def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:
     return not float(np.ptp(rest)) <= _BESIDE * float(np.ptp(record.measurement))
 
 
-def _is_correlated(residual: FloatArray) -> bool:
-    if not np.any(residual):
-        return False
-    rho = float(autocorrelation(residual, 1)[0])
-    return rho > _CORRELATED / math.sqrt(residual.size)
-
-
 def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, State]]:
     """Fit what answers the other way at first; with other structures no oscillation stays.
 
@@ -131,20 +123,17 @@ def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, State]
     """
     first = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
     starts = Starts(problem, first)
-    fast, dead_time = math.log(starts.tau), starts.dead_time
-    second = [
-        np.array((fast + 0.5 * math.log(n), math.log(0.5 * (n + 1.0) / math.sqrt(n)), dead_time))
-        for n in _SLOWER
-    ]
+    fast, dead_time = starts.tau, starts.dead_time
     tried = (
-        (structures.SOPDT_ZERO, second),
-        (structures.INTEGRATOR_INVERSE, [np.array((fast, dead_time))]),
+        (structures.SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
+        (structures.INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
     )
     found = []
     for structure, thetas in tried:
         plain = replace(problem, structure=structure)
         state = refine_best(plain, thetas, tolerance=_TRIAL)
         reading = structure.read(state.theta, state.coefficients)
-        if reading is not None and np.all(np.isfinite(reading.values)) and reading.values[0]:
-            found.append((reading.build(reading.values), state))
+        model = None if reading is None else reading.model
+        if model is not None:
+            found.append((model, state))
     return found

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from virtual_tune import tuned
 
 from relay_autotune.autotune import analyse
 from relay_autotune.identification import identify
 from relay_autotune.identification.direction import speaks_for_other
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.relay import ExperimentParameters
 
 SECOND_ORDER = TransferFunction.from_structure(
     "sopdt_zero", gain=0.38, time_constants=[1.3, 0.32], zeros=[-1.2], dead_time=0.09
@@ -25,13 +25,8 @@ INTEGRATOR = TransferFunction.from_structure(
 
 
 def run(model, *, sign, period, **acting):
-    plant = VirtualProcess(model, disturbances=Disturbances(**acting), seed=11)
-    tune = RelayExperiment(ExperimentParameters(amplitude=1.0, process_gain_sign=sign), 0.0)
-    for k in range(20_000):
-        plant.command(tune.step(k * period, plant.measure(k * period)))
-        if tune.finished:
-            break
-    return tune
+    parameters = ExperimentParameters(amplitude=1.0, process_gain_sign=sign)
+    return tuned(model, parameters, period=period, seed=11, **acting)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from virtual_tune import tuned
 
 from relay_autotune.autotune import analyse
 from relay_autotune.disturbance import with_its_load
@@ -14,9 +15,8 @@ from relay_autotune.identification import Known, identify
 from relay_autotune.load import LoadStep, identify_with_load
 from relay_autotune.models import TransferFunction
 from relay_autotune.record import PiecewiseConstant
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.relay import ExperimentParameters
 from relay_autotune.ultimate import ultimate_point
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 FIRST_ORDER = TransferFunction.from_structure(
     "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0
@@ -28,14 +28,8 @@ PERIOD = 0.2
 
 
 def run(model, *, load_time, load_size, noise_std, seed):
-    acting = Disturbances(noise_std=noise_std, load_time=load_time, load_size=load_size)
-    plant = VirtualProcess(model, disturbances=acting, seed=seed)
-    tune = RelayExperiment(ExperimentParameters(amplitude=1.0), 0.0)
-    for k in range(20_000):
-        plant.command(tune.step(k * PERIOD, plant.measure(k * PERIOD)))
-        if tune.finished:
-            break
-    return tune
+    acting = {"load_time": load_time, "load_size": load_size, "noise_std": noise_std}
+    return tuned(model, ExperimentParameters(amplitude=1.0), period=PERIOD, seed=seed, **acting)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,22 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     return np.asarray(products[1:] / products[0])
 
 
+def worth(residual: FloatArray, errors: float = 0.0) -> float:
+    """Return how many independent samples each of correlated ones is worth, up to 1.
+
+    With a correlation rho of neighbours, n samples tell no more than ``n (1 - rho)/(1 + rho)``
+    independent ones.
+
+    :param residual: shape (n,), in the order of time.
+    :param errors: standard errors up to which a correlation counts as none.
+    """
+    n = residual.size
+    rho = float(autocorrelation(residual, 1)[0])
+    if rho <= errors / math.sqrt(n):
+        return 1.0
+    return max((1.0 - rho) / (1.0 + rho), 1.0 / n)
+
+
 def _products(x: FloatArray, lags: int) -> FloatArray:
     """Return ``sum_t x_i(t + lag) x_j(t)`` for lags 0 to ``lags``, shape (p, p, lags + 1)."""
     # By Fourier transforms, padded so that the ends do not meet: a million samples take no

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from relay_autotune.identification.fit import structures as known_structures
 from relay_autotune.identification.fit.lags import FOPDT
 from relay_autotune.identification.fit.plausibility import is_unseen
-from relay_autotune.identification.fit.residuals import autocorrelation
+from relay_autotune.identification.fit.residuals import worth
 from relay_autotune.identification.fit.separable import (
     Problem,
     State,
@@ -127,11 +127,9 @@ class Selection:
         if reading is None and structure.name == "three_lags":
             problem = replace(problem, structure=known_structures.LAG_COMPLEX)
             reading = problem.structure.read(state.theta, state.coefficients)
-        if reading is None or not bool(np.all(np.isfinite(reading.values))):
+        model = None if reading is None else reading.model
+        if reading is None or model is None:
             return None
-        if reading.values[0] == 0.0:
-            return None
-        model = reading.build(reading.values)
         if self._sign and model.process_sign != self._sign:
             return None
         shortest, _ = time_scales(self._problem)
@@ -237,21 +235,19 @@ class Selection:
     def _weighed(self, found: list[Candidate]) -> list[Candidate]:
         """Return the candidates by what their samples are worth, the best first.
 
-        Where even the best residual is correlated, by jitter or by what no structure holds, n
-        samples tell no more than ``n (1 - rho)/(1 + rho)`` independent ones.
+        Where even the best residual is correlated, it is by jitter or by what no structure holds.
         """
         if not found or found[0].state.cost <= self._floor:
             return found
         n = found[0].problem.time.size
-        rho = float(autocorrelation(found[0].state.residual, 1)[0])
-        if rho <= _CORRELATED / math.sqrt(n):
+        each = worth(found[0].state.residual, _CORRELATED)
+        if each == 1.0:
             return found
-        worth = max((1.0 - rho) / (1.0 + rho), 1.0 / n)
         weighed = [
             replace(
                 c,
                 criterion=information_criterion(
-                    c.state.cost, n, c.state.parameters, self._floor, worth
+                    c.state.cost, n, c.state.parameters, self._floor, each
                 ),
             )
             for c in found

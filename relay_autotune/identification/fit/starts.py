@@ -39,6 +39,18 @@ _SHARES = (
 )
 
 
+def two_lags(large: float, small: float, dead_time: float) -> FloatArray:
+    """Return theta of a second order with two lags, which are kept apart.
+
+    :param large: time constant [s].
+    :param small: the other one [s].
+    :param dead_time: [s].
+    """
+    pair = math.sqrt(large * small)
+    ratio = max((large + small) / (2.0 * pair), 1.05)
+    return np.array((math.log(pair), math.log(ratio), dead_time))
+
+
 def changes_within(u: Input, time: FloatArray) -> FloatArray:
     """Return when an input changes within samples, so that one of them follows [s].
 
@@ -241,10 +253,8 @@ class Starts:
         """Return starts of a second order: overdamped, critical, underdamped."""
         tau, dead_time = self.lag_n(2)
         small = max(0.3 * self.dead_time, self._least)
-        pair = math.sqrt(self.tau * small)
-        ratio = max((self.tau + small) / (2.0 * pair), 1.05)
         return [
-            np.array((math.log(pair), math.log(ratio), max(self.dead_time - small, self._least))),
+            two_lags(self.tau, small, max(self.dead_time - small, self._least)),
             np.array((tau, math.log(0.9), dead_time)),
             np.array((tau, math.log(0.4), dead_time)),
         ]

@@ -42,6 +42,13 @@ class Reading:
     values: FloatArray
     build: Build
 
+    @property
+    def model(self) -> TransferFunction | None:
+        """The transfer function; None where a value is not finite, or the gain zero."""
+        if not np.all(np.isfinite(self.values)) or self.values[0] == 0.0:
+            return None
+        return self.build(self.values)
+
 
 @dataclass(frozen=True)
 class RationalStructure:

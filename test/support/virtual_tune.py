@@ -1,0 +1,34 @@
+"""A relay experiment on a simulated process, without ROS."""
+
+from __future__ import annotations
+
+from relay_autotune.models import TransferFunction
+from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.virtual_process import Disturbances, VirtualProcess
+
+SAMPLES = 20_000
+
+
+def tuned(
+    model: TransferFunction,
+    parameters: ExperimentParameters,
+    *,
+    period: float,
+    seed: int,
+    **acting: float,
+) -> RelayExperiment:
+    """Run an experiment about baseline 0 to its end, or for so many samples.
+
+    :param model: the process.
+    :param parameters: of the experiment.
+    :param period: of the samples [s].
+    :param seed: of the sensor's noise.
+    :param acting: disturbances.
+    """
+    plant = VirtualProcess(model, disturbances=Disturbances(**acting), seed=seed)
+    tune = RelayExperiment(parameters, 0.0)
+    for k in range(SAMPLES):
+        plant.command(tune.step(k * period, plant.measure(k * period)))
+        if tune.finished:
+            break
+    return tune
