@@ -89,7 +89,7 @@ def after_choice(process: Process, records: int) -> tuple[int, ...]:
     for seed in range(records):
         model = identify(process.record(RATIO, seed))
         point = (model.ultimate_gain, model.ultimate_frequency)
-        alone = ultimate_std(model.build, model.values, model.covariance, *point)
+        alone = ultimate_std(model, *point)
         averaged = (model.ultimate_gain_std, model.ultimate_frequency_std)
         errors = np.abs(np.array((point[0] - truth.gain, point[1] - truth.frequency) * 2))
         found += errors <= NORMAL_95 * np.array((*alone, *averaged))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
+from relay_autotune.identification.intervals import Uncertain
 from relay_autotune.identification.intervals import is_logarithmic as is_logarithmic
 from relay_autotune.models import TransferFunction
 from relay_autotune.ultimate import ultimate_point
@@ -195,14 +196,9 @@ def with_uncertainty(
     wide = std * quantile > DETERMINED * np.abs(values)
     undetermined = tuple(n for n, w in zip(parameters, wide, strict=True) if w)
     point = ultimate_point(model)
-    gain = frequency = gain_std = frequency_std = math.nan
     if point is None:
         warnings = (*warnings, "the model has no ultimate point: no gain makes it oscillate")
-    else:
-        gain, frequency = point.gain, point.frequency
-        if covariance is not None:
-            gain_std, frequency_std = ultimate_std(build, values, covariance, gain, frequency)
-    return Identification(
+    identified = Identification(
         method,
         model,
         build,
@@ -211,47 +207,46 @@ def with_uncertainty(
         cov,
         low,
         high,
-        gain,
-        gain_std,
-        frequency,
-        frequency_std,
-        fit or FitReport(),
-        warnings,
-        undetermined,
-        np.empty(0) if fitted is None else fitted,
+        ultimate_gain=math.nan if point is None else point.gain,
+        ultimate_frequency=math.nan if point is None else point.frequency,
+        fit=fit or FitReport(),
+        warnings=warnings,
+        undetermined=undetermined,
+        fitted=np.empty(0) if fitted is None else fitted,
     )
+    if point is None or covariance is None:
+        return identified
+    gain_std, frequency_std = ultimate_std(identified, point.gain, point.frequency)
+    return replace(identified, ultimate_gain_std=gain_std, ultimate_frequency_std=frequency_std)
 
 
-def ultimate_std(
-    build: Callable[[FloatArray], TransferFunction],
-    values: FloatArray,
-    covariance: FloatArray,
-    gain: float,
-    frequency: float,
-) -> tuple[float, float]:
+def ultimate_std(found: Uncertain, gain: float, frequency: float) -> tuple[float, float]:
     """Return the standard deviations of K_u and w_u to first order; see with_uncertainty.
 
-    :param build: the model as a function of the values.
-    :param values: shape (p,).
-    :param covariance: of the values, shape (p, p).
-    :param gain: K_u [u/y].
-    :param frequency: w_u [rad/s].
+    :param found: a model with the covariance of its values.
+    :param gain: its K_u [u/y].
+    :param frequency: its w_u [rad/s].
     """
 
     def log_response(x: FloatArray, w: float) -> complex:
         # At the ultimate point -K_u G is 1, so that its logarithm has no branch nearby.
-        return complex(np.log(-gain * build(x)(1j * w)))
+        return complex(np.log(-gain * found.build(x)(1j * w)))
 
     step = 1e-6
+    values = found.values
     by_frequency = (
         log_response(values, frequency * (1.0 + step))
         - log_response(values, frequency * (1.0 - step))
     ) / (2.0 * step * frequency)
     gradient_gain, gradient_frequency = [], []
-    for i, value in enumerate(values):
-        h = step * (abs(value) or 1.0 / frequency)
+    for i, (name, value) in enumerate(zip(found.parameters, values, strict=True)):
+        # A dead time or a zero of next to nothing still acts by its part of the period.
+        least = 0.0 if is_logarithmic(name) else 1.0 / frequency
+        size = max(abs(value), least) or 1.0 / frequency
         up, down = values.copy(), values.copy()
-        up[i], down[i] = value + h, max(value - h, 0.0) if value >= 0.0 else value - h
+        up[i], down[i] = value + step * size, value - step * size
+        if name == "dead_time":
+            down[i] = max(down[i], 0.0)
         change = (log_response(up, frequency) - log_response(down, frequency)) / (up[i] - down[i])
         dw = -change.imag / by_frequency.imag
         gradient_frequency.append(dw)
@@ -259,6 +254,6 @@ def ultimate_std(
 
     def deviation(gradient: list[float]) -> float:
         g = np.array(gradient)
-        return math.sqrt(max(float(g @ covariance @ g), 0.0))
+        return math.sqrt(max(float(g @ found.covariance @ g), 0.0))
 
     return deviation(gradient_gain), deviation(gradient_frequency)

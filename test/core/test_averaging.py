@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from relay_autotune.identification.fit.averaging import averaged_point
-from relay_autotune.identification.result import Rival, with_uncertainty
+from relay_autotune.identification.fit.fit_covariance import Fit, Noise, covariance_of_values
+from relay_autotune.identification.fit.separable import evaluate, problem_of
+from relay_autotune.identification.fit.structures import SOPDT, SOPDT_ZERO, RationalStructure
+from relay_autotune.identification.result import Identification, Rival, with_uncertainty
 from relay_autotune.models import TransferFunction
+from relay_autotune.record import RelaySettings
+from relay_autotune.simulation import simulate_relay
 
 # 2 s of lag and 2 s of dead time, each gain and constant known to 1 %.
 _VALUES = np.array([1.0, 2.0, 2.0])
@@ -59,3 +64,42 @@ def test_a_lag_too_small_to_be_seen_leaves_the_interval_as_it_is(std):
     gain_std, frequency_std = averaged_point(_FOUND, 0.7, [_second_order(1e-3, std)])
     assert gain_std == pytest.approx(_FOUND.ultimate_gain_std, rel=0.02)
     assert frequency_std == pytest.approx(_FOUND.ultimate_frequency_std, rel=0.02)
+
+
+def _fit_of(structure: RationalStructure, theta: np.ndarray, noise: float) -> Identification:
+    """Return two lags of 3 s and 1 s of dead time as a structure has them at theta."""
+    process, relay = TransferFunction.sopdt(2.0, (3.0, 3.0), 1.0), RelaySettings(0.0, 0.0, 1.0)
+    end = simulate_relay(process, relay, cycles=5).command.times[-1]
+    run = simulate_relay(process, relay, cycles=5, time=np.linspace(0.0, end, 800))
+    assert run.command is not None
+    error = noise * np.random.default_rng(4).standard_normal(run.time.size)
+    problem = problem_of([(run.time, run.measurement + error, run.command)], structure)
+    state = evaluate(problem, theta)
+    reading = structure.read(state.theta, state.coefficients)
+    assert reading is not None
+    covariance = covariance_of_values(problem, state, Fit(problem, state, (), 1.0), Noise(True))
+    return with_uncertainty(
+        "waveform", reading.build, reading.parameters, reading.values, covariance
+    )
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-6, 1e-9])
+def test_what_data_cannot_tell_apart_leaves_open_no_more_together(noise):
+    # A zero of next to nothing is the same as less dead time: each of the two is open, hardly
+    # what they do together.
+    theta = np.array((math.log(3.0), 0.0, 1.0))
+    plain = _fit_of(SOPDT, theta, noise)
+    found = _fit_of(SOPDT_ZERO, theta, noise)
+    i, j = (found.parameters.index(name) for name in ("zero", "dead_time"))
+    assert abs(found.values[i]) < 10.0 * noise
+    assert found.std[i] > 10.0 * noise
+    assert found.std[j] == pytest.approx(found.std[i], rel=0.05)
+    along = np.zeros(len(found.parameters))
+    along[i] = along[j] = 1.0
+    shared = math.sqrt(along @ found.covariance @ along)
+    assert math.isfinite(shared)
+    assert np.allclose(found.covariance, found.covariance.T, rtol=1e-12)
+    np.linalg.cholesky(found.covariance)
+    assert plain.ultimate_gain_std > 0.0
+    rounding = 1e-6
+    assert found.ultimate_gain_std < 1.5 * plain.ultimate_gain_std + rounding

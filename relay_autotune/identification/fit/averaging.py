@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +47,8 @@ def averaged_point(
         point = point_of(rival.model) if rival.parameters else (math.nan, math.nan)
         if not math.isfinite(point[0]) or point[0] * own[0] < 0.0:
             continue
-        covariance = _within_reach(rival, point[1])
-        theirs = ultimate_std(rival.build, rival.values, covariance, *point)
+        limited = replace(rival, covariance=_within_reach(rival, point[1]))
+        theirs = ultimate_std(limited, *point)
         if not all(math.isfinite(s) for s in theirs):
             continue
         total += rival.support

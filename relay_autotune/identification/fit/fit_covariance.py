@@ -91,46 +91,44 @@ def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise)
     :param fit: where scale and loss are told.
     :param noise: what the residual is like.
     """
-    scale = fit.scale
-    gradient = _gradient(problem, state, scale)
+    gradient = _gradient(problem, state, fit.scale)
     with np.errstate(over="ignore", invalid="ignore"):
-        inner = _covariance(problem, state, fit, noise)
-        covariance = np.asarray(gradient @ inner @ gradient.T)
-        # Differences of large numbers leave a variance of rounding, on either side of zero.
-        rounding = _EPSILON * np.diag(np.abs(gradient) @ np.abs(inner) @ np.abs(gradient).T)
+        root = gradient @ _root(problem, state, fit, noise)
+        covariance = root @ root.T
     if not np.all(np.isfinite(covariance)):
         return np.full_like(covariance, math.nan)
-    np.fill_diagonal(covariance, np.maximum(np.diag(covariance), rounding))
-    return covariance
+    return np.asarray(covariance)
 
 
-def _covariance(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
-    """Return the covariance of all linear coefficients and theta, in this order.
+def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return B of the covariance B B' of all linear coefficients and theta, in this order.
 
-    Of least squares it is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
+    Of least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
     ``J r`` between two inverses. Of a robust loss r is its derivative, over the mean of its
-    second one (Huber 1981).
+    second one (Huber 1981). With J = Q R the inverses are those of R: where two parameters can
+    hardly be told apart, J'J keeps half of the digits that it takes to tell what both together
+    leave open.
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)
     size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
     size[size == 0.0] = 1.0
-    inverse = np.linalg.pinv((jacobian @ jacobian.T) / np.outer(size, size), rcond=1e-15)
-    inverse = inverse / np.outer(size, size)
+    q, r = np.linalg.qr((jacobian / size[:, None]).T)
+    left, singular, right = np.linalg.svd(r, full_matrices=False)
+    # What has no effect beyond rounding is as uncertain as that tells, not certain.
+    singular = np.maximum(singular, _EPSILON * n * singular[0])
+    inverse = (right.T / singular) @ left.T / size[:, None]
     degrees = max(n - state.parameters, 1)
-    if noise.coloured:
-        meat = covariance_meat(jacobian * scores, scores) * (n / degrees)
-        covariance = inverse @ meat @ inverse
-        white = inverse * (float(scores @ scores) / degrees)
-        # Each of the two reasons for fewer independent samples may hold; the larger one counts.
-        larger = np.sqrt(
-            np.diag(white) * noise.inflation / np.maximum(np.diag(covariance), 1e-300)
-        )
-        factor = np.maximum(larger, 1.0)
-        covariance = covariance * np.outer(factor, factor)
-    else:
-        covariance = inverse * (float(scores @ scores) / degrees * noise.inflation)
-    return np.asarray(covariance / slope**2)
+    if not noise.coloured:
+        variance = float(scores @ scores) / degrees * noise.inflation
+        return np.asarray(inverse * math.sqrt(variance) / slope)
+    meat = covariance_meat(q.T * scores, scores) * (n / degrees)
+    size_of, axes = np.linalg.eigh(meat)
+    root = inverse @ (axes * np.sqrt(np.maximum(size_of, 0.0)))
+    white = np.sum(inverse**2, axis=1) * (float(scores @ scores) / degrees)
+    # Each of the two reasons for fewer independent samples may hold; the larger one counts.
+    larger = np.sqrt(white * noise.inflation / np.maximum(np.sum(root**2, axis=1), 1e-300))
+    return np.asarray(root * np.maximum(larger, 1.0)[:, None] / slope)
 
 
 def _scores(problem: Problem, state: State, fit: Fit) -> tuple[FloatArray, FloatArray, float]:
