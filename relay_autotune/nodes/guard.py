@@ -28,19 +28,21 @@ class FollowWatch:
 
     The fault is a position that is further than the tolerance from the command for longer than
     the timeout; or, where the relay switches faster than that, three of the last six stays at a
-    level in which the position never came near it.
+    level in which the position never came near it, while it has not followed a switch for as long:
+    what a busy machine tells late is no fault of the actuator.
 
-    :param tolerance: distance that counts as there [u].
+    :param tolerance: tells the distance that counts as there [u], asked at each position.
     :param timeout: longest time that the actuator may take [s].
     """
 
-    def __init__(self, tolerance: float, timeout: float) -> None:
+    def __init__(self, tolerance: Callable[[], float], timeout: float) -> None:
         self._tolerance = tolerance
         self._timeout = timeout
         self._command = math.nan
         self._since = -math.inf
         self._came = True
         self._stays: deque[bool] = deque(maxlen=_STAYS)
+        self._followed = math.nan
 
     def add(self, now: float, command: float, position: float) -> bool:
         """Take a position; return True if the actuator does not follow.
@@ -50,12 +52,19 @@ class FollowWatch:
         :param position: where it says it is [u].
         """
         if command != self._command:
+            if math.isnan(self._followed):
+                self._followed = now
             self._stays.append(self._came)
             self._command, self._since, self._came = command, now, False
-        if abs(position - command) <= self._tolerance:
+        if abs(position - command) <= self._tolerance():
+            if not self._came and self._stays[-1]:
+                self._followed = now
             self._came, self._since = True, now
             return False
-        return now - self._since > self._timeout or self._stays.count(False) >= _MISSED
+        if now - self._since > self._timeout:
+            return True
+        late = now - self._followed > self._timeout
+        return late and self._stays.count(False) >= _MISSED
 
 
 class Guard:

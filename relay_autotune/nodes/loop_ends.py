@@ -171,9 +171,17 @@ class LoopEnds:
         self._guard.begin(checks)
         self._hold.publish(Bool(data=self._ends.setpoint is None))
 
-    def _tolerance(self, experiment: RelayExperiment) -> float:
-        given = float(self._value("feedback_tolerance"))
-        return given or 0.5 * experiment.parameters.amplitude or math.inf
+    def _tolerance(self, experiment: RelayExperiment) -> Callable[[], float]:
+        """Return what tells how far the actuator may be from the command [u]."""
+        given = float(self._value("feedback_tolerance")) or 0.5 * experiment.parameters.amplitude
+
+        def tolerance() -> float:
+            # An amplitude that is still found may be too small for a valve that sticks, and
+            # grows therefore; the first cycle that counts is of the one that was found.
+            settings = experiment.settings if experiment.cycle_count else None
+            return math.inf if settings is None else 0.5 * settings.amplitude
+
+        return (lambda: given) if given else tolerance
 
     def give_back(self, experiment: RelayExperiment, command: float) -> None:
         """Give the command back after a tune, without a bump unless it hurries.

@@ -36,6 +36,9 @@ sys.exit(relay.main())
 Undo = Callable[[], object]
 Cause = Callable[[Loop, Random], "Undo | None"]
 
+# An amplitude that finds itself.
+FINDS = {"amplitude": 0.0, "command_min": 0.0, "command_max": 10.0}
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -225,7 +228,10 @@ def abort(loop: Loop, _: Random) -> None:
 
 
 def actuator(loop: Loop, random: Random) -> float:
-    """Tell the position of an actuator, which then stays where it is."""
+    """Tell the position of an actuator, which then stays where it is.
+
+    The amplitude is given or finds itself, and the position may first be told within the tune.
+    """
     stuck, node = False, loop.rig.node
     ends: list[Any] = []
 
@@ -240,15 +246,15 @@ def actuator(loop: Loop, random: Random) -> float:
         loop.rig.run_for(0.05)
 
     timer = node.create_timer(0.01, feed)
-    # It may speak for the first time in the midst of the tune.
-    late = random.random() < 0.5
+    late, finds = random.random() < 0.5, random.random() < 0.5
     try:
         have_relay(loop)
-        loop.set(**DEFAULTS)
+        loop.set(**{**DEFAULTS, **(FINDS if finds else {})})
         if not late:
             speak()
         loop.tune()
         wait_for_a_moment(loop, random)
+        loop.rig.until(lambda: loop.cycles, "a whole cycle")
         if late:
             speak()
         stuck, began = True, time.monotonic()
