@@ -58,15 +58,12 @@ def _model_alone(_: FloatArray) -> TransferFunction:
 class Rival:
     """Another structure that the data do not rule out.
 
-    It has what an :class:`Identification` has to draw models from, so that an ensemble can
-    take the structures by their support.
-
     :param model: its best fit.
     :param support: its weight among all structures tried, 0 to 1.
     :param build: the transfer function for any values of the parameters.
     :param parameters: names of the structure's parameters; empty: only the model is known.
     :param values: their values, shape (p,).
-    :param covariance: of the values, shape (p, p).
+    :param root: B of their covariance B B', shape (p, k).
     """
 
     model: TransferFunction
@@ -74,7 +71,12 @@ class Rival:
     build: Callable[[FloatArray], TransferFunction] = _model_alone
     parameters: tuple[str, ...] = ()
     values: FloatArray = field(default_factory=lambda: np.empty(0))
-    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    root: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the values, shape (p, p)."""
+        return self.root @ self.root.T
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.identification.combinations import point_of
 from relay_autotune.identification.intervals import is_logarithmic
 from relay_autotune.identification.result import Identification, Rival, ultimate_std
-
-FloatArray = NDArray[np.float64]
 
 # How far a value of a rival may stray for the first order to stand for it: of a logarithm, and
 # of a dead time or a zero, in radians at the ultimate frequency.
@@ -47,8 +44,9 @@ def averaged_point(
         point = point_of(rival.model) if rival.parameters else (math.nan, math.nan)
         if not math.isfinite(point[0]) or point[0] * own[0] < 0.0:
             continue
-        limited = replace(rival, covariance=_within_reach(rival, point[1]))
-        theirs = ultimate_std(limited, *point)
+        if not np.all(np.isfinite(rival.root)):
+            continue
+        theirs = ultimate_std(_within_reach(rival, point[1]), *point)
         if not all(math.isfinite(s) for s in theirs):
             continue
         total += rival.support
@@ -59,14 +57,15 @@ def averaged_point(
     return math.sqrt(sums[0] / total), math.sqrt(sums[1] / total)
 
 
-def _within_reach(rival: Rival, frequency: float) -> FloatArray:
-    """Return the covariance of a rival's values as far as the first order goes.
+def _within_reach(rival: Rival, frequency: float) -> Rival:
+    """Return a rival with the covariance of its values as far as the first order goes.
 
     A lag or a zero far below the sampling period can hardly be told from dead time. To first
     order the two may then differ by more than the whole record, with a standard deviation S
     where the value is next to nothing; K_u, a curved function of both, would inherit that. A
     value is therefore taken to be known beforehand to within a limit L, many times what the data
-    leave of one that they show:  ``(S^-1 + L^-1)^-1 = L (S + L)^-1 S``.
+    leave of one that they show:  ``(S^-1 + L^-1)^-1 = L^1/2 U s^2/(1 + s^2) U' L^1/2`` with the
+    singular values s of the root of S over that of L.
 
     :param rival: with a covariance.
     :param frequency: w_u [rad/s].
@@ -77,6 +76,5 @@ def _within_reach(rival: Rival, frequency: float) -> FloatArray:
         for name, value in zip(rival.parameters, rival.values, strict=True)
     ]
     size = np.maximum(np.array(limits), 1e-12 * phase)
-    scaled = rival.covariance / np.outer(size, size)
-    kept = np.linalg.solve(scaled + np.eye(size.size), scaled)
-    return np.asarray(0.5 * (kept + kept.T) * np.outer(size, size))
+    axes, std, _ = np.linalg.svd(rival.root / size[:, None], full_matrices=False)
+    return replace(rival, root=size[:, None] * axes * (std / np.sqrt(1.0 + std**2)))

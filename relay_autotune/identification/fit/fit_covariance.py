@@ -91,13 +91,28 @@ def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise)
     :param fit: where scale and loss are told.
     :param noise: what the residual is like.
     """
-    gradient = _gradient(problem, state, fit.scale)
+    root = root_of_covariance(problem, state, fit, noise)
     with np.errstate(over="ignore", invalid="ignore"):
-        root = gradient @ _root(problem, state, fit, noise)
         covariance = root @ root.T
     if not np.all(np.isfinite(covariance)):
         return np.full_like(covariance, math.nan)
     return np.asarray(covariance)
+
+
+def root_of_covariance(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return B of the covariance B B' of the parameters of the field, shape (p, k).
+
+    It has twice the digits for what parameters leave open together that are hardly told apart.
+    Not finite: what is not determined is so large that numbers do not hold it.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    :param fit: where scale and loss are told.
+    :param noise: what the residual is like.
+    """
+    gradient = _gradient(problem, state, fit.scale)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(gradient @ _root(problem, state, fit, noise))
 
 
 def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
@@ -123,8 +138,8 @@ def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
         variance = float(scores @ scores) / degrees * noise.inflation
         return np.asarray(inverse * math.sqrt(variance) / slope)
     meat = covariance_meat(q.T * scores, scores) * (n / degrees)
-    size_of, axes = np.linalg.eigh(meat)
-    root = inverse @ (axes * np.sqrt(np.maximum(size_of, 0.0)))
+    variances, axes = np.linalg.eigh(meat)
+    root = inverse @ (axes * np.sqrt(np.maximum(variances, 0.0)))
     white = np.sum(inverse**2, axis=1) * (float(scores @ scores) / degrees)
     # Each of the two reasons for fewer independent samples may hold; the larger one counts.
     larger = np.sqrt(white * noise.inflation / np.maximum(np.sum(root**2, axis=1), 1e-300))

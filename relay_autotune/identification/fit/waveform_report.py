@@ -22,6 +22,7 @@ from relay_autotune.identification.fit.fit_covariance import (
     covariance_of_values,
     noise_of,
     raw_residual,
+    root_of_covariance,
 )
 from relay_autotune.identification.fit.residuals import ljung_box
 from relay_autotune.identification.fit.selection import Candidate
@@ -163,10 +164,10 @@ def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) ->
     model = reading.build(reading.values)
     if noise is None:
         return Rival(model, share)
-    covariance = covariance_of_values(problem, state, replace(fit, loss="squares"), noise)
+    root = root_of_covariance(problem, state, replace(fit, loss="squares"), noise)
     # It was fitted to some of the samples, where they are many.
-    covariance = covariance * (problem.time.size / fit.problem.time.size)
-    return Rival(model, share, reading.build, reading.parameters, reading.values, covariance)
+    root = root * math.sqrt(problem.time.size / fit.problem.time.size)
+    return Rival(model, share, reading.build, reading.parameters, reading.values, root)
 
 
 def _prediction(records: Sequence[Record], problem: Problem, state: State) -> float:
