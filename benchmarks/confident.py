@@ -9,10 +9,12 @@ on. Beside each length stands the least one: the time at which the Cramer-Rao bo
 whoever knows the structure and for the same commands, reaches what was asked.
 
 A target may be missed where that bound needs more than half of the classic time; the exit status
-is 1 if one is missed elsewhere. `--unknown-sign` lets each test find the sign of the gain first,
-which is then part of both lengths. `--of ms` ends the tests by the interval of the predicted Ms
-in place of that of K_u; the error is then that of the predicted Ms against the Ms of the gains on
-the process, and no target is set. `--jobs 2` takes two processes at a time.
+is 1 if one is missed elsewhere. 50 tests tell a median to a sixth of itself, so that the errors of
+the tests of all other processes together are told, too. `--unknown-sign` lets each test find the
+sign of the gain first, which is then part of both lengths. `--of ms` ends the tests by the
+interval of the predicted Ms in place of that of K_u; the error is then that of the predicted Ms
+against the Ms of the gains on the process, and no target is set. `--jobs 2` takes two processes
+at a time.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from processes import true_point
 from relay_autotune.autotune import analyse
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, Finding
 from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
+from relay_autotune.record import FloatArray, Record, RelaySettings
 from relay_autotune.relay import ExperimentParameters, RelayExperiment
 from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.simulation import exact_limit_cycle
@@ -207,10 +209,24 @@ class Bench:
         return least, float(found[round(MOST_TIME * _GRID) - 1])
 
 
-def _row(
-    case: Case, seeds: range, sought: str, unknown_sign: bool
-) -> tuple[tuple[object, ...], bool]:
-    """Return the row of a process, and whether its targets were missed though they need not be."""
+@dataclass(frozen=True)
+class Row:
+    """What came of a process.
+
+    :param cells: of the table.
+    :param fine: True: the targets were met.
+    :param can: True: the bound lets them be met.
+    :param errors: of what was sought, of each test.
+    """
+
+    cells: tuple[object, ...]
+    fine: bool
+    can: bool
+    errors: FloatArray
+
+
+def _row(case: Case, seeds: range, sought: str, unknown_sign: bool) -> Row:
+    """Return the row of a process."""
     # The pulse that finds the sign wants a process that comes back by itself.
     bench = Bench(case, 0 if unknown_sign and case.model.is_stable else case.model.process_sign)
     usual = bench.classic.time
@@ -223,7 +239,7 @@ def _row(
     most = case.most_error
     fine = share <= MOST_TIME and median <= most[0] and high <= most[1] and not unfinished
     can = bool(least <= MOST_TIME * usual)
-    row = (
+    cells = (
         case.title,
         case.source,
         bench.classic.cycles,
@@ -236,7 +252,7 @@ def _row(
         f"{100 * high:.2f}",
         "-" if sought != ULTIMATE_GAIN else "yes" if fine else "no" if can else "beyond the bound",
     )
-    return row, can and not fine and sought == ULTIMATE_GAIN
+    return Row(cells, fine, can, errors)
 
 
 def main() -> int:
@@ -257,13 +273,12 @@ def main() -> int:
             found = list(pool.map(one, cases))
     else:
         found = [one(case) for case in cases]
-    missed = sum(late for _, late in found)
     headings = (
         *("process", "from", "classic, cycles", "classic [s]"),
         *("confident, % of classic", "cycles", "bound, % of classic", "bound at half [%]"),
         *("error, median [%]", "95th percentile [%]", "targets met"),
     )
-    print(table(headings, [row for row, _ in found]))
+    print(table(headings, [row.cells for row in found]))
     wanted = (
         f"K_u asked to within {100 * ASKED:g} % ({100 * ASKED_OF_TINY:g} % with a tiny dead time)"
         if asked.of == ULTIMATE_GAIN
@@ -275,7 +290,17 @@ def main() -> int:
         f"{100 * MOST_ERROR[0]:g} % and {100 * MOST_ERROR[1]:g} % "
         f"({100 * MOST_ERROR_OF_TINY[1]:g} % at the 95th percentile with a tiny dead time)."
     )
-    return 1 if missed and not asked.quick else 0
+    if asked.of != ULTIMATE_GAIN:
+        return 0
+    within = [row for row in found if row.can]
+    errors = 100.0 * np.concatenate([row.errors for row in within]) if within else np.empty(0)
+    if errors.size:
+        print(
+            f"\nAll {errors.size} tests of the {len(within)} processes that the bound lets meet "
+            f"them: median {np.nanmedian(errors):.2f} %, 95th percentile "
+            f"{np.nanquantile(errors, 0.95):.2f} %."
+        )
+    return 0 if asked.quick or all(row.fine for row in within) else 1
 
 
 if __name__ == "__main__":
