@@ -100,7 +100,18 @@ class Loop:
     def verify(
         self, during: Callable[[], None] | None = None, **request: float
     ) -> tuple[int, Any]:
-        """Ask for a proof; once the set-point has moved, do something."""
+        """Ask for a proof of a loop at rest; once the set-point has moved, do something."""
+
+        def at_rest() -> tuple[int, Any] | None:
+            status, result = self.ask_for_proof(during, request)
+            # How long a loop takes to settle, a busy machine decides.
+            return None if "the loop is not at rest" in result.reason else (status, result)
+
+        return self.rig.until(at_rest, "a loop at rest")
+
+    def ask_for_proof(
+        self, during: Callable[[], None] | None, request: dict[str, float]
+    ) -> tuple[int, Any]:
         moved = len(self.setpoints)
         client = ActionClient(self.rig.node, Verify, "controller_node/verify")
         self.rig.until(client.server_is_ready, "the action")
@@ -109,7 +120,8 @@ class Loop:
         answer = sent.result().get_result_async()
         if during is not None:
             self.rig.until(lambda: len(self.setpoints) > moved or answer.done(), "the step")
-            during()
+            if len(self.setpoints) > moved:
+                during()
         self.rig.until(answer.done, "the result")
         client.destroy()
         return answer.result().status, answer.result().result
