@@ -22,9 +22,9 @@ from loop_rig import Rig  # noqa: E402
 from ros_domain import free_domain  # noqa: E402
 
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64  # noqa: E402
-from relay_autotune.models import TransferFunction  # noqa: E402
-from relay_autotune.record import PiecewiseConstant  # noqa: E402
-from relay_autotune.response import response  # noqa: E402
+from relay_autotune.process.response import response  # noqa: E402
+from relay_autotune.process.transfer_function import TransferFunction  # noqa: E402
+from relay_autotune.record.record import PiecewiseConstant  # noqa: E402
 
 GAIN, TIME_CONSTANT, DEAD_TIME = 1.65, 20.0, 10.0
 PERIOD = 0.2

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification import Identification, identify
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.simulation import Plant
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 
 _RATIOS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.3, 1.5, 2.0, 4.0, 6.0, 8.0, 10.0, 20.0, 50.0)
 _LONG = (100.0, 200.0, 500.0)

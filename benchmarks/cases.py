@@ -13,12 +13,12 @@ from relay_autotune import threads  # noqa: F401  before numpy
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import RelayRun, exact_limit_cycle, simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.process.response import response
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import RelayRun, exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
 

@@ -19,20 +19,20 @@ from relay_autotune import threads  # noqa: F401  before numpy
 import numpy as np
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.atv import (
+from relay_autotune.identification.methods.atv import (
     phase_of_lags,
     time_constant_from_magnitude,
     time_constant_from_phase,
     ultimate_estimate,
 )
-from relay_autotune.identification.chang1992 import (
+from relay_autotune.identification.methods.chang1992 import (
     time_constant_from_period,
     two_time_constants,
 )
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import Plant, exact_limit_cycle
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.process.simulation import Plant, exact_limit_cycle
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import RelaySettings
 
 EXAMPLE = TransferFunction.fopdt(1.65, 20.0, 10.0)
 # As the paper reads them off its chart; its amplitude of 0.26 lacks a zero.

@@ -12,7 +12,7 @@ from reference import take_turns
 # isort: split
 import numpy as np
 
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.search import Search

@@ -15,8 +15,8 @@ import numpy as np
 from cases import CASES
 
 from relay_autotune.identification import Known, identify
-from relay_autotune.record import Record
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.record.record import Record
 
 # Of structure and number of samples [ms].
 TARGETS = {

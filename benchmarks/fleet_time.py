@@ -19,9 +19,9 @@ import numpy as np
 from markdown import table, three
 
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
-from relay_autotune.response import response
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 
 BAGS, QUICK_BAGS = 1000, 1
 START = 1_790_000_000_000_000_000

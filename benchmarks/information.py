@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from processes import true_point
 
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record
-from relay_autotune.response import response
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
 

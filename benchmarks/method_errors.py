@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification, Known, identify, identify_jointly
-from relay_autotune.record import PiecewiseConstant, Record
-from relay_autotune.response import response
+from relay_autotune.process.response import response
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 FloatArray = NDArray[np.float64]
 

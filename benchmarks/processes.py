@@ -11,11 +11,11 @@ from relay_autotune import threads  # noqa: F401  before numpy
 # isort: split
 import numpy as np
 
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import RelayRun, exact_limit_cycle, simulate_relay
-from relay_autotune.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import RelayRun, exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 PER_CYCLE = 200
 

@@ -10,13 +10,18 @@ from relay_autotune import threads  # noqa: F401  before numpy
 # isort: split
 import numpy as np
 
-from relay_autotune.actuator import Actuator
 from relay_autotune.errors import ModelError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Cycle, Outcome, RelaySettings
-from relay_autotune.relay import ExperimentParameters, RelayExperiment, SafePolicy, State
-from relay_autotune.simulation import simulate_relay
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.experiment.experiment import (
+    ExperimentParameters,
+    RelayExperiment,
+    SafePolicy,
+    State,
+)
+from relay_autotune.process.actuator import Actuator
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.record import Cycle, Outcome, RelaySettings
 
 STRUCTURES = (
     *("fopdt",) * 4,

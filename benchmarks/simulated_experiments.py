@@ -29,12 +29,12 @@ from random_experiments import Experiment, with_delay
 from simulated_summary import summary
 
 import relay_autotune
-from relay_autotune.autotune import Analysis, analyse
+from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.identification import Known
-from relay_autotune.record import Outcome
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Outcome
 from relay_autotune.tuning import DesignOptions, Gains
-from relay_autotune.tuning.analysis import frequencies, is_stable, sensitivity_peaks
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.tuning.loop.analysis import frequencies, is_stable, sensitivity_peaks
 
 EXPERIMENTS = 10_000
 QUICK = 4

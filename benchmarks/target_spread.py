@@ -19,7 +19,7 @@ from markdown import table, three
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.process.simulation import simulate_relay
 
 FloatArray = NDArray[np.float64]
 

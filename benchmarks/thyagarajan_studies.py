@@ -21,21 +21,21 @@ from markdown import table, three
 from numpy.typing import NDArray
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.half_cycle import HalfCycle
 from relay_autotune.identification import Known, identify
-from relay_autotune.identification.cycle.shape import Shape, shape_of_half_cycle, shape_of_record
-from relay_autotune.identification.thyagarajan2003 import (
+from relay_autotune.identification.judgement.validation import integrated_error, validate
+from relay_autotune.identification.methods.thyagarajan2003 import (
     flat_fopdt,
     fopdt,
     higher_order,
     small_dead_time,
     unstable_fopdt,
 )
-from relay_autotune.identification.validation import integrated_error, validate
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.simulation import RelayRun, exact_limit_cycle, simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle, shape_of_record
+from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.simulation import RelayRun, exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
 Numbers = tuple[float, float, float]

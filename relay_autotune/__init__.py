@@ -18,36 +18,36 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from relay_autotune.autotune import Analysis, analyse
+    from relay_autotune.analysis import Analysis, analyse
     from relay_autotune.bag.records import read_records
     from relay_autotune.errors import RelayAutotuneError
-    from relay_autotune.experiment.relay_parameters import ExperimentParameters
+    from relay_autotune.exchange.python_control import to_control
+    from relay_autotune.experiment.experiment import RelayExperiment
+    from relay_autotune.experiment.parameters import ExperimentParameters
     from relay_autotune.identification import METHODS, Identification, Known, identify
-    from relay_autotune.models import STRUCTURES, TransferFunction
-    from relay_autotune.python_control import to_control
-    from relay_autotune.record import Outcome, PiecewiseConstant, Record, RelaySettings
-    from relay_autotune.relay import RelayExperiment
+    from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
+    from relay_autotune.process.ultimate import ultimate_point
+    from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+    from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
     from relay_autotune.report import draw, write_report
     from relay_autotune.tuning import RULES, Controller, Gains, tune
-    from relay_autotune.tuning.closed_loop import simulate_closed_loop
-    from relay_autotune.ultimate import ultimate_point
-    from relay_autotune.virtual_process import Disturbances, VirtualProcess
+    from relay_autotune.tuning.loop.closed_loop import simulate_closed_loop
 
 _HOMES = {
-    "autotune": ("Analysis", "analyse"),
+    "analysis": ("Analysis", "analyse"),
     "bag.records": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification": ("METHODS", "Identification", "Known", "identify"),
-    "models": ("STRUCTURES", "TransferFunction"),
-    "python_control": ("to_control",),
-    "record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
-    "relay": ("RelayExperiment",),
-    "experiment.relay_parameters": ("ExperimentParameters",),
+    "process.transfer_function": ("STRUCTURES", "TransferFunction"),
+    "exchange.python_control": ("to_control",),
+    "record.record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
+    "experiment.experiment": ("RelayExperiment",),
+    "experiment.parameters": ("ExperimentParameters",),
     "report": ("draw", "write_report"),
     "tuning": ("RULES", "Controller", "Gains", "tune"),
-    "tuning.closed_loop": ("simulate_closed_loop",),
-    "ultimate": ("ultimate_point",),
-    "virtual_process": ("Disturbances", "VirtualProcess"),
+    "tuning.loop.closed_loop": ("simulate_closed_loop",),
+    "process.ultimate": ("ultimate_point",),
+    "process.virtual_process": ("Disturbances", "VirtualProcess"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -18,7 +18,7 @@ from relay_autotune.bag.limits import MOST_STEPS
 from relay_autotune.bag.locate import Content, every_byte
 from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type
 from relay_autotune.errors import BagError
-from relay_autotune.record import IntArray
+from relay_autotune.record.record import IntArray
 
 _ENCAPSULATION = 4
 _UINT32 = Number("uint32", "u4")

@@ -11,7 +11,7 @@ import numpy as np
 
 from relay_autotune.bag.signals import Signal
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.record import FloatArray
+from relay_autotune.record.record import FloatArray
 
 # Times from here on are taken as seconds since 1970; no experiment lasts that long.
 EPOCH = 1.0e8

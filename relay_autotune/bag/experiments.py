@@ -10,13 +10,13 @@ import numpy as np
 from relay_autotune.bag.names import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, RecordError
-from relay_autotune.messages import (
+from relay_autotune.exchange.messages import (
     record_from_message,
     settings_from_message,
     stamp_nanoseconds,
     start_seconds,
 )
-from relay_autotune.record import IntArray, Outcome, Record
+from relay_autotune.record.record import IntArray, Outcome, Record
 
 _STAMP_ERROR_NS = 1000
 

@@ -12,8 +12,8 @@ from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
 from relay_autotune.bag.signals import Signal, cut, join
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.excitation import find_experiments
-from relay_autotune.record import Record
+from relay_autotune.record.excitation import find_experiments
+from relay_autotune.record.record import Record
 
 # Fewer are not taken apart.
 _FEWEST_SAMPLES = 12

@@ -17,7 +17,7 @@ from relay_autotune.bag.mcap_records import (
     DamageError,
     unsigned,
 )
-from relay_autotune.record import IntArray
+from relay_autotune.record.record import IntArray
 
 Content = bytes | memoryview
 

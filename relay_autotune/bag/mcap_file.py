@@ -28,7 +28,7 @@ from relay_autotune.bag.mcap_records import Channel, DamageError
 from relay_autotune.bag.mcap_scan import scan
 from relay_autotune.bag.mcap_summary import layout_by_summary
 from relay_autotune.bag.source import Source
-from relay_autotune.record import IntArray
+from relay_autotune.record.record import IntArray
 
 # Two records cannot begin nearer to each other than this.
 _SMALLEST_RECORD = 9

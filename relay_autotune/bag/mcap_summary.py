@@ -22,7 +22,7 @@ from relay_autotune.bag.mcap_records import (
     DamageError,
 )
 from relay_autotune.bag.source import MAGIC, Source, file_records, record_body
-from relay_autotune.record import IntArray
+from relay_autotune.record.record import IntArray
 
 # A chunk index up to its list of message indexes: times of the first and the last message, start
 # and length of the chunk, and the list's length.

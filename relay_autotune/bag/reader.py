@@ -15,7 +15,7 @@ from relay_autotune.bag.signals import join, window
 from relay_autotune.bag.timing import CLOCKS
 from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.record import Record
+from relay_autotune.record.record import Record
 
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
 _WHOLE = ([".mcap", ".zstd"], [".mcap", ".zst"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.record import Record
+from relay_autotune.record.record import Record
 
 
 def read_records(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from relay_autotune.bag.columns import Column
 from relay_autotune.bag.signals import Signal
 from relay_autotune.errors import BagError
-from relay_autotune.record import IntArray
+from relay_autotune.record.record import IntArray
 
 # Which time of a message counts; the first is the default.
 CLOCKS = ("publish", "log", "header")

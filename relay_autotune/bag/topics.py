@@ -20,7 +20,7 @@ from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Struct, message_type
 from relay_autotune.bag.timing import SignalReader, TimedSignal
 from relay_autotune.errors import BagError
-from relay_autotune.record import FloatArray, IntArray
+from relay_autotune.record.record import FloatArray, IntArray
 
 # Told of how far a file has been read: bytes done, bytes in all.
 Progress = Callable[[int, int], None]

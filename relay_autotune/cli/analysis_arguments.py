@@ -78,7 +78,7 @@ def jobs_of(
     :param with_table: whether results are wanted as the table for people.
     :raises SelectionError: if options contradict each other, or name what there is not.
     """
-    from relay_autotune.autotune import check_names
+    from relay_autotune.analysis import check_names
     from relay_autotune.identification import ONLY_JOINT
 
     try:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from relay_autotune.identification.atv import atv_from_numbers
-from relay_autotune.identification.chang_method import chang_from_numbers
-from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.li_method import li_from_numbers
+from relay_autotune.identification.methods.atv import atv_from_numbers
+from relay_autotune.identification.methods.chang_method import chang_from_numbers
+from relay_autotune.identification.methods.li_method import li_from_numbers
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 
 
 def identify_chang_chart(numbers: Mapping[str, float], known: Known) -> Identification:

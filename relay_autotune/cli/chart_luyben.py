@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.luyben_method import STRUCTURE, identify_step_numbers
+from relay_autotune.identification.methods.luyben_method import STRUCTURE, identify_step_numbers
 from relay_autotune.identification.result import Identification
 
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 
 from relay_autotune.errors import SelectionError
-from relay_autotune.identification.cycle.shape import Shape
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods.thyagarajan_method import identify_numbers
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.thyagarajan_method import identify_numbers
+from relay_autotune.identification.shown.shape import Shape
 
 
 def identify_thyagarajan_chart(numbers: Mapping[str, float], known: Known) -> Identification:

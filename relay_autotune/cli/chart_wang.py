@@ -9,14 +9,14 @@ import numpy as np
 
 from relay_autotune.errors import SelectionError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.identification.wang1997 import (
+from relay_autotune.identification.methods.wang1997 import (
     PARAMETERS,
     FopdtCycle,
     fopdt_from_biased,
     fopdt_with_gain,
 )
-from relay_autotune.models import TransferFunction
+from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.process.transfer_function import TransferFunction
 
 
 def identify_biased_chart(numbers: Mapping[str, float], known: Known) -> Identification:

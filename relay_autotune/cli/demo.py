@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
-from relay_autotune.autotune import Analysis, analyse
+from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.document import document, model_fields, to_json
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.models import TransferFunction
+from relay_autotune.exchange.document import document, model_fields, to_json
+from relay_autotune.exchange.text import digits, process_text
 from relay_autotune.nodes.domain import free_domain
-from relay_autotune.notation import digits, process_text
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import case_of
-from relay_autotune.ultimate import ultimate_point
 
 TRUTH = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PERIOD = 0.1

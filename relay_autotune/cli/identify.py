@@ -76,8 +76,8 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace) -> int:
     from relay_autotune.cli.chart import NUMBERS, identify_chart
     from relay_autotune.cli.table import identification_lines
-    from relay_autotune.document import identification_fields, to_json
     from relay_autotune.errors import ParameterError, SelectionError
+    from relay_autotune.exchange.document import identification_fields, to_json
     from relay_autotune.identification.known import Known
 
     numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}

@@ -17,7 +17,7 @@ from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.errors import SelectionError
 
 if TYPE_CHECKING:
-    from relay_autotune.autotune import Analysis
+    from relay_autotune.analysis import Analysis
 
 PROGRAM = "replay"
 
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     options = _parser().parse_args(arguments)
-    import relay_autotune.autotune  # noqa: F401  see guarded; --help need not wait for scipy
+    import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
 
     return guarded(PROGRAM, lambda: _run(options))
 

@@ -11,10 +11,10 @@ from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE
 from relay_autotune.errors import RelayAutotuneError, SelectionError
 
 if TYPE_CHECKING:
-    from relay_autotune.autotune import Analysis
+    from relay_autotune.analysis import Analysis
     from relay_autotune.cli.export import Target
     from relay_autotune.identification.known import Known
-    from relay_autotune.record import Record
+    from relay_autotune.record.record import Record
     from relay_autotune.tuning.task import DesignOptions
 
 Progress = Callable[[int, int], None]
@@ -113,7 +113,7 @@ def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tup
             recording = read_experiments(path, job.selection, progress)
             said += [f"{path}: {note}" for note in recording.notes]
             records += recording.experiments
-        from relay_autotune.autotune import analyse_jointly
+        from relay_autotune.analysis import analyse_jointly
 
         found = analyse_jointly(
             records, method=job.method, rule=job.rule, known=job.known, options=job.options
@@ -121,7 +121,7 @@ def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tup
         return (found,)
     recording = read_experiments(job.paths, job.selection, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
-    from relay_autotune.autotune import analyse
+    from relay_autotune.analysis import analyse
 
     return tuple(
         analyse(record, method=job.method, rule=job.rule, known=job.known, options=job.options)
@@ -152,7 +152,7 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
         from relay_autotune.cli.table import table
 
         return table(job.name, analyses)
-    from relay_autotune.document import document, to_json
+    from relay_autotune.exchange.document import document, to_json
 
     return to_json(document(job.name, analyses, error=error))
 

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     options = _parser().parse_args(arguments)
-    import relay_autotune.autotune  # noqa: F401  see guarded; --help need not wait for scipy
+    import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
 
     return guarded(PROGRAM, lambda: _run(options))
 

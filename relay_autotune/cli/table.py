@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.cycles import limit_cycle
-from relay_autotune.notation import date_text, digits, process_text, unit_of
-from relay_autotune.record import Outcome, Record
+from relay_autotune.exchange.text import date_text, digits, process_text, unit_of
+from relay_autotune.record.cycles import limit_cycle
+from relay_autotune.record.record import Outcome, Record
 
 if TYPE_CHECKING:
-    from relay_autotune.autotune import Analysis
+    from relay_autotune.analysis import Analysis
     from relay_autotune.identification import Identification
-    from relay_autotune.identification.validation import Validation
-    from relay_autotune.models import TransferFunction
+    from relay_autotune.identification.judgement.validation import Validation
+    from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import Gains
 
 _WIDTH = 99

@@ -18,7 +18,7 @@ from relay_autotune.cli.design_arguments import (
 from relay_autotune.errors import SelectionError, TuningError
 
 if TYPE_CHECKING:
-    from relay_autotune.models import TransferFunction
+    from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import DesignOptions, DesignTask, Gains, Performance
     from relay_autotune.tuning.compensators import Compensator
 
@@ -223,7 +223,7 @@ def _print_document(
     form: str,
     inside: Sequence[tuple[Compensator, Performance]] = (),
 ) -> None:
-    from relay_autotune.document import gains_fields, model_fields, number_fields, to_json
+    from relay_autotune.exchange.document import gains_fields, model_fields, number_fields, to_json
     from relay_autotune.tuning.forms import series_form
 
     found = []

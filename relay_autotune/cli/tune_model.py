@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from relay_autotune.errors import ModelError, SelectionError
-from relay_autotune.models import STRUCTURES, TransferFunction
+from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
 
 _FLAGS = (
     *("gain", "time_constants", "zeros", "dead_time", "integrators", "order", "structure"),

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.cli.report import write_report
 
 if TYPE_CHECKING:
-    from relay_autotune.autotune import Analysis
-    from relay_autotune.record import Record
+    from relay_autotune.analysis import Analysis
+    from relay_autotune.record.record import Record
 
 _RENAMED = {"known_gain": "gain", "known_dead_time": "dead_time", "closed_loop_time": "lambda"}
 _NEAR = 1e-6
@@ -43,7 +43,7 @@ def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
     :param record: the samples.
     :param values: of its parameters, by name.
     """
-    from relay_autotune.autotune import analyse
+    from relay_autotune.analysis import analyse
     from relay_autotune.nodes.design_parameters import options_from
     from relay_autotune.nodes.known_parameters import known_from
 

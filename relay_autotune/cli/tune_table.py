@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import TuningError
-from relay_autotune.notation import digits, process_text
+from relay_autotune.exchange.text import digits, process_text
 from relay_autotune.tuning.forms import series_form
 
 if TYPE_CHECKING:
-    from relay_autotune.models import TransferFunction
+    from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import Gains, Performance
     from relay_autotune.tuning.compensators import Compensator
 

@@ -14,8 +14,8 @@ from typing import Any
 
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.messages import transfer_function_from_message
-from relay_autotune.notation import digits, process_text
+from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.exchange.text import digits, process_text
 
 # By the constants of Tune.Feedback and RelayExperiment.
 STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")

@@ -21,7 +21,10 @@ _STEEPNESS = 3.0
 
 
 class Running(Protocol):
-    """What is asked of a running experiment, a :class:`~relay_autotune.relay.RelayExperiment`."""
+    """What is asked of a running experiment.
+
+    :class:`~relay_autotune.experiment.experiment.RelayExperiment` answers it.
+    """
 
     @property
     def elapsed(self) -> float:

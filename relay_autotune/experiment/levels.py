@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
-from relay_autotune.record import FloatArray
+from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.record.record import FloatArray
 
 # An amplitude that is to be found begins with this part of the range of the command.
 FIRST_SHARE = 0.01

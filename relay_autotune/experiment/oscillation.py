@@ -7,9 +7,7 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 
-from relay_autotune.cycles import MIN_CYCLES, next_cycle
-from relay_autotune.experiment.levels import Levels, clear_swing
-from relay_autotune.experiment.no_return import (
+from relay_autotune.experiment.faults.no_return import (
     NO_ANSWER,
     RunawayWatch,
     count_cycles,
@@ -17,12 +15,14 @@ from relay_autotune.experiment.no_return import (
     is_growing,
     why_no_return,
 )
-from relay_autotune.experiment.noise_alone import TELL, why_noise_alone
+from relay_autotune.experiment.faults.noise_alone import TELL, why_noise_alone
+from relay_autotune.experiment.levels import Levels, clear_swing
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Patience, Relay
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
-from relay_autotune.record import Cycle, FloatArray, Outcome
+from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
+from relay_autotune.record.record import Cycle, FloatArray, Outcome
 
 # A stay at the low level shorter than this part of the longest stay (less, in proportion to how
 # unequally a biased relay pushes), or of half the time that the process took to respond, cannot be

@@ -10,7 +10,7 @@ The states, the command in each of them, and what ends it::
     RELAY      the relay's                cycles agree, or max_cycles            -> COMPLETED
 
 A part that takes too long leads to FAILED. What may end an experiment in any state, and leads to
-ABORTED or FAILED, is not of the procedure but of :mod:`relay_autotune.relay`. In COMPLETED,
+ABORTED or FAILED, belongs to :mod:`relay_autotune.experiment.experiment`. In COMPLETED,
 ABORTED and FAILED the command is the baseline, for good.
 """
 
@@ -21,15 +21,15 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+from relay_autotune.experiment.faults.no_return import count_cycles
 from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
 from relay_autotune.experiment.levels import Levels
-from relay_autotune.experiment.no_return import count_cycles
 from relay_autotune.experiment.oscillation import Oscillation
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Relay
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import NOT_SETTLED, RestState, Settling, rest_state
-from relay_autotune.record import Cycle, Outcome, RelaySettings
+from relay_autotune.record.record import Cycle, Outcome, RelaySettings
 
 SETTLING_LIMIT = 600.0
 """Longest settling [s], where settle_time does not say; or 500 samples, if these take longer."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from relay_autotune.record import Cycle, RelaySettings
+from relay_autotune.record.record import Cycle, RelaySettings
 
 # Half the ultimate gain: the quarter-decay margin of Ziegler and Nichols for proportional control.
 HOLD_SHARE = 0.5

@@ -6,7 +6,7 @@ from array import array
 
 import numpy as np
 
-from relay_autotune.record import FloatArray
+from relay_autotune.record.record import FloatArray
 
 
 class Samples:

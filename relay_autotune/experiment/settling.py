@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.record import FloatArray
+from relay_autotune.record.record import FloatArray
 
 # A constant is known from few samples; a noise band is known to 10 % from 50, since the relative
 # standard error of a standard deviation is 1/sqrt(2 n).

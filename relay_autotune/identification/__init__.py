@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.atv import identify_atv
-from relay_autotune.identification.chang_method import identify_chang
-from relay_autotune.identification.fourier_method import identify_fourier
-from relay_autotune.identification.intervals import Estimate, estimate
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.li_method import identify_li, identify_li_jointly
-from relay_autotune.identification.luyben_method import identify_step
+from relay_autotune.identification.methods.atv import identify_atv
+from relay_autotune.identification.methods.chang_method import identify_chang
+from relay_autotune.identification.methods.fourier_method import identify_fourier
+from relay_autotune.identification.methods.li_method import identify_li, identify_li_jointly
+from relay_autotune.identification.methods.luyben_method import identify_step
+from relay_autotune.identification.methods.thyagarajan_method import identify_thyagarajan
+from relay_autotune.identification.methods.wang_method import identify_biased, identify_unbiased
 from relay_autotune.identification.result import FitReport, Identification
-from relay_autotune.identification.thyagarajan_method import identify_thyagarajan
-from relay_autotune.identification.wang_method import identify_biased, identify_unbiased
-from relay_autotune.identification.waveform import identify_waveform, identify_waveform_jointly
-from relay_autotune.record import Record
+from relay_autotune.identification.uncertainty import Estimate, estimate
+from relay_autotune.identification.waveform.method import (
+    identify_waveform,
+    identify_waveform_jointly,
+)
+from relay_autotune.record.record import Record
 from relay_autotune.registry import look_up
 
 Method = Callable[[Record, Known], Identification]

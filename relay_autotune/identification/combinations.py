@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from relay_autotune.identification.intervals import Estimate, Uncertain, estimate
-from relay_autotune.models import TransferFunction
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.uncertainty import Estimate, Uncertain, estimate
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 
 # Half an interval at most so many times the value.
 DETERMINED = 0.2

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
-from relay_autotune.identification.intervals import Uncertain
-from relay_autotune.identification.intervals import is_logarithmic as is_logarithmic
-from relay_autotune.models import TransferFunction
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.uncertainty import Uncertain
+from relay_autotune.identification.uncertainty import is_logarithmic as is_logarithmic
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 
 if TYPE_CHECKING:
-    from relay_autotune.identification.cycle.fourier import FrequencyPoint
-    from relay_autotune.identification.validation import Validation
+    from relay_autotune.identification.judgement.validation import Validation
+    from relay_autotune.identification.shown.fourier import FrequencyPoint
 
 FloatArray = NDArray[np.float64]
 

@@ -12,9 +12,11 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
+from relay_autotune.control.controller import PidController
+from relay_autotune.control.sampled import Limits
+from relay_autotune.control.verification import Step
 from relay_autotune.errors import ParameterError, RelayAutotuneError
-from relay_autotune.messages import transfer_function_from_message
-from relay_autotune.models import TransferFunction
+from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -24,10 +26,8 @@ from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop
 from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
-from relay_autotune.pid import PidController
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.gains import Controller
-from relay_autotune.tuning.sampled import Limits
-from relay_autotune.verification import Step
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage

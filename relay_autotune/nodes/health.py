@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from relay_autotune.messages import set_stamp
+from relay_autotune.exchange.messages import set_stamp
 
 
 def diagnostics(

@@ -10,25 +10,25 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from relay_autotune.autotune import Analysis, analyse, analyse_jointly, check_names
+from relay_autotune.analysis import Analysis, analyse, analyse_jointly, check_names
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.experiment.early_end import ULTIMATE_GAIN
-from relay_autotune.identification import DEFAULT_METHOD, METHODS, ONLY_JOINT
-from relay_autotune.messages import (
+from relay_autotune.exchange.messages import (
     fill_gains,
     fill_transfer_function,
     record_from_cycles,
     record_from_message,
     start_nanoseconds,
 )
+from relay_autotune.experiment.early_end import ULTIMATE_GAIN
+from relay_autotune.identification import DEFAULT_METHOD, METHODS, ONLY_JOINT
+from relay_autotune.identification.running_fit import RunningFit, Task
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.design_parameters import DESIGN_PARAMETERS, options_from
 from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
 from relay_autotune.nodes.signs_of_life import SignsOfLife
-from relay_autotune.record import Outcome, Record
-from relay_autotune.running_fit import RunningFit, Task
+from relay_autotune.record.record import Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify

@@ -8,8 +8,8 @@ from typing import Any
 
 from relay_autotune.identification import Known
 from relay_autotune.identification.known import LOSSES
-from relay_autotune.models import STRUCTURES
 from relay_autotune.nodes.parameters import NodeParameter
+from relay_autotune.process.transfer_function import STRUCTURES
 
 _MOST_LAGS = 20
 

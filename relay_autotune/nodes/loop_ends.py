@@ -13,12 +13,12 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from std_msgs.msg import Bool, Float64
 
+from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.guard import FollowWatch, Guard, Silence, second_publisher
 from relay_autotune.nodes.handover import Handover
 from relay_autotune.nodes.readiness import NotReadyError
-from relay_autotune.relay import RelayExperiment
 
 # In takeover, the node's own last commands, which come back to it by the topic.
 _OWN_KEPT = 256

@@ -16,15 +16,15 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64
 
-from relay_autotune.actuator import Actuator
 from relay_autotune.errors import ParameterError
-from relay_autotune.messages import set_stamp
-from relay_autotune.models import STRUCTURES, TransferFunction
+from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.nodes.parameters import NodeParameter, declare, values_of
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.actuator import Actuator
+from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 
 MODES = ("realtime", "clock", "lockstep")
 

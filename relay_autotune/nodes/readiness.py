@@ -10,14 +10,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from relay_autotune.errors import ParameterError, RelayAutotuneError
+from relay_autotune.experiment.experiment import SafePolicy
 from relay_autotune.experiment.levels import Levels
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.parameters import merged
 from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.silence import Sensor
 from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
-from relay_autotune.relay import SafePolicy
 
 
 class NotReadyError(RelayAutotuneError):

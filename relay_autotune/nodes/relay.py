@@ -17,9 +17,10 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.exchange.messages import finding_from_message
 from relay_autotune.experiment.early_end import EarlyEnd
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
-from relay_autotune.messages import finding_from_message
+from relay_autotune.experiment.experiment import RelayExperiment, SafePolicy
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -53,8 +54,7 @@ from relay_autotune.nodes.tune_parameters import (
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )
-from relay_autotune.record import Outcome
-from relay_autotune.relay import RelayExperiment, SafePolicy
+from relay_autotune.record.record import Outcome
 from relay_autotune_msgs.srv import StartTune
 
 # How long the end of the process waits for the record to be acknowledged

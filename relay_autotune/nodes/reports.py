@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from relay_autotune.errors import RecordError
-from relay_autotune.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
+from relay_autotune.exchange.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
 from relay_autotune.nodes.session import Session
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 

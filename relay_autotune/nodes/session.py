@@ -12,12 +12,12 @@ import numpy as np
 # numpy loads this with its first median, which would be 20 ms in the middle of a tune.
 import numpy.ma
 
+from relay_autotune.exchange.messages import start_seconds
 from relay_autotune.experiment.early_end import EarlyEnd
-from relay_autotune.experiment.sensor_watch import ClockWatch
-from relay_autotune.messages import start_seconds
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.faults.sensor_watch import ClockWatch
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
-from relay_autotune.record import Record
-from relay_autotune.relay import RelayExperiment
+from relay_autotune.record.record import Record
 
 # A measurement waits no longer than this for its callback, unless a clock was set back [ns].
 _LONGEST_WAIT_NS = 1_000_000_000

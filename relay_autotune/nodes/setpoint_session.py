@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.readiness import NotReadyError
 from relay_autotune.nodes.session import Session
-from relay_autotune.record import FloatArray, Record, RelaySettings
+from relay_autotune.record.record import FloatArray, Record, RelaySettings
 
 
 def on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters, float]:

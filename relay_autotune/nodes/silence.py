@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.repetition import Repetition
+from relay_autotune.experiment.faults.repetition import Repetition
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import Reader
 from relay_autotune.nodes.reports import Counter

@@ -10,8 +10,8 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.node import Node
 
+from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.nodes.goals import conclude
-from relay_autotune.relay import RelayExperiment, State
 from relay_autotune_msgs.action import Tune
 
 _STATES = {

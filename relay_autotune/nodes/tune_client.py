@@ -21,9 +21,9 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import LoopError, ParameterError
-from relay_autotune.messages import record_from_message
+from relay_autotune.exchange.messages import record_from_message
 from relay_autotune.nodes import quality
-from relay_autotune.record import Record
+from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayExperiment
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
-from relay_autotune.experiment.relay_parameters import PARAMETERS as EXPERIMENT_PARAMETERS
+from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.nodes.live_types import COMMAND_TYPES, FLOAT64
 from relay_autotune.nodes.parameters import Entry, NodeParameter
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from relay_autotune.autotune import Analysis
-    from relay_autotune.models import TransferFunction
+    from relay_autotune.analysis import Analysis
+    from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.report.case import Case
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -61,7 +61,7 @@ def write_report(
     :param title: of the page; default: the id of the first experiment.
     :param truth: the process, where it was a simulated one.
     """
-    from relay_autotune.autotune import Analysis
+    from relay_autotune.analysis import Analysis
     from relay_autotune.report.case import case_of
 
     several = [analyses] if isinstance(analyses, Analysis) else list(analyses)

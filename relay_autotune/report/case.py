@@ -9,18 +9,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.autotune import Analysis
+from relay_autotune.analysis import Analysis
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.exchange.text import unit_of
 from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.cycle.fourier import FrequencyPoint
+from relay_autotune.identification.judgement.validation import Validation
 from relay_autotune.identification.result import Rival
-from relay_autotune.identification.validation import Validation
-from relay_autotune.models import TransferFunction
-from relay_autotune.notation import unit_of
-from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.tuning import Gains, ensemble
 
 FloatArray = NDArray[np.float64]
@@ -285,7 +285,7 @@ def ultimate_estimates(
     :param frequency_std: its standard deviation.
     :param truth: the process, where it was a simulated one.
     """
-    from relay_autotune.ultimate import ultimate_point
+    from relay_autotune.process.ultimate import ultimate_point
 
     if not math.isfinite(gain):
         return ()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.record import Record, RelaySettings
+from relay_autotune.record.record import Record, RelaySettings
 from relay_autotune.report.case import Case, ModelCase
 from relay_autotune.report.style import (
     BLUE,

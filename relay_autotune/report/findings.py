@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from relay_autotune.notation import date_text, digits
-from relay_autotune.record import Outcome
+from relay_autotune.exchange.text import date_text, digits
+from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, ModelCase
 from relay_autotune.tuning import Gains
 

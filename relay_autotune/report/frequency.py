@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import (
     BLUE,
@@ -114,7 +114,7 @@ def _loop_frequencies(loop: TransferFunction) -> FloatArray:
 
     A dead time turns what is left about the origin for ever, which says no more after a few turns.
     """
-    from relay_autotune.tuning.analysis import frequencies
+    from relay_autotune.tuning.loop.analysis import frequencies
 
     grid = frequencies(loop)
     size = np.abs(loop(1j * grid))

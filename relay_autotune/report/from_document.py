@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.cycles import LimitCycle
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.cycle.fourier import FrequencyPoint
+from relay_autotune.identification.judgement.validation import DIFFERENCES, Validation
 from relay_autotune.identification.result import Rival
-from relay_autotune.identification.validation import DIFFERENCES, Validation
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, RelaySettings
+from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import LimitCycle
+from relay_autotune.record.record import Outcome, RelaySettings
 from relay_autotune.report.case import Case, around, measured_points, model_case
 from relay_autotune.tuning import Gains
 

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import relay_autotune
-from relay_autotune.notation import digits, process_mathml, process_text
+from relay_autotune.exchange.text import digits, process_mathml, process_text
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (

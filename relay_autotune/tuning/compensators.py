@@ -22,12 +22,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from relay_autotune.control.sampled import Limits, require_period
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
-from relay_autotune.simulation import Plant
-from relay_autotune.tuning.control_law import InternalModelLaw
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.tuning.loop.control_law import InternalModelLaw
 from relay_autotune.tuning.rules.applicability import fopdt_of, named, process_of
-from relay_autotune.tuning.sampled import Limits, require_period
 from relay_autotune.tuning.task import DesignTask
 
 DEAD_TIME_LAMBDA = 2.0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.floating[Any]]
 

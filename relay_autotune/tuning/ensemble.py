@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification, is_logarithmic
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.gains import Controller
-from relay_autotune.tuning.margins import frequencies
-from relay_autotune.tuning.model_set import ModelSet
-from relay_autotune.tuning.stability import (
+from relay_autotune.tuning.loop.margins import frequencies
+from relay_autotune.tuning.loop.stability import (
     at_infinity,
     closed_loop_unstable_poles,
     winding,
 )
+from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.tuning.surroundings import allowed_outside
 
 FloatArray = NDArray[np.floating[Any]]

@@ -17,7 +17,7 @@ import math
 from dataclasses import dataclass
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.gains import Controller
 
 FORMS = ("isa", "parallel", "series")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.models import TransferFunction
-from relay_autotune.ultimate import unstable_at_small_gain
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import unstable_at_small_gain
 
 FloatArray = NDArray[np.floating[Any]]
 

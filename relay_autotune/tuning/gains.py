@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.model_set import ModelSet
-from relay_autotune.ultimate import UltimatePoint
 
 CONTROLLERS = ("auto", "pi", "pid")
 MS_RANGE = (1.2, 4.0)

@@ -28,7 +28,7 @@ from relay_autotune.bag.names import CYCLE, EXPERIMENT
 from relay_autotune.bag.reader import Selection, read_experiments
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.record import Outcome, Record
+from relay_autotune.record.record import Outcome, Record
 
 FACTS = {"experiment_id": "run-1", "measurement": "/measurement", "command": "/command"}
 LOOP = [Topic("/measurement"), Topic("/command")]

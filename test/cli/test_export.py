@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from relay_autotune.cli import export, replay
 from relay_autotune.cli.export import Target, number, pid_controller, plain
 from relay_autotune.errors import SelectionError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, Gains, Performance
 
 PERFORMANCE = Performance(

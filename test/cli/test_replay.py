@@ -19,14 +19,14 @@ from made_bags import (
     write_samples,
 )
 
-from relay_autotune.autotune import analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.bag.definitions import Definition
 from relay_autotune.bag.names import CYCLE, EXPERIMENT
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli import csv_to_bag, replay
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 
@@ -422,7 +422,7 @@ def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
 
 
 def test_numbers_that_json_lacks_are_null():
-    from relay_autotune.document import _number
+    from relay_autotune.exchange.document import _number
 
     assert _number(math.nan) is None
     assert _number(math.inf) is None

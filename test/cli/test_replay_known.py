@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from made_bags import START, definition, experiment_message, serialize, write_samples
 
-from relay_autotune.autotune import analyse, analyse_jointly
+from relay_autotune.analysis import analyse, analyse_jointly
 from relay_autotune.bag.definitions import Definition
 from relay_autotune.bag.names import EXPERIMENT
 from relay_autotune.bag.writer import BagWriter, Topic
 from relay_autotune.cli import replay
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Known
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 

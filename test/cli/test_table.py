@@ -7,7 +7,7 @@ import pytest
 
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.identification.result import Identification, Rival
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 
 LONG = TransferFunction.lag_complex(-0.4356, 148.123, 0.0123456, 0.345678, 15.8612)
 ZERO = TransferFunction.sopdt(1234.5, (123.45, 12.345), 1.2345, -98.765)

@@ -12,15 +12,15 @@ from scipy import signal
 from scipy.integrate import trapezoid
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
-from relay_autotune.tuning.analysis import analyse_loop, is_stable
-from relay_autotune.tuning.control_law import InternalModelLaw
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.ensemble import ensemble_peaks
 from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.loop.analysis import analyse_loop, is_stable
+from relay_autotune.tuning.loop.control_law import InternalModelLaw
+from relay_autotune.tuning.loop.responses import step_responses
+from relay_autotune.tuning.loop.stability import closed_loop_unstable_poles, winding
 from relay_autotune.tuning.model_set import ModelSet
-from relay_autotune.tuning.responses import step_responses
-from relay_autotune.tuning.stability import closed_loop_unstable_poles, winding
-from relay_autotune.ultimate import ultimate_point
 
 
 def _rational(control, controller: Controller, model: TransferFunction):

@@ -10,17 +10,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from relay_autotune.autotune import Analysis
+from relay_autotune.analysis import Analysis
 from relay_autotune.cli.table import table
-from relay_autotune.document import document, to_json
+from relay_autotune.exchange.document import document, to_json
+from relay_autotune.exchange.messages import fill_transfer_function
 from relay_autotune.identification import Known, identify
-from relay_autotune.identification.assessment import assess, fit_of_model
-from relay_autotune.identification.fit.residuals import noise_to_signal
-from relay_autotune.identification.validation import DIFFERENCES, integrated_error
-from relay_autotune.messages import fill_transfer_function
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.identification.judgement.assessment import assess, fit_of_model
+from relay_autotune.identification.judgement.validation import DIFFERENCES, integrated_error
+from relay_autotune.identification.waveform.residuals import noise_to_signal
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.0, 2.0, 1.0)
 RELAY = RelaySettings(3.0, 1.0, 1.0, 0.0, 0.1)

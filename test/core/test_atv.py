@@ -11,7 +11,8 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
-from relay_autotune.identification.atv import (
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods.atv import (
     atv_from_numbers,
     identify_atv,
     phase_of_lags,
@@ -21,13 +22,12 @@ from relay_autotune.identification.atv import (
     two_time_constants,
     ultimate_estimate,
 )
-from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
-from relay_autotune.identification.known import Known
-from relay_autotune.identification.lag_models import MODEL_4, MODEL_5, equal_lags
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.simulation import exact_limit_cycle, simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5, equal_lags
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Record, RelaySettings
 
 LAGS = [
     (equal_lags(1), (3.0,)),

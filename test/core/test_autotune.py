@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.autotune import analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.tuning import RULES
 
 

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.identification.fit.averaging import averaged_point
-from relay_autotune.identification.fit.fit_covariance import Fit, Noise, covariance_of_values
-from relay_autotune.identification.fit.separable import evaluate, problem_of
-from relay_autotune.identification.fit.structures import SOPDT, SOPDT_ZERO, RationalStructure
 from relay_autotune.identification.result import Identification, Rival, with_uncertainty
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.identification.waveform.averaging import averaged_point
+from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, covariance_of_values
+from relay_autotune.identification.waveform.separable import evaluate, problem_of
+from relay_autotune.identification.waveform.structures import SOPDT, SOPDT_ZERO, RationalStructure
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 
 # 2 s of lag and 2 s of dead time, each gain and constant known to 1 %.
 _VALUES = np.array([1.0, 2.0, 2.0])

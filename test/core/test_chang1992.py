@@ -12,22 +12,22 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
-from relay_autotune.identification.chang1992 import (
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods.chang1992 import (
     gain_and_time_constant,
     time_constant_from_amplitude,
     time_constant_from_period,
     two_equal_and_one,
     two_time_constants,
 )
-from relay_autotune.identification.chang_method import chang_from_numbers, identify_chang
-from relay_autotune.identification.cycle.symmetric_cycle import SymmetricCycle
-from relay_autotune.identification.known import Known
-from relay_autotune.identification.square_wave import fundamental, level, peak, slope_sign
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import exact_limit_cycle, simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.methods.chang_method import chang_from_numbers, identify_chang
+from relay_autotune.identification.methods.square_wave import fundamental, level, peak, slope_sign
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Record, RelaySettings
 
 EXAMPLE = {name: exact for name, _, exact, _ in cases("chang.ex1")}
 

@@ -7,18 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.identification.checks import (
+from relay_autotune.identification.judgement.checks import (
     disagreeing_point,
     unequal_amplitudes,
     unequal_gains,
 )
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.waveform import identify_waveform
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import Plant
+from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.process.response import response
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 RELAY = RelaySettings(5.0, 40.0, 1.0, 0.2, 0.1)

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.identification.waveform import identify_waveform
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.simulation import Plant
-from relay_autotune.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.record.record import Record
 
 
 def _point(model: TransferFunction) -> UltimatePoint:

@@ -11,17 +11,17 @@ from fopdt_plant import FopdtPlant, run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.cycles import (
+from relay_autotune.errors import RecordError
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.record.cycles import (
     agree,
     cycle_from_samples,
     cycles_of,
     find_cycles,
     limit_cycle,
 )
-from relay_autotune.errors import RecordError
-from relay_autotune.foreign import infer_settings
-from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.record.foreign import infer_settings
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 CYCLE = Cycle(
     index=0,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from virtual_tune import tuned
 
-from relay_autotune.autotune import analyse
+from relay_autotune.analysis import analyse
+from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import identify
-from relay_autotune.identification.direction import speaks_for_other
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters
+from relay_autotune.identification.judgement.direction import speaks_for_other
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome
 
 SECOND_ORDER = TransferFunction.from_structure(
     "sopdt_zero", gain=0.38, time_constants=[1.3, 0.32], zeros=[-1.2], dead_time=0.09

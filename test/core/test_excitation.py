@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.autotune import analyse
-from relay_autotune.excitation import find_experiments
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.sampled_relay import simulate_sampled_relay
+from relay_autotune.analysis import analyse
+from relay_autotune.process.response import response
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.excitation import find_experiments
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 TIME = np.arange(0.0, 3000.0, 0.25)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
-from relay_autotune.cycles import limit_cycle
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.no_return import RunawayWatch, is_growing
-from relay_autotune.experiment.sensor_watch import ClockWatch, FrozenWatch
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters, RelayExperiment, SafePolicy
-from relay_autotune.simulation import Plant
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, SafePolicy
+from relay_autotune.experiment.faults.no_return import RunawayWatch, is_growing
+from relay_autotune.experiment.faults.sensor_watch import ClockWatch, FrozenWatch
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import limit_cycle
+from relay_autotune.record.record import Outcome
 
 
 def experiment(baseline=0.0, policy=None, until_converged=True, **parameters):

@@ -10,10 +10,10 @@ import pytest
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import METHODS, identify
 from relay_autotune.identification.known import Known
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.simulation import exact_limit_cycle, simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Record, RelaySettings
 
 FOPDT = TransferFunction.fopdt(1.65, 20.0, 10.0)
 RELAY = RelaySettings(5.0, 40.0, 1.0, 0.0, 0.1)

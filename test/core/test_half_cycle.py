@@ -9,12 +9,12 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import ModelError
-from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.cycle.envelope import normalised_growth
-from relay_autotune.identification.thyagarajan2003 import equal_lags
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.identification.methods.thyagarajan2003 import equal_lags
+from relay_autotune.identification.shown.envelope import normalised_growth
+from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 
 MODELS = {
     "fopdt": TransferFunction.fopdt(2.0, 3.0, 1.0),

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relay_autotune.autotune import analyse_jointly
+from relay_autotune.analysis import analyse_jointly
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import Known, identify_jointly
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
 
 FOPDT = Known(structure="fopdt")
 TRUTH = (1.65, 20.0, 10.0)

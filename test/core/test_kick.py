@@ -9,9 +9,9 @@ import pytest
 
 from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
 from relay_autotune.experiment.settling import RestState, Settling, rest_state
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
-from relay_autotune.response import response
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 
 
 def at_rest(noise_std=0.0, mean=0.0):

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from virtual_tune import tuned
 
-from relay_autotune.autotune import analyse
-from relay_autotune.disturbance import with_its_load
+from relay_autotune.analysis import analyse
+from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import Known, identify
-from relay_autotune.load import LoadStep, identify_with_load
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
-from relay_autotune.relay import ExperimentParameters
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.judgement.disturbance import with_its_load
+from relay_autotune.identification.judgement.load import LoadStep, identify_with_load
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import PiecewiseConstant
 
 FIRST_ORDER = TransferFunction.from_structure(
     "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0

@@ -12,12 +12,16 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.luyben2003 import from_step, step_features, step_response
-from relay_autotune.identification.luyben_method import identify_step_numbers
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.identification.methods.luyben2003 import (
+    from_step,
+    step_features,
+    step_response,
+)
+from relay_autotune.identification.methods.luyben_method import identify_step_numbers
+from relay_autotune.process.response import response
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 EXAMPLE = (0.547, 0.418, 1.06, 0.1)
 

@@ -13,11 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.errors import RecordError
-from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.cycle.fourier import FrequencyPoint
-from relay_autotune.identification.result import FitReport
-from relay_autotune.identification.validation import Validation
-from relay_autotune.messages import (
+from relay_autotune.exchange.messages import (
     fill_cycle,
     fill_experiment,
     fill_gains,
@@ -28,8 +24,12 @@ from relay_autotune.messages import (
     start_seconds,
     transfer_function_from_message,
 )
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.identification.combinations import Combination
+from relay_autotune.identification.judgement.validation import Validation
+from relay_autotune.identification.result import FitReport
+from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.tuning.gains import NUMBERS
 
 SETTINGS = RelaySettings(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from relay_autotune.errors import ModelError
-from relay_autotune.models import STRUCTURES, TransferFunction
+from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
 
 W = np.logspace(-3, 3, 50)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.noise_alone import why_noise_alone
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.faults.noise_alone import why_noise_alone
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.record import Outcome
 
 PROCESS = TransferFunction.from_structure(
     "lag_n", gain=-1.0, time_constants=[1.7], order=3, dead_time=0.1

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import MissingPackageError, ModelError
-from relay_autotune.models import TransferFunction
-from relay_autotune.python_control import to_control
+from relay_autotune.exchange.python_control import to_control
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.gains import Controller
 
 MODELS = [

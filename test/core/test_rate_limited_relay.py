@@ -9,11 +9,11 @@ import pytest
 from scipy.signal import lsim, tf2ss
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification import Known, identify
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.simulation import Plant
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
 
 
 def _record(rate: float) -> Record:

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relay_autotune.actuator import Actuator
-from relay_autotune.cycles import cycles_of
-from relay_autotune.disturbance import without_disturbance
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification import Known, identify
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.ultimate import ultimate_point
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.identification.judgement.disturbance import without_disturbance
+from relay_autotune.process.actuator import Actuator
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.cycles import cycles_of
+from relay_autotune.record.record import Outcome
 
 PROCESS = TransferFunction.from_structure(
     "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0

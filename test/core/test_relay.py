@@ -11,12 +11,12 @@ from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.cycles import cycles_of, limit_cycle
 from relay_autotune.errors import ParameterError, RecordError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters, RelayExperiment, State
-from relay_autotune.simulation import Plant
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, State
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import cycles_of, limit_cycle
+from relay_autotune.record.record import Outcome
 
 
 def experiment(baseline=0.0, **parameters):

@@ -8,7 +8,7 @@ from dataclasses import fields
 import pytest
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.relay_parameters import PARAMETERS, ExperimentParameters
+from relay_autotune.experiment.parameters import PARAMETERS, ExperimentParameters
 
 
 def test_the_table_describes_every_field():

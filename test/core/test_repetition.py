@@ -8,13 +8,13 @@ import re
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.repetition import Repetition, SilenceWatch
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.faults.repetition import Repetition, SilenceWatch
 from relay_autotune.identification import Known, identify
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.ultimate import ultimate_point
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.record import Outcome
 
 PROCESS = TransferFunction.from_structure(
     "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0

@@ -10,10 +10,10 @@ from scipy import signal
 from scipy.linalg import expm
 
 from relay_autotune.errors import RecordError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
-from relay_autotune.response import response
-from relay_autotune.simulation import Plant
+from relay_autotune.process.response import response
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 
 INPUT = PiecewiseConstant(np.array([0.0, 3.3, 7.7, 20.0]), np.array([1.0, -1.0, 0.5, -0.3]), 0.0)
 # None of the times falls on a change of the input, where a biproper process jumps.

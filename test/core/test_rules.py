@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import exact_limit_cycle
+from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, analyse_loop, design
 from relay_autotune.tuning.rules import PUBLISHED
 from relay_autotune.tuning.rules.amigo import amigo
@@ -34,7 +35,6 @@ from relay_autotune.tuning.rules.ultimate_point import (
     ziegler_nichols_cycle,
 )
 from relay_autotune.tuning.rules.unstable import unstable
-from relay_autotune.ultimate import UltimatePoint, ultimate_point
 
 _T = TransferFunction
 

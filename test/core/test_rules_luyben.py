@@ -9,7 +9,7 @@ import pytest
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, DesignOptions, DesignTask, analyse_loop
 from relay_autotune.tuning.forms import SeriesForm, series_form
 from relay_autotune.tuning.rules.luyben2003 import (

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relay_autotune.autotune import analyse
-from relay_autotune.models import TransferFunction
-from relay_autotune.pid import PidController
-from relay_autotune.record import Record
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
+from relay_autotune.analysis import analyse
+from relay_autotune.control.controller import PidController
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.record import Record
 from relay_autotune.tuning.gains import Controller
-from relay_autotune.ultimate import ultimate_point
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
 
 PERIOD = 0.02
 

@@ -10,26 +10,26 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.cycle.envelope import (
+from relay_autotune.identification.shown.envelope import (
     Envelope,
     curvature_time,
     envelope,
     growth_time,
     normalised_growth,
 )
-from relay_autotune.identification.cycle.fold import fold
-from relay_autotune.identification.cycle.shape import (
+from relay_autotune.identification.shown.fold import fold
+from relay_autotune.identification.shown.shape import (
     Shape,
     read_shape,
     shape_of_curve,
     shape_of_half_cycle,
     shape_of_record,
 )
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record, RelaySettings
 
 IDEAL = RelaySettings(0.0, 0.0, 1.0)
 

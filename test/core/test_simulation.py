@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from worked_cases import cases
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.wang1997 import fopdt_limit_cycle
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.response import response
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.identification.methods.wang1997 import fopdt_limit_cycle
+from relay_autotune.process.response import response
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 
 IDEAL = RelaySettings(setpoint=0.0, baseline=0.0, amplitude=1.0)
 

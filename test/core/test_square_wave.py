@@ -9,10 +9,10 @@ import pytest
 from scipy.special import gammaincc
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.square_wave import fundamental, level, peak, peak_part
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import exact_limit_cycle
+from relay_autotune.identification.methods.square_wave import fundamental, level, peak, peak_part
+from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 6])

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from relay_autotune.identification.fit.factors import Denominator, Lag, Quadratic, UnstableLag
-from relay_autotune.identification.fit.lags import FOPDT
-from relay_autotune.identification.fit.partial_fractions import partial_fractions
-from relay_autotune.identification.fit.plausibility import is_unseen
-from relay_autotune.identification.fit.rational import free_motion, responses
-from relay_autotune.identification.fit.structures import lag_n
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.waveform import identify_waveform
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.simulation import simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.waveform.factors import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.identification.waveform.lags import FOPDT
+from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.partial_fractions import partial_fractions
+from relay_autotune.identification.waveform.plausibility import is_unseen
+from relay_autotune.identification.waveform.rational import free_motion, responses
+from relay_autotune.identification.waveform.structures import lag_n
+from relay_autotune.process.response import response
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 TIME = np.linspace(0.0, 60.0, 400)
 INPUT = PiecewiseConstant(

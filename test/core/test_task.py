@@ -7,7 +7,7 @@ import math
 import pytest
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 

@@ -11,9 +11,7 @@ from hypothesis import strategies as st
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.cycle.shape import shape_of_half_cycle
-from relay_autotune.identification.thyagarajan2003 import (
+from relay_autotune.identification.methods.thyagarajan2003 import (
     dead_time_ratio,
     equal_lags,
     first_guess,
@@ -27,9 +25,11 @@ from relay_autotune.identification.thyagarajan2003 import (
     unstable_fopdt,
     unstable_limit_cycle,
 )
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import exact_limit_cycle
+from relay_autotune.identification.shown.shape import shape_of_half_cycle
+from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T2"))

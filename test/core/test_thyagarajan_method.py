@@ -11,11 +11,11 @@ import pytest
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Record, RelaySettings
 
 
 def record_of(model, hysteresis=0.0, noise=0.0, seed=3, cycles=6, samples=1200, **relay):

@@ -9,10 +9,10 @@ import pytest
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
-from relay_autotune.identification.waveform import identify_waveform
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import Controller, analyse_loop, ensemble, is_stable, tune
 
 

@@ -10,15 +10,15 @@ import pytest
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification import Known, estimate, identify
-from relay_autotune.identification.fit.lags import FOPDT
-from relay_autotune.identification.fit.profiles import profile_ends
-from relay_autotune.identification.fit.quantisation import quantisation_step
-from relay_autotune.identification.fit.separable import evaluate, problem_of, refine
 from relay_autotune.identification.result import with_uncertainty
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.identification.waveform.lags import FOPDT
+from relay_autotune.identification.waveform.profiles import profile_ends
+from relay_autotune.identification.waveform.quantisation import quantisation_step
+from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
+from relay_autotune.process.response import response
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 GIVEN = Known(structure="fopdt")
 
@@ -62,7 +62,7 @@ def test_the_interval_of_the_ultimate_gain_is_that_of_its_stated_deviation():
 
 
 def identify_point(model: TransferFunction) -> float:
-    from relay_autotune.ultimate import ultimate_point
+    from relay_autotune.process.ultimate import ultimate_point
 
     point = ultimate_point(model)
     return math.nan if point is None else point.gain

@@ -9,12 +9,12 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle.fold import fold
-from relay_autotune.identification.validation import integrated_error, validate
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.identification.judgement.validation import integrated_error, validate
+from relay_autotune.identification.shown.fold import fold
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record, RelaySettings
 
 FOPDT = TransferFunction.fopdt(1.65, 20.0, 10.0)
 
@@ -96,7 +96,7 @@ def test_a_wrong_model_does_not(wrong):
 
 
 def test_models_of_one_period_and_amplitude_differ_in_shape_only():
-    from relay_autotune.identification.thyagarajan2003 import higher_order
+    from relay_autotune.identification.methods.thyagarajan2003 import higher_order
 
     relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.1)
     run = simulate_relay(FOPDT, relay, cycles=6)

@@ -9,21 +9,21 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.cycle.fourier import cycle_means, frequency_point
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.wang1997 import (
+from relay_autotune.identification.methods.wang1997 import (
     FopdtCycle,
     fopdt_from_biased,
     fopdt_from_unbiased,
     fopdt_limit_cycle,
     fopdt_with_gain,
 )
-from relay_autotune.identification.wang_method import identify_biased, identify_unbiased
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Record, RelaySettings
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.methods.wang_method import identify_biased, identify_unbiased
+from relay_autotune.identification.shown.fourier import cycle_means, frequency_point
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Record, RelaySettings
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("wang.T1"))

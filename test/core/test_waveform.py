@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.fit.residuals import covariance_meat, ljung_box
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.waveform import identify_waveform
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant, Record, RelaySettings
-from relay_autotune.response import response
-from relay_autotune.sampled_relay import simulate_sampled_relay
-from relay_autotune.simulation import RelayRun, simulate_relay
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
+from relay_autotune.process.response import response
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.simulation import RelayRun, simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 FOPDT = Known(structure="fopdt")
 

@@ -13,13 +13,13 @@ import yaml
 from pages import GUIDE, PAGES, ROOT, block_noted, blocks, commands, rows, spans
 from parameter_values import check_parameter_file, check_value
 
-from relay_autotune.autotune import analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import csv_to_bag, replay, tune_loop
-from relay_autotune.document import document
+from relay_autotune.exchange.document import document
 from relay_autotune.identification import METHODS
-from relay_autotune.models import STRUCTURES
 from relay_autotune.nodes.plant import MODES
+from relay_autotune.process.transfer_function import STRUCTURES
 from relay_autotune.tuning import RULES
 from tools.fill_docs import TABLES, filled
 

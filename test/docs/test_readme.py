@@ -16,8 +16,8 @@ from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, se
 
 from relay_autotune import start
 from relay_autotune.cli import demo
-from relay_autotune.models import TransferFunction
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from tools.report_images import tune_as_the_demo
 
 

@@ -12,14 +12,14 @@ import rclpy
 from rclpy.parameter import Parameter
 
 from relay_autotune.errors import ParameterError
+from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification import Known
-from relay_autotune.messages import fill_experiment
-from relay_autotune.models import TransferFunction
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.identifier import PARAMETERS, IdentifierNode
 from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
-from relay_autotune.record import RelaySettings
-from relay_autotune.simulation import simulate_relay
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 PROCESS = TransferFunction.lag_n(2.0, 3.0, 2, 1.0)

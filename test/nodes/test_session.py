@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import RecordError
-from relay_autotune.experiment.relay_parameters import ExperimentParameters
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.nodes.session import Session
-from relay_autotune.relay import RelayExperiment
 
 
 def experiment() -> RelayExperiment:

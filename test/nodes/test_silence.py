@@ -13,7 +13,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.messages import set_stamp
+from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller import ControllerNode
 from relay_autotune.nodes.domain import free_domain

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.path import Path
 from report_cases import SETTINGS, completed, fruitless
 
-from relay_autotune.record import Record
+from relay_autotune.record.record import Record
 from relay_autotune.report import draw
 from relay_autotune.report.case import case_of, in_loop
 from relay_autotune.report.experiment import rate_of, switches_of

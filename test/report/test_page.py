@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from report_cases import MODEL, aborted, completed, fruitless, only
 
-from relay_autotune.document import document, model_fields, to_json
+from relay_autotune.exchange.document import document, model_fields, to_json
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.result import Rival, with_uncertainty
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, case_of, true_value
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.from_document import cases_of_document, read_documents

@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from relay_autotune.bag.definitions import Definition, find_definition
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.messages import fill_experiment
-from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.exchange.messages import fill_experiment
+from relay_autotune.record.record import Outcome, Record, RelaySettings
 
 REPOSITORY = Path(__file__).parents[2]
 START = 1_790_000_000_000_000_000

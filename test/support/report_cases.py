@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relay_autotune.autotune import Analysis, analyse
+from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.identification import Known
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import Outcome, Record, RelaySettings
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.report import figures, page
-from relay_autotune.sampled_relay import simulate_sampled_relay
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from relay_autotune.models import TransferFunction
-from relay_autotune.relay import ExperimentParameters, RelayExperiment
-from relay_autotune.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 
 SAMPLES = 20_000
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 
 _CASES = json.loads((Path(__file__).parent / "data" / "worked_cases.json").read_text())
 

@@ -13,7 +13,7 @@ import pytest
 from loop_rig import Rig
 from ros_domain import free_domain
 
-from relay_autotune.messages import record_from_message
+from relay_autotune.exchange.messages import record_from_message
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
 GAIN, TIME_CONSTANT, DEAD_TIME = 1.65, 20.0, 10.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.task import DesignTask
-from relay_autotune.ultimate import UltimatePoint, ultimate_point
 
 
 @dataclass(frozen=True)

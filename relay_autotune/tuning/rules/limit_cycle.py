@@ -9,10 +9,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from relay_autotune.errors import ModelError
-from relay_autotune.half_cycle import HalfCycle
-from relay_autotune.identification.cycle.shape import shape_of_half_cycle
-from relay_autotune.models import TransferFunction
-from relay_autotune.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.identification.shown.shape import shape_of_half_cycle
+from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 
 _REACH = np.geomspace(1.0, 4.0, 60)
 _AT_SWITCH = np.zeros(1)

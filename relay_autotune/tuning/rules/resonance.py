@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
-from relay_autotune.ultimate import ultimate_point
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 
 FloatArray = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from relay_autotune.errors import TuningError
-from relay_autotune.models import TransferFunction
-from relay_autotune.record import PiecewiseConstant
-from relay_autotune.response import response
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 from relay_autotune.tuning.rules.applicability import is_first_order, named
 
 _POINTS = 4000

@@ -8,6 +8,7 @@ The papers' examples take the latter, and so do the rules whose name ends in ``_
 
 from __future__ import annotations
 
+from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.rules.applicability import (
     controller,
@@ -16,7 +17,6 @@ from relay_autotune.tuning.rules.applicability import (
     wants_pid,
 )
 from relay_autotune.tuning.task import DesignTask
-from relay_autotune.ultimate import UltimatePoint
 
 _OWN = "of the model itself"
 _CYCLE = "of the limit cycle by the describing function"

@@ -1,0 +1,390 @@
+"""From a record to models and gains: the one path that live nodes and replay share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
+from relay_autotune.experiment.early_end import Finding
+from relay_autotune.identification import (
+    DEFAULT_METHOD,
+    METHODS,
+    Identification,
+    Known,
+    identify,
+    identify_jointly,
+    method_named,
+)
+from relay_autotune.identification.judgement.assessment import assess
+from relay_autotune.identification.judgement.checks import unequal_amplitudes
+from relay_autotune.identification.judgement.direction import speaks_for_other, wrong_direction
+from relay_autotune.identification.judgement.disturbance import (
+    is_far_off,
+    with_its_load,
+    without_disturbance,
+)
+from relay_autotune.identification.known import NOTHING
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint
+from relay_autotune.record.cycles import cycles_of, limit_cycle
+from relay_autotune.record.record import Cycle, Outcome, Record
+from relay_autotune.tuning import (
+    DEFAULT_RULE,
+    RULES,
+    DesignOptions,
+    DesignTask,
+    Gains,
+    design,
+    ensemble,
+    rule_named,
+)
+from relay_autotune.tuning.prediction import PredictedMs, predicted_ms
+from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
+
+_NO_GAINS = {
+    Outcome.ABORTED: "the experiment was aborted",
+    Outcome.FAILED: "the experiment failed",
+}
+# Parameters of a load step: its instant and size.
+_LOAD = 2
+_OPEN_DEAD_TIME = (
+    "no gains: the record goes with a dead time of any length, so that it bounds no gain; record "
+    "a relay test, or a step that stands clear of the noise"
+)
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What one record gave.
+
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param models: every method's model that could be had, the chosen method's first.
+    :param selected: index of the model that counts; None: nothing was identified.
+    :param gains: every rule's gains that apply to the selected model, the chosen rule's first.
+    :param recommended: index of the gains that count; None: there are none.
+    :param reason: why there is no model or no gains; empty where there are both.
+    :param added_delay: dead time beside the process's own with which the gains were judged [s]:
+        half a sampling period of the controller, and what else its loop adds.
+    :param predicted: of a running experiment, Ms with the gains that its model would give; None:
+        not asked for, or there would be none.
+    """
+
+    record: Record
+    cycles: tuple[Cycle, ...] = ()
+    models: tuple[Identification, ...] = ()
+    selected: int | None = None
+    gains: tuple[Gains, ...] = ()
+    recommended: int | None = None
+    reason: str = ""
+    added_delay: float = 0.0
+    predicted: PredictedMs | None = None
+
+    @property
+    def model(self) -> Identification | None:
+        """The identification that counts."""
+        return None if self.selected is None else self.models[self.selected]
+
+    @property
+    def best_gains(self) -> Gains | None:
+        """The gains that count."""
+        return None if self.recommended is None else self.gains[self.recommended]
+
+    @property
+    def finding(self) -> Finding:
+        """What the model and its prediction say of a running experiment."""
+        model, ms = self.model, self.predicted
+        if model is None:
+            return Finding()
+        found = Finding(model.ultimate_gain, model.ultimate_gain_std)
+        return found if ms is None else replace(found, ms=ms.ms, ms_low=ms.low, ms_high=ms.high)
+
+    def _repr_html_(self) -> str:
+        """Return model and gains as a table, as notebooks show it."""
+        # Imported here, since nothing else needs it.
+        from relay_autotune.exchange.notebook import analysis_html
+
+        return analysis_html(self)
+
+
+def check_names(method: str, rule: str) -> None:
+    """Refuse unknown names before any work is done.
+
+    :raises RelayAutotuneError: if there is no such method or rule; the message lists the known.
+    """
+    method_named(method)
+    rule_named(rule)
+
+
+def analyse(
+    record: Record,
+    *,
+    method: str = DEFAULT_METHOD,
+    rule: str = DEFAULT_RULE,
+    known: Known = NOTHING,
+    options: DesignOptions | None = None,
+    final: bool = True,
+    alone: bool = False,
+    predict: bool = False,
+    rng: np.random.Generator | None = None,
+) -> Analysis:
+    """Identify a record and, where the experiment was completed, tune.
+
+    Data that tell no model are a result, not an exception: the reason says what was found and
+    what to do. Only a completed experiment, or data that carry no outcome at all, yield gains.
+
+    :param record: the experiment.
+    :param method: the method whose model counts.
+    :param rule: the rule whose gains count.
+    :param known: what is known of the process beforehand.
+    :param options: what is asked of the controller; noise and amplitude come from the record
+        where they are not given.
+    :param final: False while the experiment still runs: only the chosen model, and no gains; this
+        takes a fraction of the time.
+    :param alone: True: only the chosen method's model and the chosen rule's gains, equal to those
+        beside all others; for many records.
+    :param predict: True: of a running experiment, predict Ms, too.
+    :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
+        that equal records give equal numbers.
+    :raises RelayAutotuneError: if method or rule are unknown.
+    """
+    check_names(method, rule)
+    cycles: tuple[Cycle, ...] = ()
+    try:
+        cycles = cycles_of(record)
+        chosen = _guarded(record, method, known)
+    except RelayAutotuneError as error:
+        return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
+    chosen = without_disturbance(
+        chosen, record, cycles, lambda part: _guarded(part, method, known)
+    )
+    # The record as the process was driven, with a load that came.
+    driven = record
+    if chosen.method == DEFAULT_METHOD and not known.structure:
+        chosen, driven = with_its_load(
+            chosen,
+            record,
+            cycles,
+            lambda part, kind: _guarded(part, method, replace(known, structure=kind)),
+        )
+    if not final and is_far_off(chosen, record):
+        # Its interval is that of a model which the record contradicts: nothing to end a test on.
+        chosen = replace(chosen, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
+    models = [chosen]
+    if final and not known.structure and _tells_direction(chosen, record):
+        other = speaks_for_other(chosen, record, beside=0 if driven is record else _LOAD)
+        if other is not None:
+            return Analysis(record, cycles, reason=wrong_direction(other))
+    if final:
+        if not alone:
+            models += _others(driven, method, known, chosen)
+        models = list(assess(models, record))
+    simple = next((m.model for m in models if m.structure == "fopdt"), None)
+    if (alone or predict) and simple is None and rule != DEFAULT_RULE:
+        simple = _simple((driven,), known, chosen)
+    found = Analysis(record, cycles, tuple(models), 0)
+    if not final:
+        return _with_prediction(found, rule, rng, simple, options) if predict else found
+    refused = _NO_GAINS.get(record.outcome)
+    if refused:
+        return Analysis(
+            record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
+        )
+    return _tuned(found, (rule,) if alone else _first(rule), rng, simple, options)
+
+
+def _tells_direction(chosen: Identification, record: Record) -> bool:
+    """Return whether to ask a record if its relay worked in the right direction."""
+    gains = record.settings is not None and record.outcome not in _NO_GAINS
+    return gains and chosen.method == DEFAULT_METHOD
+
+
+def analyse_jointly(
+    records: Sequence[Record],
+    *,
+    method: str,
+    rule: str = DEFAULT_RULE,
+    known: Known = NOTHING,
+    options: DesignOptions | None = None,
+    rng: np.random.Generator | None = None,
+) -> Analysis:
+    """Identify one model from several records of a process and, where all were completed, tune.
+
+    :param records: the experiments, at least one; the first stands for all in the result.
+    :param method: one of ``JOINT_METHODS``.
+    :param rule: the rule whose gains count.
+    :param known: what is known of the process beforehand.
+    :param options: as for :func:`analyse`.
+    :param rng: as for :func:`analyse`.
+    :raises RelayAutotuneError: if method or rule are unknown.
+    """
+    rule_named(rule)
+    first = records[0]
+    cycles: tuple[Cycle, ...] = ()
+    try:
+        cycles = cycles_of(first)
+        chosen = identify_jointly(records, method, known)
+    except RelayAutotuneError as error:
+        return Analysis(first, cycles, reason=_with_outcome(first, str(error)))
+    told = unequal_amplitudes(records, chosen.model)
+    if told:
+        chosen = replace(chosen, warnings=(*chosen.warnings, told))
+    found = Analysis(first, cycles, assess((chosen,), first), 0)
+    for record in records:
+        if record.outcome in _NO_GAINS:
+            why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
+            return replace(found, reason=why)
+    return _tuned(found, _first(rule), rng, _simple(records, known, chosen), options)
+
+
+def _first(rule: str) -> tuple[str, ...]:
+    """Return the names of all rules, the chosen one first."""
+    return (rule, *(name for name in RULES if name != rule))
+
+
+def _simple(
+    records: Sequence[Record], known: Known, chosen: Identification
+) -> TransferFunction | None:
+    """Return the FOPDT that fits best, on which most rules are built; None if there is none."""
+    if chosen.structure == "fopdt":
+        return chosen.model
+    try:
+        found = identify_jointly(records, DEFAULT_METHOD, replace(known, structure="fopdt"))
+    except RelayAutotuneError:
+        return None
+    return found.model
+
+
+def _tuned(
+    found: Analysis,
+    rules: Sequence[str],
+    rng: np.random.Generator | None,
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
+) -> Analysis:
+    """Add the gains of the rules that apply to the selected model; the first one has to."""
+    if _dead_time_is_open(found.models[0]):
+        return replace(found, reason=_OPEN_DEAD_TIME)
+    task = _task(found, rng, simple, options)
+    try:
+        first = design(task, rules[0])
+    except TuningError as error:
+        return replace(found, reason=f"no gains: {error}")
+    gains = [first]
+    for name in rules[1:]:
+        try:
+            gains.append(design(task, name))
+        except TuningError:
+            # A rule that does not apply has nothing to compare.
+            continue
+    delay = task.options.added_delay
+    return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
+
+
+def _with_prediction(
+    found: Analysis,
+    rule: str,
+    rng: np.random.Generator | None,
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
+) -> Analysis:
+    """Add the Ms that the gains of a rule would have on the model and on those around it."""
+    task = _task(found, rng, simple, options)
+    return replace(found, predicted=predicted_ms(task, rule_named(rule)))
+
+
+def _task(
+    found: Analysis,
+    rng: np.random.Generator | None,
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
+) -> DesignTask:
+    chosen = found.models[0]
+    return DesignTask(
+        model=chosen.model,
+        options=_with_noise(options or DesignOptions(), found),
+        simple=simple,
+        models=ensemble(chosen, rng=rng or np.random.default_rng(0)),
+        describing=_describing_point(found),
+    )
+
+
+def _dead_time_is_open(chosen: Identification) -> bool:
+    """Return whether the data go with any dead time, so that they bound no gain."""
+    high = dict(zip(chosen.parameters, chosen.ci95_high, strict=True)).get("dead_time", 0.0)
+    return math.isinf(high)
+
+
+def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
+    """Take noise, amplitude and sampling period from the record where they are not given."""
+    record, chosen = found.record, found.models[0]
+    if math.isnan(options.noise_std):
+        measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
+        options = replace(options, noise_std=measured)
+    if math.isnan(options.amplitude):
+        # Of another's experiment, half of what the command moved.
+        settings, half = record.settings, 0.5 * float(np.ptp(record.command))
+        options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
+    if options.sample_period == 0.0 and len(record) > 1:
+        # The controller will see the same measurement.
+        options = replace(options, sample_period=float(np.median(np.diff(record.time))))
+    return options
+
+
+def _describing_point(found: Analysis) -> UltimatePoint | None:
+    """Return what the describing function reads from the limit cycle; None: there is none."""
+    settings = found.record.settings
+    if not found.cycles or settings is None:
+        return None
+    cycle = limit_cycle(found.cycles)
+    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
+    if not amplitude > 0.0:
+        return None
+    return describing_point_of_cycle(
+        cycle.period,
+        cycle.period_high,
+        amplitude,
+        settings.amplitude,
+        found.models[0].model.process_sign,
+    )
+
+
+def _guarded(record: Record, method: str, known: Known) -> Identification:
+    try:
+        return identify(record, method, known)
+    except RelayAutotuneError:
+        raise
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        # A search that meets a number that is not finite says so with a ValueError.
+        raise IdentificationError(
+            f"{method} broke down on this record ({error}): it holds no usable response"
+        ) from error
+
+
+def _others(
+    record: Record, method: str, known: Known, chosen: Identification
+) -> list[Identification]:
+    """Models of the other methods, for comparison; one that does not apply is left out.
+
+    The first is the FOPDT that fits best, on which most rules are built.
+    """
+    wanted = [(DEFAULT_METHOD, replace(known, structure="fopdt"))]
+    wanted += [(name, known) for name in METHODS if name not in (method, DEFAULT_METHOD)]
+    if chosen.method == DEFAULT_METHOD and chosen.structure == "fopdt":
+        wanted = wanted[1:]
+    found = []
+    for name, facts in wanted:
+        try:
+            found.append(_guarded(record, name, facts))
+        except RelayAutotuneError:
+            continue
+    return found
+
+
+def _with_outcome(record: Record, reason: str) -> str:
+    refused = _NO_GAINS.get(record.outcome)
+    return f"{refused} ({record.reason}); {reason}" if refused else reason

@@ -1,0 +1,1 @@
+"""Controllers that run on a loop, and the proof of their gains."""

@@ -1,0 +1,187 @@
+r"""A PI or PID controller as it runs on a loop: from sample to sample, by hand or by itself.
+
+The law is that of :class:`~relay_autotune.tuning.gains.Controller`, sample by sample as in
+:class:`~relay_autotune.control.sampled.PidLaw`,
+
+    u = kc (b r - yf + (1/ti) int (r - yf) dt - td dyf/dt),   yf = y/(1 + tf s + (tf s)^2/2),
+
+with the integral advanced by the backward rule and drawn back by what the limits cut off
+(back-calculation, Astrom and Hagglund 1995, section 3.5). Whatever is changed while it runs (the
+gains, the limits, from manual to automatic), the integral takes up the difference, so that the
+command goes on from where it was.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.control.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import FloatArray
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.loop.closed_loop import ClosedLoop
+
+# A sample interval within this part of the nominal one uses the filter of that one.
+_JITTER = 0.2
+# An interval longer than so many nominal ones is a gap: the integral does not run on through it.
+_LONGEST_INTERVAL = 5.0
+
+
+class PidController:
+    """Answer each measurement with a command.
+
+    :param gains: the controller; None: it only holds its command.
+    :param command: command from which it starts [u].
+    :param limits: range of the command.
+    :param automatic: False: it starts in manual.
+    :param usual_interval: an interval of samples that is no gap [s]; 0: the first one tells.
+    """
+
+    def __init__(
+        self,
+        gains: Controller | None,
+        command: float,
+        *,
+        limits: Limits = UNLIMITED,
+        automatic: bool = True,
+        usual_interval: float = 0.0,
+    ) -> None:
+        self._gains = gains
+        self._limits = limits
+        self._automatic = automatic
+        self._command = limits.clip(command)
+        self._law: PidLaw | None = None
+        self._time = math.nan
+        self._nominal = math.nan
+        self._usual = usual_interval
+        self._motion = filter_matrices(0.0, 1.0)
+        self._align = True
+
+    @property
+    def command(self) -> float:
+        """The last command [u]."""
+        return self._command
+
+    @property
+    def gains(self) -> Controller | None:
+        """The gains in force."""
+        return self._gains
+
+    @property
+    def is_automatic(self) -> bool:
+        """True if it controls, False if it holds its command."""
+        return self._automatic and self._gains is not None
+
+    def use(self, gains: Controller | None) -> None:
+        """Take other gains without a bump.
+
+        :param gains: the gains; None: hold the command.
+        """
+        self._gains = gains
+        self._nominal = math.nan
+        self._align = True
+
+    def limit(self, limits: Limits) -> None:
+        """Take other limits.
+
+        :param limits: range of the command.
+        """
+        self._limits = limits
+        self._command = limits.clip(self._command)
+
+    def switch(self, *, automatic: bool) -> None:
+        """Go to automatic, from the present command on, or to manual."""
+        self._automatic = automatic
+        self._align = True
+
+    def track(self, command: float) -> None:
+        """Take over what somebody else commands, to go on from there [u]."""
+        self._command = self._limits.clip(command)
+        self._align = True
+
+    def step(self, time: float, setpoint: float, measurement: float) -> float:
+        """Take a sample and return the command [u].
+
+        :param time: of the sample [s], not decreasing.
+        :param setpoint: [y].
+        :param measurement: [y]; one that is not finite is passed over, as is a set-point.
+        """
+        if not (math.isfinite(measurement) and math.isfinite(setpoint)):
+            return self._command
+        interval = 0.0 if math.isnan(self._time) else max(time - self._time, 0.0)
+        self._time = time
+        gains = self._gains
+        if gains is None:
+            return self._command
+        law = self._heard(gains, interval, measurement)
+        if self._align or not self._automatic:
+            # The integral is what makes the command go on from where it is.
+            law.integral = self._command - law.proportional(gains, setpoint)
+            self._align = False
+            return self._command
+        if not math.isnan(self._nominal):
+            interval = min(interval, _LONGEST_INTERVAL * max(self._nominal, self._usual))
+        self._command = law.command(gains, setpoint, interval, self._limits)
+        return self._command
+
+    def _heard(self, gains: Controller, interval: float, measurement: float) -> PidLaw:
+        """Take a measurement over an interval that may be another one each time."""
+        law = self._law
+        if law is None:
+            self._law = law = PidLaw(measurement, self._command)
+        elif interval > 0.0:
+            near = abs(interval - self._nominal) <= _JITTER * self._nominal
+            motion = self._motion
+            if not near:
+                motion = filter_matrices(gains.tf, interval)
+                if math.isnan(self._nominal):
+                    self._nominal, self._motion = interval, motion
+            law.hear(motion, measurement)
+        else:
+            law.replace_last(measurement)
+        return law
+
+
+def run_loop(
+    gains: Controller,
+    model: TransferFunction,
+    time: FloatArray,
+    *,
+    setpoint: float = 0.0,
+    load: float = 0.0,
+    limits: Limits = UNLIMITED,
+) -> ClosedLoop:
+    """Run the controller on the exact process, which rests, from a step of set-point and load on.
+
+    :param gains: the controller.
+    :param model: the process.
+    :param time: instants of the samples [s], increasing, the first at the step, shape (n,).
+    :param setpoint: step of the set-point [y].
+    :param load: step added to the command [u].
+    :param limits: range of the command, as deviations [u].
+    """
+    plant = Plant(model)
+    controller = PidController(gains, 0.0, limits=limits)
+    interval = float(np.median(np.diff(time))) if time.size > 1 else 1.0
+    controller.step(-interval, 0.0, 0.0)
+    measurement, command = np.empty(time.size), np.empty(time.size)
+    applied = 0.0
+    for k, t in enumerate(time - time[0]):
+        y = plant.advance(float(t), applied)
+        u = controller.step(float(t), setpoint, y)
+        applied = u + load
+        measurement[k], command[k] = y, u
+    return ClosedLoop(time, measurement, command)
+
+
+def scaled(model: TransferFunction, factor: float) -> TransferFunction:
+    """Return a model with another gain.
+
+    :param model: the process.
+    :param factor: on its gain.
+    """
+    return replace(model, gain=factor * model.gain)

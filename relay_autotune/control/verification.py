@@ -1,0 +1,269 @@
+"""Try gains with a step, and compare with what the model predicts for the same step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from relay_autotune.control.controller import run_loop, scaled
+from relay_autotune.control.sampled import UNLIMITED, Limits
+from relay_autotune.errors import TuningError
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import FloatArray
+from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.loop.analysis import frequencies, is_stable, sensitivity_peaks
+
+# A response has settled when it stays within this part of its largest deviation.
+SETTLED = 0.05
+# A step is watched for so many times the predicted settling time, and for so many samples.
+WATCHED = 1.6
+LEAST_SAMPLES = 30
+
+# What may differ from the prediction: a difference of overshoot, a ratio of settling times and of
+# IAE, a gain, and a peak of sensitivity.
+OVERSHOOT_MARGIN = 0.15
+SETTLING_RATIO = 2.0
+IAE_RATIO = 1.6
+GAIN_RANGE = (0.6, 1.7)
+MS_RATIO = 1.3
+# So many standard deviations of the noise are left out of each comparison.
+_NOISE = 3.0
+# A deviation so many times larger than the prediction's largest ends the step at once.
+RUNAWAY = 3.0
+
+_GAIN_SEARCH = (0.3, 3.0)
+_PREDICTED_SAMPLES = 4000
+_DOUBLINGS = 8
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a closed loop.
+
+    :param setpoint: height of the set-point's step [y]; 0: none.
+    :param load: height of the step added to the command [u]; 0: none.
+    """
+
+    setpoint: float = 0.0
+    load: float = 0.0
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a response to a step was like.
+
+    :param overshoot: of a set-point step, beyond it, as a fraction; of a load step, the largest
+        deviation to the other side, as a fraction of the largest.
+    :param settling_time: after it the error stays within 5 % of its largest [s].
+    :param iae: integral of the absolute error [y s].
+    :param largest: the largest deviation from where it began [y].
+    """
+
+    overshoot: float
+    settling_time: float
+    iae: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A measured step beside the predicted one.
+
+    :param step: the step.
+    :param passed: True if every comparison is within its tolerance.
+    :param reason: what was compared, with numbers.
+    :param measured: the measured response.
+    :param expected: the predicted one.
+    :param predicted: predicted deviation at each sample [y], shape (n,).
+    :param fit: 1 - rms(difference)/rms(predicted about its mean).
+    :param gain_ratio: factor on the model's gain that fits best.
+    :param ms: largest sensitivity with that gain; NaN: the loop would be unstable.
+    :param ms_predicted: likewise with the model as identified.
+    """
+
+    step: Step
+    passed: bool
+    reason: str
+    measured: Response
+    expected: Response
+    predicted: FloatArray
+    fit: float
+    gain_ratio: float
+    ms: float
+    ms_predicted: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How long a step is watched, and what would be too much.
+
+    :param step: the step.
+    :param duration: s.
+    :param runaway: deviation from rest that ends it at once [y].
+    """
+
+    step: Step
+    duration: float
+    runaway: float
+
+
+def plan(
+    gains: Controller, model: TransferFunction, step: Step, period: float, noise_std: float = 0.0
+) -> Plan:
+    """Return how long a step has to be watched.
+
+    :param gains: the controller.
+    :param model: the process.
+    :param step: the step.
+    :param period: sample period of the loop [s].
+    :param noise_std: standard deviation of the measurement noise [y].
+    :raises TuningError: if the loop is unstable on the model, or does not settle.
+    """
+    if not is_stable(gains, model):
+        raise TuningError("these gains make an unstable loop with the model: nothing to verify")
+    horizon = max(8.0 * (gains.ti + model.dead_time), LEAST_SAMPLES * period)
+    for _ in range(_DOUBLINGS):
+        # A slow loop is predicted with fewer samples than it has.
+        interval = max(period, horizon / _PREDICTED_SAMPLES)
+        time = np.arange(int(horizon / interval) + 2, dtype=np.float64) * interval
+        run = run_loop(gains, model, time, setpoint=step.setpoint, load=step.load)
+        response = describe(time, run.measurement, step)
+        if response.settling_time < 0.6 * horizon:
+            duration = max(WATCHED * response.settling_time, LEAST_SAMPLES * period)
+            return Plan(step, duration, RUNAWAY * response.largest + 10.0 * noise_std)
+        horizon *= 2.0
+    raise TuningError("the predicted response does not settle in any reasonable time")
+
+
+def describe(
+    time: FloatArray, deviation: FloatArray, step: Step, noise_std: float = 0.0
+) -> Response:
+    """Return what a response was like.
+
+    :param time: instants of the samples from the step on [s], shape (n,).
+    :param deviation: of the measurement from where it was before the step [y], shape (n,).
+    :param step: the step.
+    :param noise_std: standard deviation of the noise, which is no error [y].
+    """
+    error = step.setpoint - deviation
+    allowed = _NOISE * noise_std
+    if step.setpoint != 0.0:
+        way = deviation / step.setpoint
+        overshoot = max(0.0, float(way.max()) - 1.0 - allowed / abs(step.setpoint))
+        band = SETTLED * abs(step.setpoint) + allowed
+    else:
+        side = 1.0 if deviation.max() >= -deviation.min() else -1.0
+        top, other = float((side * deviation).max()), float((-side * deviation).max())
+        overshoot = max(0.0, other - allowed) / top if top > 0.0 else 0.0
+        band = SETTLED * top + allowed
+    outside = np.flatnonzero(np.abs(error) > band)
+    settled = 0 if outside.size == 0 else min(int(outside[-1]) + 1, time.size - 1)
+    # Noise alone has a mean absolute value of sqrt(2/pi) standard deviations.
+    absolute = np.maximum(np.abs(error) - math.sqrt(2.0 / math.pi) * noise_std, 0.0)
+    return Response(
+        overshoot=overshoot,
+        settling_time=float(time[settled] - time[0]),
+        iae=float(np.sum(0.5 * (absolute[1:] + absolute[:-1]) * np.diff(time))),
+        largest=float(np.max(np.abs(deviation))),
+    )
+
+
+def compare(
+    gains: Controller,
+    model: TransferFunction,
+    step: Step,
+    time: FloatArray,
+    deviation: FloatArray,
+    *,
+    limits: Limits = UNLIMITED,
+    noise_std: float = 0.0,
+) -> Comparison:
+    """Compare a measured step with the prediction.
+
+    :param gains: the controller.
+    :param model: the process as identified.
+    :param step: the step.
+    :param time: instants of the samples, the first at the step [s], shape (n,).
+    :param deviation: of the measurement from where it was before the step [y], shape (n,).
+    :param limits: range of the command about where it was [u].
+    :param noise_std: standard deviation of the measurement noise [y].
+    """
+
+    def predict(factor: float) -> FloatArray:
+        run = run_loop(
+            gains,
+            scaled(model, factor),
+            time,
+            setpoint=step.setpoint,
+            load=step.load,
+            limits=limits,
+        )
+        return run.measurement
+
+    def misfit(log_factor: float) -> float:
+        difference = deviation - np.nan_to_num(predict(math.exp(log_factor)), nan=1e9)
+        return float(np.mean(np.minimum(difference**2, 1e12)))
+
+    predicted = predict(1.0)
+    low, high = (math.log(end) for end in _GAIN_SEARCH)
+    best = minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 1e-3})
+    ratio = math.exp(float(best.x))
+    spread = float(np.std(predicted))
+    rms = math.sqrt(float(np.mean((deviation - predicted) ** 2)))
+    measured = describe(time, deviation, step, noise_std)
+    expected = describe(time, predicted, step)
+    ms, ms_predicted = _ms(gains, scaled(model, ratio)), _ms(gains, model)
+    problems = _problems(measured, expected, ratio, ms, ms_predicted, time)
+    numbers = (
+        f"overshoot {measured.overshoot:.0%} (predicted {expected.overshoot:.0%}), "
+        f"settling {measured.settling_time:.3g} s ({expected.settling_time:.3g} s), "
+        f"IAE {measured.iae:.3g} ({expected.iae:.3g}), Ms {ms:.2f} ({ms_predicted:.2f}), "
+        f"gain {ratio:.2f} times the model's"
+    )
+    return Comparison(
+        step=step,
+        passed=not problems,
+        reason="; ".join((*problems, numbers)),
+        measured=measured,
+        expected=expected,
+        predicted=predicted,
+        fit=1.0 - rms / spread if spread > 0.0 else math.nan,
+        gain_ratio=ratio,
+        ms=ms,
+        ms_predicted=ms_predicted,
+    )
+
+
+def _ms(gains: Controller, model: TransferFunction) -> float:
+    if not is_stable(gains, model):
+        return math.nan
+    loop = gains.loop(model)
+    return sensitivity_peaks(loop, frequencies(loop))[0]
+
+
+def _problems(
+    measured: Response,
+    expected: Response,
+    ratio: float,
+    ms: float,
+    ms_predicted: float,
+    time: FloatArray,
+) -> list[str]:
+    interval = float(np.median(np.diff(time)))
+    problems = []
+    if measured.overshoot > expected.overshoot + OVERSHOOT_MARGIN:
+        problems.append("the overshoot is larger than predicted")
+    if measured.settling_time > SETTLING_RATIO * expected.settling_time + 2.0 * interval or (
+        measured.settling_time >= float(time[-1] - time[0])
+    ):
+        problems.append("it settles later than predicted, or not at all")
+    if measured.iae > IAE_RATIO * expected.iae:
+        problems.append("the error lasts longer than predicted")
+    if not GAIN_RANGE[0] <= ratio <= GAIN_RANGE[1]:
+        problems.append("the process has another gain than the model")
+    if not ms <= MS_RATIO * ms_predicted:
+        problems.append("the loop is less robust than predicted")
+    return problems

@@ -1,0 +1,393 @@
+"""The relay experiment: fed with samples, it answers with commands and records both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from relay_autotune.errors import ParameterError
+from relay_autotune.experiment.faults.repetition import SilenceWatch
+from relay_autotune.experiment.faults.sample_check import SampleCheck
+from relay_autotune.experiment.faults.sensor_watch import FrozenWatch
+from relay_autotune.experiment.parameters import PARAMETERS, ExperimentParameters, Parameter
+from relay_autotune.experiment.procedure import Procedure, State
+from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy
+from relay_autotune.experiment.samples import Samples
+from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
+
+__all__ = [
+    "PARAMETERS",
+    "ExperimentParameters",
+    "Parameter",
+    "RelayExperiment",
+    "SafePolicy",
+    "State",
+]
+
+_OUTCOMES = {
+    State.COMPLETED: Outcome.COMPLETED,
+    State.ABORTED: Outcome.ABORTED,
+    State.FAILED: Outcome.FAILED,
+}
+
+
+_BASELINE = SafePolicy()
+
+
+class RelayExperiment:
+    """Run one relay experiment: call :meth:`step` for each measurement, send what it returns.
+
+    :mod:`relay_autotune.experiment.procedure` has the states. Whatever the state, :meth:`abort`
+    and a measurement outside its limits end the experiment as ABORTED; a sample that cannot be
+    used, a frozen sensor and max_duration end it as FAILED. It does not raise on bad data:
+    :attr:`reason` says why it ended. It has no clock: time comes in with the samples, on any
+    origin.
+
+    :param parameters: what the user set.
+    :param baseline: command of the operating point [u].
+    :param experiment_id: the id that the record will carry.
+    :param policy: how the process is left at the end.
+    :param until_converged: False: cycles that agree do not end it, but :meth:`conclude` or
+        max_cycles does.
+    :raises ParameterError: if a parameter is out of range, or some contradict each other.
+    """
+
+    def __init__(
+        self,
+        parameters: ExperimentParameters,
+        baseline: float,
+        experiment_id: str = "",
+        *,
+        policy: SafePolicy = _BASELINE,
+        until_converged: bool = True,
+    ) -> None:
+        parameters.validate(baseline)
+        self.parameters = parameters
+        self.experiment_id = experiment_id
+        self.baseline = float(baseline)
+        self.safe_command = self.baseline if math.isnan(policy.command) else policy.command
+        """What is commanded after an abort or a failure, where nothing holds the process [u]."""
+        self._policy = policy
+        self._hold: ProportionalHold | None = None
+        self._samples = Samples()
+        self._frozen = FrozenWatch()
+        self._silence = SilenceWatch()
+        self._check = SampleCheck()
+        self._procedure = Procedure(
+            parameters, self.baseline, self._samples, until_converged=until_converged
+        )
+        self._origin = math.nan
+
+    @property
+    def state(self) -> State:
+        """Where the experiment is."""
+        return self._procedure.state
+
+    @property
+    def finished(self) -> bool:
+        """True once the experiment has ended, however it ended."""
+        return self._procedure.state in _OUTCOMES
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended: completed; aborted by someone or by a limit; failed; UNKNOWN before."""
+        return _OUTCOMES.get(self._procedure.state, Outcome.UNKNOWN)
+
+    @property
+    def reason(self) -> str:
+        """Why it ended, a sentence for people; empty before."""
+        reason, repeated = self._procedure.reason, self._silence.repeated
+        if not (reason and repeated):
+            return reason
+        told = f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
+        silent = self._silence.silence
+        if self.outcome is Outcome.COMPLETED or not silent > 0.0:
+            return told
+        return f"{told}, at the end for {silent:.3g} s: check it first"
+
+    @property
+    def settings(self) -> RelaySettings | None:
+        """What the relay does; None until the measurement has settled.
+
+        While the sign of the process gain is not known, ``reverse_acting`` is False.
+        """
+        return self._procedure.settings
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of the measurement at rest [y]; NaN until it has settled."""
+        return self._procedure.rest.noise_std
+
+    @property
+    def rest_measurement(self) -> float:
+        """Mean measurement at rest at the baseline [y]; NaN until it has settled."""
+        return self._procedure.rest.mean
+
+    @property
+    def dead_time_seen(self) -> float:
+        """Time from the kick to the last sample before the response [s]; NaN until it is seen.
+
+        Without noise the dead time lies between this and one sample interval more. With noise
+        this is longer, by the time that the response takes to leave the noise band.
+        """
+        return self._procedure.dead_time_seen
+
+    @property
+    def process_gain_sign(self) -> int:
+        """1 or -1 as given or found; 0 while unknown."""
+        return self._procedure.sign
+
+    @property
+    def cycles(self) -> tuple[Cycle, ...]:
+        """The whole cycles so far."""
+        return tuple(self._procedure.cycles)
+
+    @property
+    def cycle_count(self) -> int:
+        """Number of whole cycles so far."""
+        return len(self._procedure.cycles)
+
+    @property
+    def switches(self) -> int:
+        """Number of switches of the relay so far; two of them are a half cycle."""
+        return self._procedure.switches
+
+    @property
+    def cycle_start(self) -> tuple[int, ...]:
+        """Index of the first sample of each cycle, as in a record."""
+        return tuple(self._procedure.cycle_start)
+
+    @property
+    def sample_count(self) -> int:
+        """Number of samples recorded."""
+        return len(self._samples)
+
+    @property
+    def elapsed(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return self._samples.time[-1] if self._samples else 0.0
+
+    @property
+    def kicked_at(self) -> float:
+        """Time of the kick from the first sample on [s]; NaN before."""
+        return self._procedure.kicked_at
+
+    @property
+    def cycles_left(self) -> int:
+        """Number of cycles until the end, as far as one can tell; at least 1 while it runs."""
+        return max(self.parameters.min_cycles + 1 - self.cycle_count, 0 if self.finished else 1)
+
+    @property
+    def remaining(self) -> float:
+        """Expected time until the end [s]; NaN before the first whole cycle."""
+        if self.finished:
+            return 0.0
+        cycles = self._procedure.cycles
+        return self.cycles_left * cycles[-1].period if cycles else math.nan
+
+    @property
+    def progress(self) -> float:
+        """How much of the experiment is done, from 0 to 1, as far as one can tell."""
+        if self.state is State.RELAY:
+            done = self.cycle_count
+            return 0.1 + 0.9 * done / (done + self.cycles_left)
+        return {State.SETTLING: 0.0, State.KICK: 0.05, State.PROBE: 0.05}.get(self.state, 1.0)
+
+    def samples(self, first: int, stop: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return time [s], measurement [y] and command [u] of the samples first to stop - 1."""
+        return self._samples.columns(first, stop)
+
+    def record(
+        self,
+        receive_time: Sequence[float] | FloatArray | None = None,
+        command_time: Sequence[float] | FloatArray | None = None,
+        start: float = 0.0,
+        lost_samples: int = 0,
+    ) -> Record:
+        """Return all that was recorded so far, whether or not the experiment has ended.
+
+        The sample that ended it is the last one, if it was a number at a possible time; the
+        samples after the end are not recorded.
+
+        :param receive_time: when each sample arrived [s], on the relay's clock, counted from the
+            time of the first sample; entries beyond the samples recorded are dropped.
+        :param command_time: when each answer left [s], likewise.
+        :param start: time of the first sample [s since the epoch].
+        :param lost_samples: samples that the middleware is known to have lost.
+        :raises RecordError: if there is no sample.
+        """
+        # A sample that was being answered when the caller was struck by an error has no answer.
+        n = len(self._samples.command)
+        time, measurement, command = self._samples.columns(0, n)
+        return Record(
+            time=time,
+            measurement=measurement,
+            command=command,
+            receive_time=np.array([] if receive_time is None else receive_time[:n]),
+            command_time=np.array([] if command_time is None else command_time[:n]),
+            settings=self.settings,
+            noise_std=self.noise_std,
+            cycle_start=self.cycle_start,
+            outcome=self.outcome,
+            reason=self.reason,
+            experiment_id=self.experiment_id,
+            start=start,
+            lost_samples=lost_samples,
+        )
+
+    def step(self, time: float, measurement: float) -> float:
+        """Take one sample and return the command that answers it.
+
+        :param time: when the sample was taken [s], on any origin; equal times are allowed.
+        :param measurement: the sample [y].
+        :returns: the command [u]; after the end that of :meth:`after_end`.
+        """
+        return self._take(time, measurement, repeated=False)
+
+    def repeat(self, time: float, measurement: float) -> float:
+        """Take the last measurement for a sample once more, since the sensor has been silent.
+
+        A sensor that speaks only when its value changes says so that it has not. The record holds
+        the sample like any other: it equals the one before.
+
+        :param time: the present time [s], on the axis of :meth:`step`.
+        :param measurement: what the sensor said last [y].
+        :returns: as :meth:`step`.
+        """
+        return self._take(time, measurement, repeated=True)
+
+    def _take(self, time: float, measurement: float, *, repeated: bool) -> float:
+        procedure, samples = self._procedure, self._samples
+        if procedure.state in _OUTCOMES:
+            return self.after_end(measurement)
+        last = samples.time[-1] if samples else -math.inf
+        problem = self._check.problem(time, measurement, last, self._origin)
+        if problem is not None:
+            procedure.end(State.FAILED, problem)
+            return self._ended(math.nan)
+        if not samples:
+            self._origin = float(time)
+        t, y = float(time) - self._origin, float(measurement)
+        samples.time.append(t)
+        samples.measurement.append(y)
+        over = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
+        command = self.baseline if over else procedure.answer(t, y)
+        if procedure.state in _OUTCOMES:
+            command = self._ended(y)
+        elif self.parameters.command_rate > 0.0:
+            command = self._rate_limited(command)
+        samples.command.append(command)
+        return command
+
+    def after_end(self, measurement: float) -> float:
+        """Return the command that answers a measurement after the end [u].
+
+        :param measurement: [y]; NaN: there is none.
+        """
+        if self._hold is not None:
+            return self._hold.command(measurement)
+        if self._procedure.state is State.COMPLETED and not self._policy.give_back:
+            return self.baseline
+        return self.safe_command
+
+    def conclude(self, reason: str) -> float:
+        """Complete the experiment now, with what there is; do nothing if it has ended.
+
+        :param reason: why, for people.
+        :returns: the command of :meth:`after_end` [u], to be sent now.
+        :raises ParameterError: if there is no half cycle, without which little is known.
+        """
+        if not self.finished:
+            if self.switches < 2:
+                raise ParameterError(
+                    "an experiment cannot be completed before its first half cycle; abort it"
+                )
+            self._procedure.end(State.COMPLETED, reason)
+            self._ended(math.nan)
+        return self.after_end(self._last_measurement())
+
+    def abort(self, reason: str, time: float | None = None) -> float:
+        """End the experiment from outside; do nothing if it has ended already.
+
+        :param reason: why, for people.
+        :param time: when [s], on the axis of :meth:`step`; default: at the last sample.
+        :returns: the command of :meth:`after_end` [u], to be sent now.
+        """
+        if not self.finished:
+            at = self.elapsed if time is None or not self._samples else time - self._origin
+            self._procedure.end(
+                State.ABORTED, f"{reason} (at {at:.6g} s, {self._procedure.where()})"
+            )
+            self._ended(math.nan)
+        return self.after_end(self._last_measurement())
+
+    def _last_measurement(self) -> float:
+        return self._samples.measurement[-1] if self._samples else math.nan
+
+    def _ended(self, measurement: float) -> float:
+        if self._policy.hold and not self._policy.give_back:
+            self._hold = ProportionalHold.after(
+                self.settings, self._procedure.cycles, self._policy.gain
+            )
+        return self.after_end(measurement)
+
+    def _rate_limited(self, wanted: float) -> float:
+        samples = self._samples
+        if len(samples) < 2:
+            return wanted
+        before = samples.command[-1]
+        step = self.parameters.command_rate * (samples.time[-1] - samples.time[-2])
+        return min(max(wanted, before - step), before + step)
+
+    def _passes_limit(self, t: float, y: float) -> bool:
+        """End the experiment if the last sample passes a limit; return True if it does."""
+        p, procedure = self.parameters, self._procedure
+        resting = procedure.state is State.SETTLING
+        if not p.measurement_min <= y <= p.measurement_max:
+            procedure.end(
+                State.ABORTED,
+                f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
+                f"to {p.measurement_max:g}",
+            )
+        elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:
+            procedure.end(
+                State.ABORTED,
+                f"the measurement {y:g} at {t:g} s is {self._deviation(y):g} away from the "
+                f"set-point, more than max_deviation, {p.max_deviation:g}",
+            )
+        elif 0.0 < p.max_duration < t:
+            procedure.end(
+                State.FAILED,
+                f"max_duration {p.max_duration:g} s was over {procedure.where()}: allow more time "
+                f"or fewer cycles",
+            )
+        return procedure.state in _OUTCOMES
+
+    def _is_dead(self, t: float, y: float, *, repeated: bool) -> bool:
+        """End the experiment if the sensor says no more; return True if so."""
+        procedure = self._procedure
+        if repeated:
+            longest = max((cycle.period for cycle in procedure.cycles), default=math.inf)
+            if self._silence.repeat(t, longest_cycle=longest):
+                procedure.end(
+                    State.FAILED,
+                    f"the measurement does not respond any more: none has come for "
+                    f"{self._silence.silence:.3g} s, much longer than before, "
+                    f"{procedure.where()}; check the sensor",
+                )
+            return procedure.state in _OUTCOMES
+        self._silence.hear(t, relaying=procedure.state is State.RELAY)
+        resting = procedure.state is State.SETTLING
+        if self._frozen.add(y, at_rest=resting, in_cycles=bool(procedure.cycles)):
+            procedure.end(
+                State.FAILED,
+                f"the sensor is frozen: its last {self._frozen.run} samples are all {y:g}, "
+                f"{procedure.where()}; check the sensor",
+            )
+        return procedure.state in _OUTCOMES
+
+    def _deviation(self, y: float) -> float:
+        settings = self._procedure.settings
+        return abs(y - settings.setpoint) if settings is not None else 0.0

@@ -1,0 +1,152 @@
+"""Why a measurement does not come back to the relay: what it did instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from relay_autotune.record.record import Cycle, FloatArray
+
+# A growth is taken for that of an instability after so many steps, each of which is larger than
+# the one before by this factor, to so many times the first swing: the transient of a stable loop
+# grows in steps that become smaller.
+_STEPS = 3
+_FASTER = 1.15
+_LARGER = 3.0
+
+# Growth is exponential if the last of so many steps by this factor took no longer than the one so
+# many before it, give or take: t^8, with which eight lags answer at first, takes 1.7 times as
+# long. Steps of fewer samples are too short to tell.
+_STEP, _LEAST_STEPS, _APART, _NO_LONGER = 8.0, 4, 2, 1.1
+_SAMPLES = 10
+# What falls below this part of what it had reached grows no more.
+_FALLEN = 0.05
+
+# Over its last third, a measurement that moves by less than this part of its whole way is level.
+_LEVEL = 0.03
+# What is no further than this part of its way from where it went last has not come back.
+_BACK = 0.1
+
+NO_ANSWER = (
+    "it does not respond: it has stood still since the command last changed; check the sensor, "
+    "and that the actuator follows"
+)
+"""What there is to say of a measurement that did nothing."""
+
+
+class RunawayWatch:
+    """Recognise exponential growth, as of an unstable process of which the relay has no hold.
+
+    Before the first cycle nothing is known of the process by which a distance could be called far,
+    but the answer of a stable one multiplies ever more slowly.
+
+    :param floor: distance from which steps count [y]; 0: from the first one above zero.
+    """
+
+    def __init__(self, floor: float) -> None:
+        self._floor = floor
+        self._next = _STEP * floor
+        self._passed: list[float] = []
+        self._samples = 0
+        self._above = False
+
+    def add(self, time: float, distance: float) -> bool:
+        """Take a sample; return True if it runs away.
+
+        :param time: its instant [s].
+        :param distance: from the set-point, of either sign [y].
+        """
+        away = abs(distance)
+        self._samples += 1
+        if (distance > 0.0) != self._above:
+            # What has turned back to the other side obeys the relay; from a passage through
+            # zero on, a distance multiplies fast whatever the process.
+            self._above = not self._above
+            self._passed.clear()
+        if away < self._next:
+            if away < _FALLEN * self._next:
+                self._passed.clear()
+                self._next = _STEP * self._floor
+            return False
+        # One at a time, so that a spike of the sensor is one.
+        self._passed.append(time)
+        self._next = _STEP * (self._next or away)
+        samples, self._samples = self._samples, 0
+        if len(self._passed) <= _LEAST_STEPS or samples < _SAMPLES:
+            return False
+        before, begin = self._passed[-1 - _APART], self._passed[-2 - _APART]
+        last = self._passed[-1] - self._passed[-2]
+        return last <= _NO_LONGER * (before - begin)
+
+
+def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> str:
+    """Say what the measurement did while the relay stayed at one level, and what may help.
+
+    :param time: instants of the samples of that stay [s], shape (n,).
+    :param towards: the samples, times 1 if the relay pushed upwards and -1 if downwards [y],
+        shape (n,).
+    :param noise_std: standard deviation of the noise [y].
+    """
+    thirds = [part for part in _thirds(time, towards) if len(part)]
+    if len(thirds) < 3:
+        return "there are too few samples to say why: check the sensor's rate"
+    first, second, third = (float(part.mean()) for part in thirds)
+    whole = float(towards.max() - towards.min())
+    still = 3.0 * noise_std / min(len(part) for part in thirds) ** 0.5
+    level = max(_LEVEL * whole, still)
+    # It may swing out for a while first; what counts is whether it came back from there.
+    way_back = float(towards[-1] - towards.min())
+    away = way_back <= max(_BACK * whole, level, 6.0 * noise_std)
+    if away and third - float(towards[0]) < -level:
+        faster = " faster and faster" if second - third > first - second > 0.0 else ""
+        rests = abs(third - second) <= level
+        other = (
+            "a load has come that the relay cannot bear"
+            if rests
+            else "the process is unstable and the amplitude too small to hold it"
+        )
+        return (
+            f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, or "
+            f"{other}"
+        )
+    if abs(third - second) <= level:
+        return (
+            "the response saturates before the relay's band: the amplitude may be too small for "
+            "the hysteresis or the set-point, a load may have come, or the actuator is at its end"
+        )
+    return (
+        "it moves towards the band, but too slowly for what was seen before: give a larger "
+        "amplitude or max_half_cycle, and let the process rest before the start"
+    )
+
+
+def has_moved(measurement: FloatArray) -> bool:
+    """Return True if a measurement has changed at all, or there is too little of it to tell.
+
+    :param measurement: the samples since the command last changed [y], shape (n,).
+    """
+    return len(measurement) < _SAMPLES or bool(measurement.max() > measurement.min())
+
+
+def _thirds(time: FloatArray, values: FloatArray) -> list[FloatArray]:
+    begin, span = float(time[0]), float(time[-1] - time[0])
+    edges = [begin + k * span / 3.0 for k in (1, 2)]
+    early, late = time < edges[0], time >= edges[1]
+    return [values[early], values[~early & ~late], values[late]]
+
+
+def is_growing(swings: Sequence[float]) -> bool:
+    """Return True if the swings of the cycles grow as those of an unstable loop do.
+
+    :param swings: peak to peak of each cycle so far [y].
+    """
+    last = swings[-(_STEPS + 1) :]
+    if len(last) <= _STEPS or last[0] <= 0.0 or last[-1] < _LARGER * last[0]:
+        return False
+    steps = [b - a for a, b in pairwise(last)]
+    return steps[0] > 0.0 and all(b >= _FASTER * a for a, b in pairwise(steps))
+
+
+def count_cycles(cycles: list[Cycle]) -> str:
+    """Say how many cycles there are."""
+    return f"{len(cycles)} whole cycle{'' if len(cycles) == 1 else 's'}"

@@ -1,0 +1,155 @@
+"""Checks that tell a linear model from a process that is none, on the data it was fitted to."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import IdentificationError, RecordError
+from relay_autotune.identification.shown.fourier import frequency_point
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import cycles_of
+from relay_autotune.record.record import PiecewiseConstant, Record
+
+FloatArray = NDArray[np.float64]
+
+_SURE = 4.5
+_LEAST_ASYMMETRY = 0.05
+_OTHER_AMPLITUDE = 1.2
+_LEAST_DISAGREEMENT = 0.03
+_LEAST_CYCLES = 3
+# With fewer samples in a cycle, straight lines between them miss more than a percent.
+_LEAST_SAMPLES = 24
+
+
+def unequal_gains(record: Record, model: TransferFunction) -> str | None:
+    """Say whether the process answers commands above and below the baseline differently.
+
+    The response to the part of the command above the baseline and to the part below it get a
+    gain each, in the least-squares sense, beside an offset and a drift; a heater that heats faster
+    than the room cools has two that differ.
+
+    :param record: the record, with the relay's settings.
+    :param model: the model fitted to it, with a stable or integrating process.
+    :return: a sentence, or None where the two agree, or cannot be told apart.
+    """
+    settings = record.settings
+    if settings is None or any(t.real < 0.0 for t in model.time_constants):
+        return None
+    u = record.input()
+    if u.initial != settings.baseline:
+        # Between two levels alone, either part is the other one scaled and moved.
+        return None
+    parts = []
+    for keep in (np.maximum, np.minimum):
+        values = keep(u.values - settings.baseline, 0.0)
+        initial = float(keep(u.initial - settings.baseline, 0.0))
+        if not bool(np.any(values)):
+            return None
+        parts.append(response(model, record.time, PiecewiseConstant(u.times, values, initial)))
+    (above, below), covariance = _factors(record, parts)
+    contrast = np.array((1.0, -1.0))
+    uncertainty = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
+    difference = abs(above - below)
+    if difference <= max(_SURE * uncertainty, _LEAST_ASYMMETRY):
+        return None
+    return (
+        f"commands above the baseline act {above:.2f} times as strongly as in the model, those "
+        f"below it {below:.2f} times: the process is not linear, and one set of gains is a "
+        "compromise; the weaker direction sets how fast the loop can be"
+    )
+
+
+def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:
+    """Say whether a process has another gain for larger changes of the command.
+
+    Each record's response gets a gain of its own, in the least-squares sense, beside an offset and
+    a drift; a valve that sticks, or a flow that goes with the root of a pressure, has gains that
+    hang on the amplitude.
+
+    :param records: tests of one process, at least two.
+    :param model: the model fitted to all of them, of a stable or integrating process.
+    :return: a sentence, or None where all agree, or no amplitude is a fifth larger than another.
+    """
+    if any(t.real < 0.0 for t in model.time_constants):
+        return None
+    swings, gains, deviations = [], [], []
+    for record in records:
+        u = record.input()
+        swings.append(0.5 * float(np.ptp(np.append(u.values, u.initial))))
+        factor, covariance = _factors(record, [response(model, record.time, u)])
+        gains.append(float(factor[0]))
+        deviations.append(math.sqrt(max(float(covariance[0, 0]), 0.0)))
+    least, most = int(np.argmin(swings)), int(np.argmax(swings))
+    if not swings[most] > _OTHER_AMPLITUDE * swings[least]:
+        return None
+    uncertainty = math.hypot(deviations[least], deviations[most])
+    if abs(gains[most] - gains[least]) <= max(_SURE * uncertainty, _LEAST_ASYMMETRY):
+        return None
+    return (
+        f"a command that moves by {swings[least]:.3g} to either side acts {gains[least]:.2f} "
+        f"times as strongly as in the model, one of {swings[most]:.3g} {gains[most]:.2f} times: "
+        "the process is not linear; tune with an amplitude like that of its normal operation"
+    )
+
+
+def _factors(record: Record, parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the factors of some responses in a record, and their covariance.
+
+    An offset and a drift are estimated beside them.
+
+    :param parts: each of the record's length.
+    """
+    line = record.time - record.time.mean()
+    columns = np.stack((*parts, np.ones(len(record)), line))
+    size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
+    size[size == 0.0] = 1.0
+    scaled = columns / size[:, None]
+    factors, *_ = np.linalg.lstsq(scaled.T, record.measurement, rcond=None)
+    residual = record.measurement - factors @ scaled
+    covariance = np.linalg.pinv(scaled @ scaled.T) * float(residual @ residual) / len(record)
+    count = len(parts)
+    return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]
+
+
+def disagreeing_point(record: Record, model: TransferFunction, gain_std: float) -> str | None:
+    """Say whether the model misses the frequency response that Fourier integrals give.
+
+    The point at the fundamental (Wang et al. 1997, eq 23) needs no structure; its scatter from
+    cycle to cycle is its uncertainty.
+
+    :param record: the record, with whole cycles.
+    :param model: the model fitted to it.
+    :param gain_std: relative standard deviation of the model's K_u, which lies near the point.
+    :return: a sentence, or None where the two agree, or the record has no settled limit cycle of
+        enough samples.
+    """
+    bounds = record.cycle_start
+    if len(bounds) <= _LEAST_CYCLES or not math.isfinite(gain_std):
+        return None
+    last = bounds[-_LEAST_CYCLES - 1 :]
+    if min(np.diff(last)) < _LEAST_SAMPLES or not cycles_of(record)[-1].converged:
+        return None
+    try:
+        whole = frequency_point(replace(record, cycle_start=last))
+        singles = [
+            frequency_point(replace(record, cycle_start=pair)) for pair in itertools.pairwise(last)
+        ]
+    except (IdentificationError, RecordError):
+        return None
+    ratios = np.array([s.value / complex(model(1j * s.frequency)) for s in singles])
+    scatter = float(np.std(ratios, ddof=1)) / math.sqrt(len(singles))
+    miss = abs(whole.value / complex(model(1j * whole.frequency)) - 1.0)
+    if miss <= max(_SURE * math.hypot(scatter, gain_std), _LEAST_DISAGREEMENT):
+        return None
+    return (
+        f"the Fourier integrals of the last cycles give a frequency response that is "
+        f"{100.0 * miss:.2g} % off the model's at {whole.frequency:.4g} rad/s: K_u is less "
+        "certain than its interval says"
+    )

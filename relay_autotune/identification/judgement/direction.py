@@ -1,0 +1,144 @@
+"""Whether a record speaks for a process of the other direction than its relay worked in.
+
+A process with an inverse response (a zero in the right half plane) first answers the other way.
+A relay of the wrong direction then oscillates on that first answer, and models of the relay's
+direction explain the cycles well enough, with a drift or a load for what they lack. The gains of
+such a model have the wrong sign, and the loop would run away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform import structures
+from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
+from relay_autotune.identification.waveform.lags import FOPDT
+from relay_autotune.identification.waveform.residuals import worth
+from relay_autotune.identification.waveform.separable import (
+    Problem,
+    State,
+    information_criterion,
+    problem_of,
+)
+from relay_autotune.identification.waveform.starts import (
+    Starts,
+    refine_best,
+    start_fopdt,
+    two_lags,
+)
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Input, PiecewiseConstant, Record
+
+FloatArray = NDArray[np.float64]
+
+_MOST_SAMPLES = 4096
+# Standard errors from which a correlation of neighbours counts as one.
+_CORRELATED = 2.0
+# Part of the measurement's range from which something was estimated beside the model.
+_BESIDE = 1e-6
+# Difference of the criterion from which the relay's own direction is clear, for odds of e^3.
+_CLEAR = 6.0
+# How many times the fast lag the slow one is at the start.
+_SLOWER = (2.0, 6.0, 20.0)
+# An answer that turns only so many times the test's length after a step is a drift.
+_HORIZON = 2.0
+_TRIAL = 1e-6
+
+
+def speaks_for_other(
+    found: Identification, record: Record, *, beside: int = 0
+) -> TransferFunction | None:
+    """Return a model of the other direction that may explain a record; None: there is none.
+
+    A process at rest before the relay needs neither drift nor load nor initial state in its own
+    direction, so the other one is given none of them, and is asked only where the model of the
+    relay's direction needs them or leaves something unexplained. The two are compared by the
+    Bayesian information criterion, and where it does not clearly speak for the relay's, the other
+    one may be true.
+
+    :param found: what was identified from all samples, in the direction of the relay.
+    :param record: the relay test.
+    :param beside: number of parameters that were estimated beside the model, as those of a load.
+    """
+    drive = record.drive()
+    residual = (record.measurement - found.fitted)[np.isfinite(found.fitted)]
+    moved, left_out = _moved_beside(found, record, drive), residual.size < len(record)
+    if not (moved or left_out or beside or worth(residual, _CORRELATED) < 1.0):
+        return None
+    sign, scale = found.model.process_sign, float(np.ptp(record.measurement))
+    y = (record.measurement - record.measurement[0]) / scale
+    whole = problem_of([(record.time, y, drive)], FOPDT)
+    problem = whole.thinned(_MOST_SAMPLES)
+    horizon = _HORIZON * float(record.time[-1] - drive.times[0])
+    inverse = [
+        f
+        for f in _inverse(problem, sign)
+        if f[0].process_sign == -sign and any(-horizon < z.real < 0.0 for z in f[0].zeros)
+    ]
+    if not inverse:
+        return None
+    n = problem.time.size
+    floor = n * NEGLIGIBLE**2
+    model, state = min(
+        inverse, key=lambda f: information_criterion(f[1].cost, n, f[1].parameters, floor)
+    )
+    # Both by what the samples are worth to the other one.
+    each = worth(state.residual)
+    parameters = len(found.parameters) + 1 + beside + moved + left_out
+    left = n * float(np.mean(residual**2)) / scale**2
+    told = information_criterion(left, n, parameters, floor, each)
+    other = information_criterion(state.cost, n, state.parameters, floor, each)
+    return model if other < told + _CLEAR else None
+
+
+def wrong_direction(other: TransferFunction) -> str:
+    """Return why there is no model where a record speaks for the other direction.
+
+    :param other: the model that it speaks for.
+    """
+    sign = other.process_sign
+    raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
+    return (
+        f"the relay took it that a higher command {lowers} the measurement, but the record goes "
+        f"as well with a process where it {raises} it in the end, after a first answer the other "
+        f"way: have the relay work in the other direction (process_gain_sign {sign}; 0: it is "
+        "found), or test again when nothing drifts"
+    )
+
+
+def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:
+    """Return whether more than an offset was estimated beside the model."""
+    stable = all(t.real > 0.0 for t in found.model.time_constants)
+    if not (stable and isinstance(drive, PiecewiseConstant)):
+        return True
+    rest: FloatArray = found.fitted - response(found.model, record.time, drive)
+    return not float(np.ptp(rest)) <= _BESIDE * float(np.ptp(record.measurement))
+
+
+def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, State]]:
+    """Fit what answers the other way at first; with other structures no oscillation stays.
+
+    In the direction of the relay, a FOPDT shows the fast part of an inverse response.
+    """
+    first = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
+    starts = Starts(problem, first)
+    fast, dead_time = starts.tau, starts.dead_time
+    tried = (
+        (structures.SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
+        (structures.INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
+    )
+    found = []
+    for structure, thetas in tried:
+        plain = replace(problem, structure=structure)
+        state = refine_best(plain, thetas, tolerance=_TRIAL)
+        reading = structure.read(state.theta, state.coefficients)
+        model = None if reading is None else reading.model
+        if model is not None:
+            found.append((model, state))
+    return found

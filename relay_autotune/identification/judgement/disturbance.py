@@ -1,0 +1,178 @@
+"""Leave out the part of a record that a disturbance has made useless."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification import Identification
+from relay_autotune.identification.shown.symmetric_cycle import roughness
+from relay_autotune.record.record import Cycle, PiecewiseConstant, Record
+
+# A fit is looked at again if its residual is larger than so many times the noise, known to 10 %
+# from the 50 samples before the test, and than this part of the measurement's spread; its record's
+# end alone is better if what it leaves beyond the noise is so much less.
+_MORE_THAN_NOISE = 1.3
+_MORE_THAN_SPREAD = 0.02
+_BETTER = 0.5
+# What is less probable than this as noise is looked at again for a load.
+_NOT_WHITE = 1e-6
+# With so many times the noise, and so much of the spread, left over, a model is another process's.
+_FAR_OFF_NOISE = 2.0
+_FAR_OFF_SPREAD = 0.05
+
+# A load is looked for in these structures, the second one being what was found without it.
+_SIMPLE = ("sopdt", "", "fopdt")
+
+# So many last cycles are kept.
+KEPT_CYCLES = 3
+
+
+def fits_badly(found: Identification, record: Record) -> bool:
+    """Return True if the model leaves more than noise, so that a disturbance may be the cause.
+
+    :param found: what was identified from the whole record.
+    :param record: the record.
+    """
+    residual, noise = found.fit.residual_rms, record.noise_std
+    if math.isnan(residual):
+        return False
+    if residual <= _MORE_THAN_SPREAD * float(np.std(record.measurement)):
+        return False
+    return math.isnan(noise) or residual > _MORE_THAN_NOISE * noise
+
+
+def is_contradicted(found: Identification, record: Record) -> bool:
+    """Return True if the model fits badly, or what it leaves is clearly no noise.
+
+    :param found: what was identified from the whole record.
+    :param record: the record.
+    """
+    if not found.fit.residual_rms > _MORE_THAN_SPREAD * float(np.std(record.measurement)):
+        return False
+    # Where the noise is not known, only its shape tells.
+    known = not math.isnan(record.noise_std)
+    return (known and fits_badly(found, record)) or found.fit.whiteness_p < _NOT_WHITE
+
+
+def is_far_off(found: Identification, record: Record) -> bool:
+    """Return True if the model leaves so much that its intervals say nothing.
+
+    :param found: what was identified.
+    :param record: its record.
+    """
+    residual = found.fit.residual_rms
+    if not residual > _FAR_OFF_SPREAD * float(np.std(record.measurement)):
+        return False
+    noise = roughness(record) if math.isnan(record.noise_std) else record.noise_std
+    return residual > _FAR_OFF_NOISE * noise
+
+
+def _unexplained(found: Identification, record: Record) -> float:
+    """Return what a model leaves beyond the noise, as a root mean square [y]."""
+    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
+    return math.sqrt(max(found.fit.residual_rms**2 - noise**2, 0.0))
+
+
+def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
+    """Return the end of a record, from the begin of its last cycles on.
+
+    A load that came before them is then part of the offset.
+
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :return: the end; None where nothing would be left out.
+    """
+    starts = record.cycle_start
+    if len(cycles) < KEPT_CYCLES + 1 or len(starts) < len(cycles) + 1:
+        return None
+    first = starts[-(KEPT_CYCLES + 1)]
+    origin = float(record.time[first])
+    held = record.held_input
+    if held is not None:
+        held = PiecewiseConstant(held.times - origin, held.values, held.initial)
+    return replace(
+        record,
+        time=record.time[first:] - origin,
+        measurement=record.measurement[first:],
+        command=record.command[first:],
+        receive_time=record.receive_time[first:] - origin,
+        command_time=record.command_time[first:] - origin,
+        cycle_start=tuple(s - first for s in starts if s >= first),
+        start=record.start + origin if record.start else 0.0,
+        held_input=held,
+    )
+
+
+def without_disturbance(
+    found: Identification,
+    record: Record,
+    cycles: tuple[Cycle, ...],
+    identify: Callable[[Record], Identification],
+) -> Identification:
+    """Identify the end of a record alone where that fits much better than the whole.
+
+    :param found: what was identified from the whole record.
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param identify: identifies a record by the same method.
+    :return: the better identification; what it has left out is a warning, and NaN in ``fitted``.
+    """
+    end = last_cycles(record, cycles) if fits_badly(found, record) else None
+    if end is None:
+        return found
+    try:
+        alone = identify(end)
+    except RelayAutotuneError:
+        return found
+    if not _unexplained(alone, record) < _BETTER * _unexplained(found, record):
+        return found
+    left_out = len(record) - len(end)
+    fitted = alone.fitted
+    if len(fitted) == len(end):
+        fitted = np.concatenate((np.full(left_out, math.nan), fitted))
+    warning = (
+        f"all before {record.time[left_out]:.4g} s is left out, since no model fits it together "
+        f"with the last {KEPT_CYCLES} cycles: a load or another disturbance came"
+    )
+    return replace(alone, fitted=fitted, warnings=(*alone.warnings, warning))
+
+
+def with_its_load(
+    found: Identification,
+    record: Record,
+    cycles: tuple[Cycle, ...],
+    identify: Callable[[Record, str], Identification],
+) -> tuple[Identification, Record]:
+    """Estimate a load step together with the model, where no model fits without one.
+
+    It is looked for in a simple structure first, since a model that was fitted without the load
+    has been bent to follow it.
+
+    :param found: what was identified.
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param identify: identifies a record in a structure, "": in the one that explains it, by the
+        method that fits samples.
+    :return: the identification and the record as it was driven; those given, where a load does
+        not explain what no model does.
+    """
+    samples = bool(cycles) and len(found.fitted) == len(record)
+    if not samples or record.continuous_command or not is_contradicted(found, record):
+        return found, record
+    # Imported here, since few records need it.
+    from relay_autotune.identification.judgement.load import identify_with_load
+
+    for structure in _SIMPLE:
+        try:
+            start = identify(record, structure) if structure else found
+            chosen = identify_with_load(start, record, lambda part: identify(part, ""))
+        except RelayAutotuneError:
+            continue
+        if chosen is not None and not is_contradicted(chosen[0], record):
+            return chosen
+    return found, record

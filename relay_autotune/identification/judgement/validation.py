@@ -1,0 +1,195 @@
+"""Whether an identified model reproduces the relay test that it was identified from.
+
+Thyagarajan and Yu 2003 run the relay experiment again on each model and look at the two curves
+beside each other (their Fig 9): models of different structure may share period and amplitude, but
+not the shape. Here the difference is a number, for the models of any method.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import IdentificationError, ModelError
+from relay_autotune.identification.shown.fold import Fold, as_switched, fold
+from relay_autotune.identification.shown.steady_state import SteadyState, steady_state
+from relay_autotune.process.response import response
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Cycle, Record, RelaySettings
+
+FloatArray = NDArray[np.float64]
+
+_POINTS = 512
+_FREQUENCIES = 4001
+_CYCLES = (8, 32, 128)
+_TOLERANCE = 1e-6
+_KICK = 0.1
+
+
+# What of two limit cycles is compared.
+DIFFERENCES = ("period", "period_high", "period_low", "peak_max", "peak_min", "shape")
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How a model's limit cycle differs from the record's, relative to the latter.
+
+    Differences of times are relative to the period, those of y to half of the record's peak to
+    peak.
+
+    :param period: of the whole period; NaN, like all below: the model has no limit cycle.
+    :param period_high: of the time with the command high.
+    :param period_low: of the time with the command low.
+    :param peak_max: of the highest measurement.
+    :param peak_min: of the lowest measurement.
+    :param shape: root mean square difference of the two curves, each from its own mean over its
+        own half of peak to peak, with the half periods laid upon each other, and without what
+        noise leaves of itself in the record's curve.
+    :param reason: why there is no limit cycle; empty if there is one.
+    """
+
+    period: float = math.nan
+    period_high: float = math.nan
+    period_low: float = math.nan
+    peak_max: float = math.nan
+    peak_min: float = math.nan
+    shape: float = math.nan
+    reason: str = ""
+
+    @property
+    def worst(self) -> float:
+        """Return the largest of them; infinite where the model has no limit cycle."""
+        if self.reason:
+            return math.inf
+        return max(abs(getattr(self, name)) for name in DIFFERENCES)
+
+
+def validate(model: TransferFunction, record: Record) -> Validation:
+    """Run the relay experiment of a record again on a model, and compare the limit cycles.
+
+    The relay has the record's levels of the command, and switches at the levels at which the
+    record's relay was seen to switch, which noise and sampling move a little away from the
+    hysteresis that was set.
+
+    :param model: any model.
+    :param record: the relay test.
+    :raises IdentificationError: if the record holds no whole cycle of a relay test.
+    """
+    seen = fold(record)
+    return validate_fold(model, seen, steady_state(record, seen.settings))
+
+
+def validate_fold(model: TransferFunction, seen: Fold, rest: SteadyState) -> Validation:
+    """Compare a model's limit cycle with an averaged period; see :func:`validate`.
+
+    :param model: any model.
+    :param seen: the averaged period.
+    :param rest: measurement under the baseline; where it was not measured, and the process comes
+        to rest at all, what the model and the means over the period make of it.
+    """
+    settings = as_switched(seen)
+    high, low, middle = seen.period_high, seen.period_low, seen.settings.setpoint
+    recorded = seen(_instants(high, low))
+    edges = [] if math.isnan(seen.edge) else [seen.edge, high + seen.edge]
+    peaks = np.append(recorded, seen(np.array(edges)))
+    size = 0.5 * float(np.ptp(peaks))
+    if not size > 0.0:
+        raise IdentificationError(
+            "the measurement is constant over the cycles: there is no limit cycle to compare with"
+        )
+    if model.process_sign * (-1 if settings.reverse_acting else 1) < 0:
+        return Validation(reason="the model's gain is against the direction of the relay")
+    try:
+        point = rest.value if rest.measured else _rest_by(model, seen, rest.value)
+        cycle, modelled = _limit_cycle(model, settings, point, _KICK * size)
+    except ModelError as error:
+        return Validation(reason=str(error))
+    weight = np.repeat([high, low], _POINTS)
+    away = _normalised(modelled, weight) - _normalised(recorded, weight)
+    power = float(np.average(away**2, weights=weight))
+    return Validation(
+        period=(cycle.period - seen.period) / seen.period,
+        period_high=(cycle.period_high - high) / seen.period,
+        period_low=(cycle.period_low - low) / seen.period,
+        peak_max=(cycle.peak_max - middle - float(np.max(peaks))) / size,
+        peak_min=(cycle.peak_min - middle - float(np.min(peaks))) / size,
+        shape=math.sqrt(max(power - (seen.curve_std / size) ** 2, 0.0)),
+    )
+
+
+def _rest_by(model: TransferFunction, seen: Fold, otherwise: float) -> float:
+    """Return the mean over a period less the gain times the mean command, from the baseline."""
+    if model.integrators or any(t.real <= 0.0 for t in model.time_constants):
+        return otherwise
+    high, low = seen.period_high, seen.period_low
+    weight = np.repeat([high, low], _POINTS)
+    mean = seen.settings.setpoint + float(np.average(seen(_instants(high, low)), weights=weight))
+    swing = seen.settings.amplitude * (high - low) / seen.period
+    return mean - model.gain * (seen.settings.bias + swing)
+
+
+def _limit_cycle(
+    model: TransferFunction, settings: RelaySettings, rest: float, kick: float
+) -> tuple[Cycle, FloatArray]:
+    """Return the limit cycle of a model, and its curve from the switch to high on."""
+    kick = max(settings.hysteresis, kick)
+    for count in _CYCLES:
+        run = simulate_relay(
+            model, settings, cycles=count, operating_point=rest, kick=kick, told=2
+        )
+        a, b = run.cycles[-2], run.cycles[-1]
+        change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
+        if change <= _TOLERANCE * b.period:
+            break
+    at = b.start + _instants(b.period_high, b.period_low)
+    if all(t.real > 0.0 for t in model.time_constants):
+        # What does not grow has its command's response in one step.
+        delayed = replace(model, dead_time=model.dead_time + settings.extra_delay)
+        return b, rest + response(delayed, at, run.command)
+    again = simulate_relay(model, settings, cycles=count, operating_point=rest, kick=kick, time=at)
+    return b, again.measurement
+
+
+def _instants(high: float, low: float) -> FloatArray:
+    """Return as many times in the half with the command high as in the other [s]."""
+    part = (np.arange(_POINTS) + 0.5) / _POINTS
+    return np.concatenate((part * high, high + part * low))
+
+
+def _normalised(y: FloatArray, weight: FloatArray) -> FloatArray:
+    return np.asarray((y - np.average(y, weights=weight)) / (0.5 * np.ptp(y)))
+
+
+def integrated_error(
+    model: TransferFunction,
+    process: TransferFunction,
+    frequency: float,
+    *,
+    relative: bool = True,
+) -> float:
+    """Return the error of a model over two decades about w_u (eqs 29 and 30).
+
+    ``int |G_m - G|/|G| dw`` from 0.1 w_u to 10 w_u; printed values of the paper's Table 3 do not
+    follow from it by any factor. Without the division the least error is that of the category
+    that the paper reports in all its examples, with it in all but one.
+
+    :param model: G_m.
+    :param process: G.
+    :param frequency: w_u [rad/s].
+    :param relative: False: without the division by |G|.
+    """
+    w = frequency * np.logspace(-1.0, 1.0, _FREQUENCIES)
+    process_response = process(1j * w)
+    error = np.abs(model(1j * w) - process_response)
+    if relative:
+        error = error / np.abs(process_response)
+    # In logarithmic steps, by Simpson's rule.
+    integrand = error * w
+    step = math.log(w[1] / w[0])
+    weights = np.ones(_FREQUENCIES)
+    weights[1:-1:2], weights[2:-1:2] = 4.0, 2.0
+    return float(np.sum(weights * integrand) * step / 3.0)

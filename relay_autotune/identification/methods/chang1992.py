@@ -1,0 +1,286 @@
+r"""Models of lags from the period and the amplitude of a relay test, exact in time.
+
+Chang, Shen and Yu, "Derivation of Transfer Function from Relay Feedback Systems", Ind. Eng. Chem.
+Res. 1992: models 1 to 3 (n equal lags, eqs 8 to 10), 4 (two lags, eq 11), 5 (two equal lags and
+one, eq 12), with the amplitude equations 21 to 25, of which eq 23 has the exponent 3/2 (printed:
+2/3). The gain and the dead time D are given.
+
+The period equations say that y = 0 where an ideal relay switches. With a hysteresis epsilon it is
+y = epsilon there, so that their exact generalisation has epsilon/(K h) for zero on the right-hand
+side; it is the default here, and a level of zero gives the paper's equations. The amplitude
+equations are the describing function's; with all the harmonics of eq 19 they are exact too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from scipy.optimize import brentq
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.methods.square_wave import level, peak, slope_sign
+
+_STEP = 1.1
+_LONGEST = 1e10
+_NEARLY_ONE = 1.0 - 1e-12
+_WITH_LAG = 1.0 - 1e-6
+
+
+def time_constant_from_period(
+    order: int, period: float, dead_time: float, switch_level: float = 0.0
+) -> float:
+    """Return tau of n equal lags from the period: eqs 8 (n = 1), 9 (2) and 10 (3), and any n.
+
+    The equation is F_n = epsilon/(K h), see
+    :mod:`~relay_autotune.identification.methods.square_wave`. The smallest of several roots is
+    the limit cycle that a relay starts, if y rises there. Eq 8 also has the trivial root
+    tau = infinity, which is excluded.
+
+    :param order: n >= 1.
+    :param period: P [s].
+    :param dead_time: D [s].
+    :param switch_level: epsilon/(K h), 0 for an ideal relay.
+    :raises IdentificationError: if no such process has this period; for n = 1 and an ideal relay
+        that is so unless P/4 < D < P/2.
+    """
+    _require_dead_time(period, dead_time)
+    _require_level(switch_level)
+    if order == 1 and switch_level == 0.0:
+        _require_fopdt(period, dead_time, 0.25)
+    part = 1.0 - 2.0 * dead_time / period
+    return _smallest(
+        order, period, part, lambda tau: level((tau,) * order, period, part) - switch_level
+    )
+
+
+def time_constant_from_amplitude(
+    order: int, period: float, relative_amplitude: float, harmonics: int | None = 1
+) -> float:
+    """Return tau of n equal lags from the amplitude: eqs 21 (n = 1), 22 (2), 23 (3), and any n.
+
+    :param order: n >= 1.
+    :param period: P [s].
+    :param relative_amplitude: a/(K h).
+    :param harmonics: terms of eq 19 that make the amplitude; 1: as the paper has it; None: all.
+    :raises IdentificationError: if the amplitude is too large for a process of this gain.
+    """
+    return _with_amplitude((1.0 / order,) * order, period, relative_amplitude, harmonics)[0]
+
+
+def two_time_constants(
+    period: float,
+    dead_time: float,
+    relative_amplitude: float,
+    switch_level: float = 0.0,
+    harmonics: int | None = 1,
+) -> tuple[float, float]:
+    """Return the two time constants of model 4, the larger first (eqs 11 and 24).
+
+    :param period: P [s].
+    :param dead_time: D [s].
+    :param relative_amplitude: a/(K h).
+    :param switch_level: epsilon/(K h), 0 for an ideal relay.
+    :param harmonics: terms of eq 19 that make the amplitude; 1: as the paper has it; None: all.
+    :raises IdentificationError: if the process has less lag than one lag or more than two equal
+        ones, so that there is no solution.
+    """
+    _require_dead_time(period, dead_time)
+    _require_level(switch_level)
+    part = 1.0 - 2.0 * dead_time / period
+
+    def lags(share: float) -> tuple[float, ...]:
+        return _with_amplitude((1.0 - share, share), period, relative_amplitude, harmonics)
+
+    def excess(share: float) -> float:
+        return level(lags(share), period, part) - switch_level
+
+    least = _with_amplitude((1.0,), period, relative_amplitude, harmonics)
+    if level(least, period, part) - switch_level <= 0.0:
+        raise IdentificationError(_outside("model 4", "less lag than one lag has", "model 1"))
+    if excess(0.5) > 0.0:
+        raise IdentificationError(
+            _outside("model 4", "more lag than two equal lags have", "model 3 or 5")
+        )
+    first, second = lags(_root(excess, 1e-12, 0.5))
+    return first, second
+
+
+def two_equal_and_one(
+    period: float,
+    dead_time: float,
+    relative_amplitude: float,
+    switch_level: float = 0.0,
+    harmonics: int | None = 1,
+) -> tuple[tuple[float, float], ...]:
+    """Return the time constants (repeated, single) of model 5 (eqs 12 and 25).
+
+    Between two equal lags and three there are two solutions, one with the larger constant
+    repeated and one with the smaller; period and amplitude do not tell them apart.
+
+    :param period: P [s].
+    :param dead_time: D [s].
+    :param relative_amplitude: a/(K h).
+    :param switch_level: epsilon/(K h), 0 for an ideal relay.
+    :param harmonics: terms of eq 19 that make the amplitude; 1: as the paper has it; None: all.
+    :return: one or two solutions, the one with the larger single constant first.
+    :raises IdentificationError: if the process has less lag than one lag or more than three
+        equal ones, so that there is no solution.
+    """
+    _require_dead_time(period, dead_time)
+    _require_level(switch_level)
+    part = 1.0 - 2.0 * dead_time / period
+
+    def lags(share: float) -> tuple[float, ...]:
+        # Two equal lags are the end of the second branch, where the single one vanishes.
+        shares = (share, share, max(1.0 - 2.0 * share, 1e-13))
+        return _with_amplitude(shares, period, relative_amplitude, harmonics)
+
+    def excess(share: float) -> float:
+        return level(lags(share), period, part) - switch_level
+
+    least = _with_amplitude((1.0,), period, relative_amplitude, harmonics)
+    if level(least, period, part) - switch_level <= 0.0:
+        raise IdentificationError(_outside("model 5", "less lag than one lag has", "model 1"))
+    if excess(1.0 / 3.0) > 0.0:
+        raise IdentificationError(
+            _outside("model 5", "more lag than three equal lags have", "more equal lags")
+        )
+    roots = [_root(excess, 1e-12, 1.0 / 3.0)]
+    if excess(0.5) > 0.0:
+        roots.append(_root(excess, 1.0 / 3.0, 0.5))
+    found = [lags(share) for share in roots]
+    return tuple((repeated, single) for repeated, _, single in found)
+
+
+def gain_and_time_constant(
+    order: int,
+    period: float,
+    amplitude: float,
+    dead_time: float,
+    relay: float,
+    hysteresis: float = 0.0,
+    harmonics: int | None = None,
+) -> tuple[float, float]:
+    """Return (K, tau) of n equal lags where the gain is not known.
+
+    An ideal relay's period does not depend on the gain: tau from eq 8, 9 or 10, then K from the
+    amplitude. With a hysteresis the two are one equation, F_n = (epsilon/a) a/(K h).
+
+    :param order: n >= 1.
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param dead_time: D [s].
+    :param relay: h [u].
+    :param hysteresis: epsilon [y].
+    :param harmonics: terms of eq 19 that make the amplitude; 1: eqs 21 to 23; None: all.
+    :raises IdentificationError: if no such process has this limit cycle; for n = 1 that is so
+        unless (1 - epsilon/a) P/4 < D < P/2.
+    """
+    _require_dead_time(period, dead_time)
+    share = hysteresis / amplitude
+    if not share < 1.0:
+        raise IdentificationError(
+            f"an amplitude of {amplitude:g} is not above the hysteresis of {hysteresis:g}, so "
+            "that the relay cannot have switched: check the numbers"
+        )
+    if order == 1:
+        _require_fopdt(period, dead_time, 0.25 * (1.0 - share))
+    part = 1.0 - 2.0 * dead_time / period
+
+    def excess(tau: float) -> float:
+        lags = (tau,) * order
+        return level(lags, period, part) - (share * peak(lags, period) if share else 0.0)
+
+    tau = _smallest(order, period, part, excess)
+    return amplitude / (relay * peak((tau,) * order, period, harmonics)), tau
+
+
+def _with_amplitude(
+    shares: Sequence[float], period: float, relative_amplitude: float, harmonics: int | None
+) -> tuple[float, ...]:
+    """Time constants of a given amplitude that divide the attenuation, in logarithms.
+
+    Eqs 21 to 25 in one: 4 K h/(pi a_1) = prod(1 + (w tau_i)^2)^(1/2), of which factor i is to the
+    power ``shares[i]``. With more harmonics a_1 is less or more than a, by a ratio that depends
+    on the time constants; it is solved for, which is where the paper's iteration converges.
+    """
+    w = 2.0 * math.pi / period
+    whole = math.log(4.0 / (math.pi * relative_amplitude))
+    most = 1.0 if harmonics is None else peak((), period, harmonics)
+    if not relative_amplitude < most:
+        raise IdentificationError(
+            f"an amplitude of {relative_amplitude:g} K h is more than the {most:g} that lags of "
+            "this gain can have: the gain given is too small, or the relay's amplitude is wrong"
+        )
+
+    def lags(attenuation: float) -> tuple[float, ...]:
+        return tuple(math.sqrt(math.expm1(2.0 * s * attenuation)) / w for s in shares)
+
+    if harmonics == 1:
+        return lags(whole)
+
+    def excess(attenuation: float) -> float:
+        return math.log(peak(lags(attenuation), period, harmonics) / relative_amplitude)
+
+    # The first harmonic of a square wave is 4/pi of it, that of a triangle 8/pi^2.
+    low, high = max(whole - 0.3, 1e-13), max(whole, 0.0) + 0.3
+    return lags(_root(excess, low, high))
+
+
+def _smallest(order: int, period: float, part: float, excess: Callable[[float], float]) -> float:
+    """Smallest tau at which ``excess`` vanishes and y rises; it is positive for small tau."""
+    tau = before = 0.5 * period * part / (3.0 * order + 60.0)
+    while tau < _LONGEST * period:
+        before, tau = tau, tau * _STEP
+        if excess(tau) > 0.0 or not excess(before) > 0.0:
+            continue
+        root = _root(excess, before, tau)
+        if slope_sign((root,) * order, period, part) > 0.0:
+            return root
+    raise IdentificationError(
+        f"no process of {order} equal lags with a dead time of {period * (1.0 - part) / 2.0:g} s "
+        f"oscillates with a period of {period:g} s under this relay: the dead time is misread, or "
+        "the process is of another structure"
+    )
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    at_low, at_high = function(low), function(high)
+    if at_low * at_high > 0.0:
+        # At the very end of where there is a solution, rounding may put it outside.
+        return low if abs(at_low) < abs(at_high) else high
+    return float(brentq(function, low, high, xtol=1e-300, rtol=1e-15))
+
+
+def _require_dead_time(period: float, dead_time: float) -> None:
+    if not 0.0 <= dead_time < 0.5 * period * _WITH_LAG:
+        raise IdentificationError(
+            f"a dead time of {dead_time:g} s cannot be: a switch takes effect only after it, so "
+            f"that it is less than half the period, {0.5 * period:g} s"
+        )
+
+
+def _require_fopdt(period: float, dead_time: float, least: float) -> None:
+    if not dead_time > least * period:
+        raise IdentificationError(
+            f"no stable FOPDT process with a dead time of {dead_time:g} s oscillates with a "
+            f"period of {period:g} s; the dead time would lie between {least * period:g} s and "
+            f"{0.5 * period:g} s: the process has more than one lag, or is unstable, or the dead "
+            "time is misread"
+        )
+
+
+def _require_level(switch_level: float) -> None:
+    if not 0.0 <= switch_level < _NEARLY_ONE:
+        raise IdentificationError(
+            f"a hysteresis of {switch_level:g} K h cannot be: below 1 the relay would never have "
+            "switched; the gain or the amplitude of the relay is wrong"
+        )
+
+
+def _outside(model: str, what: str, instead: str) -> str:
+    return (
+        f"no process of {model} has this period and amplitude: it has {what} at this gain and "
+        f"dead time; try {instead}, or check gain and dead time"
+    )

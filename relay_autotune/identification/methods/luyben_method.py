@@ -1,0 +1,361 @@
+"""The method `luyben_step`: an integrating process with inverse response, from a step test.
+
+Dead time, extremum and return are read off a smooth curve: the baseline, and from the end of the
+dead time on a polynomial that leaves it. The dead time is where the two fit best; how many powers
+the noise allows is decided by Akaike's information criterion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.luyben2003 import from_step
+from relay_autotune.identification.result import FitReport, Identification, with_uncertainty
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant, Record
+
+FloatArray = NDArray[np.float64]
+
+METHOD = "luyben_step"
+STRUCTURE = "integrator_inverse"
+PARAMETERS = ("gain", "inverse_time_constant", "time_constant", "dead_time")
+
+_LEAST_SAMPLES = 20
+_MOST_POINTS = 2000
+_MOST_POWERS = 16
+_PATIENCE = 2
+_PLACES = 60
+_SEARCHED = 4
+_BEYOND = 1.4
+_SIGNIFICANT = 4.0
+_NEGLIGIBLE = 1e-9
+_UNEXPLAINED = 1.5
+
+
+@dataclass(frozen=True)
+class StepTest:
+    """One step in a record.
+
+    :param begin: when the command steps [s].
+    :param step: du [u].
+    :param time: of the samples, up to the next change of the command [s], shape (n,).
+    :param y: the samples, shape (n,).
+    """
+
+    begin: float
+    step: float
+    time: FloatArray
+    y: FloatArray
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The baseline, and a polynomial that leaves it when the dead time is over.
+
+    :param dead_time: D [s].
+    :param span: how far beyond the dead time the polynomial reaches [s].
+    :param coefficients: of T_k(2 x - 1) - T_k(-1), T_k Chebyshev's polynomials, k = 1, 2, ...; and
+        the baseline last [y].
+    """
+
+    dead_time: float
+    span: float
+    coefficients: FloatArray
+
+    def polynomial(self) -> np.polynomial.Chebyshev:
+        """Return the deviation from the baseline against the time since the dead time ended."""
+        c = self.coefficients[:-1]
+        constant = -float(np.sum(c * (-1.0) ** np.arange(1, c.size + 1)))
+        return np.polynomial.Chebyshev(np.concatenate(([constant], c)), domain=[0.0, self.span])
+
+
+def identify_step(record: Record, known: Known = NOTHING) -> Identification:
+    """Identify an integrating process with inverse response from a step test (eqs 4 to 6).
+
+    :param record: one step of the command, long enough for the measurement to come back; samples
+        before the step tell the baseline.
+    :param known: a known dead time is not read from the record.
+    :raises IdentificationError: if the record holds no such response.
+    """
+    if known.structure not in ("", STRUCTURE):
+        raise IdentificationError(
+            f"{METHOD} has no structure {known.structure!r}; it has {STRUCTURE} only"
+        )
+    test = step_test(record)
+    until = _return_time(test, record.noise_std)
+    curve, covariance = _fitted(test, until, known.dead_time)
+    values = _values(curve, test.step)
+    if covariance is not None:
+        slopes = _jacobian(curve, test.step)
+        covariance = slopes @ covariance @ slopes.T
+    fit, fitted = _report(record, test, curve, values)
+    warnings = []
+    noise = _noise(test, record.noise_std)
+    if fit.residual_rms > max(_UNEXPLAINED * noise, 1e-4 * float(np.ptp(test.y))):
+        warnings.append(
+            f"the model leaves {fit.residual_rms:.3g} rms of the step response unexplained, where "
+            f"the noise is {noise:.3g}: noise moved the few numbers that the method reads, the "
+            "process is of another structure, or it was not in balance before the step; the "
+            "method waveform uses all samples"
+        )
+    return with_uncertainty(
+        METHOD,
+        _build,
+        PARAMETERS,
+        values,
+        covariance,
+        fit=fit,
+        warnings=tuple(warnings),
+        fitted=fitted,
+    )
+
+
+def identify_step_numbers(
+    t1: float, t2: float, extremum: float, step: float, dead_time: float
+) -> Identification:
+    """Identify an integrating process with inverse response from numbers read by hand.
+
+    :param t1: from the end of the dead time to the extremum [s].
+    :param t2: from the end of the dead time to the return [s].
+    :param extremum: its height, from before the step [y].
+    :param step: du [u].
+    :param dead_time: D [s].
+    :raises IdentificationError: if no such process has these numbers.
+    """
+    gain, tau1, tau2 = from_step(t1, t2, extremum, step)
+    return with_uncertainty(METHOD, _build, PARAMETERS, np.array((gain, tau1, tau2, dead_time)))
+
+
+def _build(values: FloatArray) -> TransferFunction:
+    gain, tau1, tau2, dead_time = (float(v) for v in values)
+    return TransferFunction.integrator_inverse(gain, tau1, tau2, dead_time)
+
+
+def step_test(record: Record) -> StepTest:
+    """Return the first step of a record.
+
+    :param record: the record.
+    :raises IdentificationError: if the command never changes, or no sample precedes the change.
+    """
+    u, time = record.input(), record.time
+    inside = np.flatnonzero((u.times >= time[0]) & (u.times < time[-1]))
+    if inside.size == 0:
+        raise IdentificationError(
+            f"the command never changes within the record; {METHOD} needs one step of it"
+        )
+    k = int(inside[0])
+    begin = float(u.times[k])
+    before = u.initial if k == 0 else float(u.values[k - 1])
+    end = float(u.times[k + 1]) if k + 1 < u.times.size else math.inf
+    # The sample at the step itself was taken before it.
+    part = time <= end
+    if not bool(np.any(time <= begin)):
+        raise IdentificationError("no sample precedes the step, so that its baseline is not known")
+    if np.count_nonzero(part & (time > begin)) < _LEAST_SAMPLES:
+        raise IdentificationError(
+            f"the command changes again {end - begin:g} s after its first step, with fewer than "
+            f"{_LEAST_SAMPLES} samples between: {METHOD} needs one step and its whole response"
+        )
+    return StepTest(begin, float(u.values[k]) - before, time[part], record.measurement[part])
+
+
+def _noise(test: StepTest, known: float) -> float:
+    before = test.y[test.time <= test.begin]
+    if before.size >= _LEAST_SAMPLES:
+        return float(np.std(before, ddof=1))
+    return 0.0 if math.isnan(known) else known
+
+
+def _return_time(test: StepTest, noise_known: float) -> float:
+    """Return roughly when the measurement is back at its baseline, from the step on [s].
+
+    The area between the measurement and its baseline falls while the response is inverse and
+    rises from then on, so that its least is where the measurement returns, however noisy.
+    """
+    after = test.time > test.begin
+    since = test.time[after] - test.begin
+    deviation = test.y[after] - float(np.mean(test.y[~after]))
+    last = max(deviation.size // 10, 1)
+    side = math.copysign(1.0, float(np.mean(deviation[-last:])))
+    interval = np.diff(since, prepend=0.0)
+    area = np.cumsum(side * deviation * interval)
+    i = int(np.argmin(area))
+    noise = _noise(test, noise_known) * math.sqrt(float(np.sum(interval[: i + 1] ** 2)))
+    least = max(_SIGNIFICANT * noise, _NEGLIGIBLE * float(np.sum(np.abs(deviation) * interval)))
+    if not -area[i] > least:
+        raise IdentificationError(
+            "the measurement shows no inverse response to the step beyond its noise, or had not "
+            "come back from it when the record or the step ended: record longer, make the step "
+            "larger, or use the method waveform"
+        )
+    return float(since[i])
+
+
+def _fitted(test: StepTest, until: float, known: float) -> tuple[Curve, FloatArray | None]:
+    """Return the smooth curve; and the covariance of dead time, coefficients and baseline."""
+    end = test.begin + _BEYOND * until
+    part = test.time <= end
+    stride = max(1, int(np.count_nonzero(part)) // _MOST_POINTS)
+    if stride > 1:
+        time, y = _averaged(test.time[part], test.y[part], test.begin, stride)
+    else:
+        time, y = test.time[part], test.y[part]
+    since = time - test.begin
+    span = _BEYOND * until
+    n = y.size
+    floor = n * (_NEGLIGIBLE * float(np.ptp(y))) ** 2 or 1e-300
+
+    def solved(dead_time: float, powers: int) -> tuple[float, FloatArray, FloatArray]:
+        columns = _columns(since, dead_time, span - dead_time, powers)
+        solution = np.linalg.lstsq(columns, y, rcond=1e-12)[0]
+        rest = y - columns @ solution
+        return float(rest @ rest), np.asarray(solution), columns
+
+    # The extremum comes after the dead time and before the return.
+    places = np.linspace(0.0, until, _PLACES, endpoint=False)
+    best: tuple[float, float, int] | None = None
+    dead_time, worse = known, 0
+    for powers in range(2, min(_MOST_POWERS, n // 4) + 1):
+        if math.isnan(known):
+
+            def left(place: float, powers: int = powers) -> float:
+                return solved(place, powers)[0]
+
+            # With few powers the end of the dead time is sought everywhere, then near there.
+            if powers <= _SEARCHED:
+                dead_time = float(places[np.argmin([left(p) for p in places])])
+            dead_time = _refined(left, dead_time, places)
+        cost = max(solved(dead_time, powers)[0], floor)
+        criterion = n * math.log(cost) + 2.0 * (powers + 2) * n / max(n - powers - 3, 1)
+        worse += 1
+        if best is None or criterion < best[0]:
+            best, worse = (criterion, dead_time, powers), 0
+        elif worse > _PATIENCE:
+            break
+    if best is None:
+        raise IdentificationError(
+            f"the inverse response holds {n} samples, too few to read it: sample faster"
+        )
+    _, dead_time, powers = best
+    # One power more than fits best: the intervals tell of noise, not of what powers leave out.
+    powers = min(powers + 1, _MOST_POWERS)
+    if math.isnan(known):
+        dead_time = _refined(lambda p: solved(p, powers)[0], dead_time, places)
+    cost, solution, columns = solved(dead_time, powers)
+    curve = Curve(dead_time, span - dead_time, solution)
+    jacobian = columns
+    if math.isnan(known):
+        slope = curve.polynomial().deriv()(np.maximum(since - dead_time, 0.0))
+        by_dead_time = np.where(since > dead_time, -slope, 0.0)
+        jacobian = np.column_stack((by_dead_time, columns))
+    degrees = n - jacobian.shape[1]
+    if degrees < 1:
+        return curve, None
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14) * (cost / degrees)
+    if not math.isnan(known):
+        covariance = np.pad(covariance, ((1, 0), (1, 0)))
+    return curve, np.asarray(covariance)
+
+
+def _averaged(
+    time: FloatArray, y: FloatArray, begin: float, stride: int
+) -> tuple[FloatArray, FloatArray]:
+    """Average neighbouring samples, those before the step apart from those after it."""
+    first = int(np.searchsorted(time, begin, side="right"))
+    edges = np.unique(
+        np.concatenate((np.arange(0, first, stride), np.arange(first, time.size, stride)))
+    )
+    count = np.diff(np.append(edges, time.size))
+    return np.add.reduceat(time, edges) / count, np.add.reduceat(y, edges) / count
+
+
+def _refined(left: Callable[[float], float], near: float, places: FloatArray) -> float:
+    """Return the dead time that leaves the least, between the two places about one."""
+    i = int(np.argmin(np.abs(places - near)))
+    bounds = (float(places[max(i - 1, 0)]), float(places[min(i + 1, places.size - 1)]))
+    options = {"xatol": 1e-9 * float(places[-1])}
+    found = minimize_scalar(left, bounds=bounds, method="bounded", options=options)
+    # The search does not try its ends.
+    return 0.0 if i <= 1 and left(0.0) <= found.fun else float(found.x)
+
+
+def _columns(since: FloatArray, dead_time: float, span: float, powers: int) -> FloatArray:
+    x = np.clip(2.0 * (since - dead_time) / span - 1.0, -1.0, 1.0)
+    chebyshev = np.polynomial.chebyshev.chebvander(x, powers)[:, 1:]
+    moved = chebyshev - (-1.0) ** np.arange(1, powers + 1)
+    return np.column_stack((moved, np.ones(since.size)))
+
+
+def _values(curve: Curve, step: float) -> FloatArray:
+    """Read extremum and return off the curve, and solve."""
+    deviation = curve.polynomial()
+    slope = deviation.deriv()
+    turns = _real_roots(slope, curve.span)
+    side = math.copysign(1.0, float(deviation(curve.span)))
+    turns = turns[side * deviation(turns) < 0.0]
+    if turns.size == 0:
+        raise IdentificationError(
+            "the step response has no extremum on the side away from where it goes: it is no "
+            "integrating process with inverse response, or noise hides it"
+        )
+    t1 = float(turns[np.argmin(side * deviation(turns))])
+    returns = _real_roots(deviation, curve.span)
+    returns = returns[returns > t1]
+    if returns.size == 0:
+        raise IdentificationError(
+            "the measurement does not come back to where it was before the step: record longer"
+        )
+    gain, tau1, tau2 = from_step(t1, float(returns[0]), float(deviation(t1)), step)
+    return np.array((gain, tau1, tau2, curve.dead_time))
+
+
+def _real_roots(polynomial: np.polynomial.Chebyshev, span: float) -> FloatArray:
+    roots = polynomial.roots()
+    real = roots.real[np.abs(roots.imag) < 1e-9 * span]
+    return np.sort(real[(real > 1e-9 * span) & (real <= span)])
+
+
+def _jacobian(curve: Curve, step: float) -> FloatArray:
+    """Return the derivatives of the values by dead time, coefficients and baseline."""
+    size = float(np.abs(curve.coefficients[:-1]).max())
+    columns = []
+    h = 1e-6 * curve.span
+    end = curve.dead_time + curve.span
+    for sign in (1.0, -1.0):
+        moved = curve.dead_time + sign * h
+        columns.append(_values(replace(curve, dead_time=moved, span=end - moved), step))
+    found = [(columns[0] - columns[1]) / (2.0 * h)]
+    for k in range(curve.coefficients.size):
+        change = np.zeros(curve.coefficients.size)
+        change[k] = 1e-6 * size
+        up = _values(replace(curve, coefficients=curve.coefficients + change), step)
+        down = _values(replace(curve, coefficients=curve.coefficients - change), step)
+        found.append((up - down) / (2.0 * change[k]))
+    return np.stack(found, axis=1)
+
+
+def _report(
+    record: Record, test: StepTest, curve: Curve, values: FloatArray
+) -> tuple[FitReport, FloatArray]:
+    """Compare the model with the whole step response."""
+    u = PiecewiseConstant(np.array([test.begin]), np.array([test.step]), 0.0)
+    modelled = float(curve.coefficients[-1]) + response(_build(values), test.time, u)
+    rms = math.sqrt(float(np.mean((test.y - modelled) ** 2)))
+    spread = float(np.std(test.y))
+    fitted = np.full(len(record), math.nan)
+    fitted[: test.time.size] = modelled
+    fit = FitReport(
+        residual_rms=rms,
+        noise_std=record.noise_std,
+        fit=1.0 - rms / spread if spread > 0.0 else math.nan,
+    )
+    return fit, fitted

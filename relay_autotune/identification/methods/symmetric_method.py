@@ -1,0 +1,399 @@
+"""What the methods for an unbiased relay have in common: choice of a model, uncertainty, remarks.
+
+Of models 1 to 3 period and amplitude give a time constant each, if the gain is known; how much
+the two differ tells whether the structure is right. Generally, the simplest model that fits is
+used (Luyben 1987, Chang, Shen and Yu 1992).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods.lag_models import (
+    MODEL_1,
+    MODEL_4,
+    MODEL_5,
+    LagModel,
+    Solution,
+    constants_text,
+    equal_lags,
+    model_asked_for,
+)
+from relay_autotune.identification.methods.square_wave import level
+from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.shown.cycle_scatter import (
+    NOT_SETTLED,
+    RelayTest,
+    Stretch,
+    relay_test,
+)
+from relay_autotune.identification.shown.dead_time import DeadTime, read_dead_time
+from relay_autotune.identification.shown.symmetric_cycle import (
+    CycleReader,
+    SymmetricCycle,
+    features,
+    half_cycles,
+    known_gain,
+    require_unbiased,
+    skew_warning,
+)
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+MOST_EQUAL = 20
+
+# A structure is as good as another whose half cycles are so much nearer to the record's; less
+# than a share of the amplitude is what sampling makes of any.
+_ALIKE = 1.02
+_ALIKE_SHARE = 3e-3
+_SHAPE_SAMPLES = 300
+_SMALL = 0.1
+
+
+@dataclass(frozen=True)
+class SymmetricMethod:
+    """A method that makes one of models 1 to 5 of a symmetric limit cycle.
+
+    :param name: its name in the registry.
+    :param solve: from model, limit cycle and gain (> 0; NaN: not known) to the numbers.
+    :param mismatch: from order, limit cycle and gain to log(tau by the period/tau by the
+        amplitude) of equal lags. Zero: the structure fits. Positive: the process has more lag;
+        infinite: so much that the period has no time constant. Negative: it has less.
+    :param agreement: how large a mismatch counts as none where nothing else is known of it.
+    :param remarks: from model, limit cycle and gain to sentences for the user.
+    """
+
+    name: str
+    solve: Callable[[LagModel, SymmetricCycle, float], Solution]
+    mismatch: Callable[[int, SymmetricCycle, float], float]
+    agreement: float
+    remarks: Callable[[LagModel, SymmetricCycle, float], list[str]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """An identification with what it was made from.
+
+    :param identification: the model.
+    :param model: its structure.
+    :param cycle: the limit cycle.
+    :param period_std: standard deviation of its period [s]; NaN: not estimated.
+    :param amplitude_std: of its amplitude [y]; NaN: not estimated.
+    """
+
+    identification: Identification
+    model: LagModel
+    cycle: SymmetricCycle
+    period_std: float = math.nan
+    amplitude_std: float = math.nan
+
+
+def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
+    """Identify one of models 1 to 5 from an unbiased relay test.
+
+    :param method: how.
+    :param record: a relay test without bias.
+    :param known: gain, dead time, structure and order where they are known.
+    :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
+    """
+    test = relay_test(method.name, record)
+    whole = test.whole
+    require_unbiased(method.name, whole.settings)
+    sign = -1 if whole.settings.reverse_acting else 1
+    gain = known_gain(known, sign)
+    reader = CycleReader.of(whole)
+    dead_time = read_dead_time(test, record, known, noisy=reader.noisy)
+
+    def read(stretch: Stretch) -> SymmetricCycle:
+        return reader.read(stretch, dead_time.value)
+
+    cycle = read(whole)
+    model, remark = _choice(method, test, read, gain, known)
+    solution = _by_shape(whole, model, cycle, method.solve(model, cycle, gain))
+
+    def values(stretch: Stretch) -> FloatArray:
+        single = _alike(method.solve(model, read(stretch), gain), solution)
+        return single.values(sign, dead_time.value)
+
+    def values_at(delay: float) -> FloatArray:
+        moved = replace(cycle, dead_time=delay + whole.settings.extra_delay)
+        return _alike(method.solve(model, moved, gain), solution).values(sign, delay)
+
+    covariance, quantile = test.scatter(values)
+    if covariance is not None and dead_time.std > 0.0:
+        covariance = covariance + _covariance_of(values_at, dead_time)
+    remarks = [
+        dead_time.source,
+        remark,
+        skew_warning(whole),
+        "" if whole.cycle.converged else NOT_SETTLED,
+        *_remarks(method, model, cycle, gain, solution),
+    ]
+    identification = with_uncertainty(
+        method.name,
+        model.build,
+        model.parameters,
+        solution.values(sign, dead_time.value),
+        covariance,
+        quantile,
+        warnings=tuple(r for r in remarks if r),
+    )
+    spread, _ = test.scatter(features)
+    if spread is None:
+        return Found(identification, model, cycle)
+    period_std, amplitude_std = (float(s) for s in np.sqrt(np.diag(spread)))
+    return Found(identification, model, cycle, period_std, amplitude_std)
+
+
+def _covariance_of(values_at: Callable[[float], FloatArray], dead_time: DeadTime) -> FloatArray:
+    """Return what the uncertainty of a dead time that was read adds to that of the values.
+
+    :param values_at: from a dead time [s] to the values.
+    :param dead_time: as it was read.
+    """
+    ends = []
+    for side in (-1.0, 1.0):
+        delay = max(dead_time.value + side * _SMALL * dead_time.std, 0.0)
+        try:
+            ends.append((delay, values_at(delay)))
+        except IdentificationError:
+            # At the end of where there is a solution one side tells as much.
+            ends.append((dead_time.value, values_at(dead_time.value)))
+    (low, below), (high, above) = ends
+    if not high > low:
+        return np.full((below.size, below.size), math.nan)
+    rate = dead_time.std * (above - below) / (high - low)
+    return np.outer(rate, rate)
+
+
+def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -> Found:
+    """Identify one of models 1 to 5 from the numbers of a limit cycle.
+
+    :param method: how.
+    :param cycle: the limit cycle of an unbiased relay.
+    :param known: gain, structure and order where they are known.
+    :raises IdentificationError: if no such model has the limit cycle.
+    """
+    sign = -1 if known.gain < 0.0 else 1
+    gain = abs(known.gain)
+    model, remark = model_asked_for(method.name, known), ""
+    if model is None and math.isnan(gain):
+        model, remark = _choose_without_gain(method, cycle, None)
+    elif model is None:
+        model, remark = choose(method, cycle, gain)
+    solution = method.solve(model, cycle, gain)
+    remarks = [remark, *_remarks(method, model, cycle, gain, solution)]
+    identification = with_uncertainty(
+        method.name,
+        model.build,
+        model.parameters,
+        solution.values(sign, cycle.dead_time),
+        warnings=tuple(r for r in remarks if r),
+    )
+    return Found(identification, model, cycle)
+
+
+def choose(
+    method: SymmetricMethod,
+    cycle: SymmetricCycle,
+    gain: float,
+    tolerance: Callable[[int], float] | None = None,
+) -> tuple[LagModel, str]:
+    """Choose the simplest model that fits, where the gain is known.
+
+    :param method: whose mismatch counts.
+    :param cycle: the limit cycle.
+    :param gain: K > 0 [y/u].
+    :param tolerance: from the order of equal lags to the mismatch that still counts as none;
+        default: the method's agreement.
+    :return: the model, and a sentence where none fits well, else an empty one.
+    """
+    found: dict[int, float] = {}
+
+    def fits(order: int) -> bool:
+        found[order] = method.mismatch(order, cycle, gain)
+        if not math.isfinite(found[order]):
+            return False
+        return abs(found[order]) <= (tolerance(order) if tolerance else method.agreement)
+
+    # Between two orders of equal lags lies a model with one lag more that differs.
+    for order, between in ((1, None), (2, MODEL_4), (3, MODEL_5)):
+        if fits(order):
+            return equal_lags(order), ""
+        if found[order] < 0.0:
+            return (MODEL_1 if between is None else between), ""
+    best = 3
+    for order in range(4, MOST_EQUAL + 1):
+        if fits(order):
+            return equal_lags(order), ""
+        if abs(found[order]) < abs(found[best]):
+            best = order
+        if found[order] < 0.0:
+            break
+    return equal_lags(best), ""
+
+
+def _choice(
+    method: SymmetricMethod,
+    test: RelayTest,
+    read: Callable[[Stretch], SymmetricCycle],
+    gain: float,
+    known: Known,
+) -> tuple[LagModel, str]:
+    cycle = read(test.whole)
+    asked = model_asked_for(method.name, known)
+    if asked is not None:
+        return asked, ""
+    if math.isnan(gain):
+        return _choose_without_gain(method, cycle, test.whole)
+    interval = float(np.median(np.diff(test.whole.record.time)))
+
+    def tolerance(order: int) -> float:
+        """Allow for the scatter of the cycles, and half a sample interval of dead time."""
+
+        def value(stretch: Stretch) -> FloatArray:
+            found = method.mismatch(order, read(stretch), gain)
+            if not math.isfinite(found):
+                raise IdentificationError("this cycle alone has no time constant")
+            return np.array([found])
+
+        allowed = method.agreement
+        covariance, quantile = test.scatter(value)
+        if covariance is not None:
+            allowed = max(allowed, quantile * math.sqrt(covariance[0, 0]))
+        for shift in (-0.5, 0.5):
+            moved = replace(cycle, dead_time=max(cycle.dead_time + shift * interval, 0.0))
+            if moved.part > 0.0:
+                change = method.mismatch(order, moved, gain) - method.mismatch(order, cycle, gain)
+                allowed = max(allowed, abs(change))
+        return allowed
+
+    return choose(method, cycle, gain, tolerance)
+
+
+def _choose_without_gain(
+    method: SymmetricMethod, cycle: SymmetricCycle, whole: Stretch | None
+) -> tuple[LagModel, str]:
+    """Choose among equal lags by the shape of the half cycles.
+
+    Period and amplitude are then used up by gain and time constant.
+
+    :param whole: the cycles; None: nothing is known of their shape.
+    """
+    solved: dict[int, Solution] = {}
+    away: dict[int, float] = {}
+    for order in range(1, MOST_EQUAL + 1):
+        if order > 3 and (
+            not solved or whole is None or min(away, key=away.__getitem__) < order - 1
+        ):
+            break
+        try:
+            solved[order] = method.solve(equal_lags(order), cycle, math.nan)
+        except IdentificationError:
+            continue
+        away[order] = 0.0
+        if whole is not None:
+            misfit = shape_misfit(whole, equal_lags(order), cycle, solved[order])
+            away[order] = misfit / cycle.amplitude
+    if not solved:
+        # The refusal of the simplest model says what is wrong.
+        method.solve(MODEL_1, cycle, math.nan)
+    order = min(n for n in solved if alike(away[n], min(away.values())))
+    why = "its simplicity" if whole is None else "the shape of its half cycles"
+    model = equal_lags(order)
+    return model, (
+        f"without the gain the structure is not checked: {model.name} was taken for {why}; give "
+        "the gain or the structure where they are known"
+    )
+
+
+def alike(misfit: float, least: float) -> bool:
+    """Return True if half cycles are as near to the record's as the nearest.
+
+    :param misfit: a :func:`shape_misfit` over the amplitude.
+    :param least: that of the structure that comes nearest.
+    """
+    return misfit <= _ALIKE * least + _ALIKE_SHARE
+
+
+def shape_misfit(
+    whole: Stretch, model: LagModel, cycle: SymmetricCycle, solution: Solution
+) -> float:
+    """Return the root mean square of half cycles minus those of a solution [y]."""
+    since, y = half_cycles(whole)
+    stride = max(1, since.size // _SHAPE_SAMPLES)
+    lags = model.lags(solution.constants)
+    half = 0.5 * cycle.period
+    squares = 0.0
+    for time, seen in zip(since[::stride].tolist(), y[::stride].tolist(), strict=True):
+        # The command that turns the measurement down arrives after the dead time.
+        before = time < cycle.dead_time
+        part = (time - cycle.dead_time) / half + before
+        height = level(lags, cycle.period, min(max(part, 0.0), 1.0))
+        squares += (seen - (height if before else -height) * solution.gain * cycle.relay) ** 2
+    return math.sqrt(squares / since[::stride].size)
+
+
+def _remarks(
+    method: SymmetricMethod,
+    model: LagModel,
+    cycle: SymmetricCycle,
+    gain: float,
+    solution: Solution,
+) -> list[str]:
+    remarks = []
+    if model.equal and not math.isnan(gain):
+        difference = method.mismatch(model.order, cycle, gain)
+        if abs(difference) > method.agreement:
+            remarks.append(_mismatch_text(model, difference))
+    remarks += [
+        f"{model.name} has two solutions, which period and amplitude do not tell apart: "
+        f"{solution} was taken, {constants_text(other)} would do as well"
+        for other in solution.others
+    ]
+    return remarks + method.remarks(model, cycle, gain)
+
+
+def _mismatch_text(model: LagModel, difference: float) -> str:
+    if math.isinf(difference):
+        apart = "cannot agree: by the period it has none"
+    else:
+        apart = (
+            f"differ: the period's is {100.0 * math.expm1(difference):+.3g} % off the amplitude's"
+        )
+    return (
+        f"the two time constants of {model.name} {apart}; the process is of another structure, or "
+        "gain or dead time are not right"
+    )
+
+
+def _by_shape(
+    whole: Stretch, model: LagModel, cycle: SymmetricCycle, solution: Solution
+) -> Solution:
+    """Put the one of several solutions first whose half cycles are most like the record's."""
+    if not solution.others:
+        return solution
+
+    def misfit(constants: tuple[float, ...]) -> float:
+        return shape_misfit(whole, model, cycle, Solution(solution.gain, constants))
+
+    first, *rest = sorted((solution.constants, *solution.others), key=misfit)
+    return Solution(solution.gain, first, tuple(rest))
+
+
+def _alike(solution: Solution, reference: Solution) -> Solution:
+    """Of several solutions, return the one nearest to another."""
+
+    def away(constants: tuple[float, ...]) -> float:
+        pairs = zip(constants, reference.constants, strict=True)
+        return sum(abs(math.log(c / r)) for c, r in pairs)
+
+    return Solution(solution.gain, min((solution.constants, *solution.others), key=away))

@@ -1,0 +1,370 @@
+r"""Models of three structures from the shape of an unbiased relay test.
+
+Thyagarajan and Yu, "Improved Autotuning Using the Shape Factor from Relay Feedback", Ind. Eng.
+Chem. Res. 2003. t = 0 is where y rises through the level at which the relay switches; P is the
+period, a the amplitude, h that of the relay.
+
+Each set of equations is here twice. Literally: for an ideal relay that switches at zero, of which
+eqs 21 to 24, 26 and 27 use the first harmonic alone. And exactly: for a relay that switches at the
+level epsilon, with all harmonics. Corrected are eq 17, where the bracket divides, and eq 23, which
+the paper solved with 22/7 for pi.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.methods.square_wave import level as level_of_lags
+from relay_autotune.identification.methods.square_wave import peak as peak_of_lags
+
+FloatArray = NDArray[np.float64]
+
+SMALL_DEAD_TIME = 0.001
+HIGHER_ORDER = 5
+
+_NEARLY_ONE = 1.0 - 1e-14
+_INTEGRATING = 1e-9
+_STEP = 1.1
+_LONGEST = 1e10
+
+
+def first_half(
+    time: FloatArray,
+    gain: float,
+    time_constant: float,
+    dead_time: float,
+    relay: float,
+    level: float = 0.0,
+) -> FloatArray:
+    """Return y from one switch to the next (eqs 8 and 9; 14 and 15 of an unstable process).
+
+    With K h = g, y = g - (g - epsilon) exp(-t/tau) until the dead time has passed, and falls
+    towards -g from there. An unstable process is the same with negative K and tau.
+
+    :param time: since the switch, up to half a period [s], shape (n,).
+    :param gain: K of K exp(-D s)/(tau s + 1) [y/u].
+    :param time_constant: tau [s].
+    :param dead_time: D [s].
+    :param relay: h [u].
+    :param level: epsilon, where the relay switches; 0: as in the paper [y].
+    """
+    g = gain * relay
+    rising = g - (g - level) * np.exp(-time / time_constant)
+    late = np.maximum(time - dead_time, 0.0)
+    return np.asarray(rising + 2.0 * g * np.expm1(-late / time_constant))
+
+
+def fopdt(
+    period: float, amplitude: float, time_to_peak: float, relay: float, level: float = 0.0
+) -> tuple[float, float, float]:
+    """Return (K, tau, D) of a stable FOPDT process (eqs 10 and 11, with a level).
+
+    D is the time to the peak, and
+
+        tau = (P/2)/ln[(2 a e^{D/tau} - a - epsilon)/(a - epsilon)],
+        K = (a - epsilon e^{-D/tau})/(h (1 - e^{-D/tau})).
+
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param time_to_peak: from the switch to the peak [s].
+    :param relay: h [u].
+    :param level: epsilon [y]; 0: eqs 10 and 11 as they stand.
+    :raises IdentificationError: unless (1 - epsilon/a) P/4 < D < P/2.
+    """
+    v = _reach(period, amplitude, time_to_peak, level)
+    if v <= _INTEGRATING:
+        raise IdentificationError(
+            f"the peak comes {time_to_peak:g} s after the switch, before (1 - epsilon/a) P/4 = "
+            f"{_earliest(period, amplitude, level):g} s: no stable FOPDT process does that (eq "
+            "10); the process has more lags, integrates, or is unstable"
+        )
+    return amplitude / (v * relay), 0.25 * period / math.atanh(v), time_to_peak
+
+
+def unstable_fopdt(
+    period: float, amplitude: float, time_to_peak: float, relay: float, level: float = 0.0
+) -> tuple[float, float, float]:
+    """Return (K, tau, D) of K exp(-D s)/(tau s - 1) (eqs 16 and 17, with a level).
+
+    In eq 17 the bracket divides, K = a/[h (e^{D/tau} - 1)] (printed: multiplies). With a level,
+
+        tau = (P/2)/ln[(a - epsilon)/(2 a e^{-D/tau} - a - epsilon)],
+        K = (a - epsilon e^{D/tau})/(h (e^{D/tau} - 1)).
+
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param time_to_peak: from the switch to the peak, which is D [s].
+    :param relay: h [u].
+    :param level: epsilon [y]; 0: eqs 16 and 17 as they stand.
+    :raises IdentificationError: unless 0 < D < (1 - epsilon/a) P/4.
+    """
+    v = _reach(period, amplitude, time_to_peak, level)
+    if v >= -_INTEGRATING:
+        raise IdentificationError(
+            f"the peak comes {time_to_peak:g} s after the switch, not before (1 - epsilon/a) P/4 "
+            f"= {_earliest(period, amplitude, level):g} s: no unstable FOPDT process does that "
+            "(eq 16)"
+        )
+    return -amplitude / (v * relay), -0.25 * period / math.atanh(v), time_to_peak
+
+
+def unstable_limit_cycle(
+    gain: float, time_constant: float, dead_time: float, relay: float, level: float = 0.0
+) -> tuple[float, float]:
+    """Return (P, a) of an unstable FOPDT process (eqs 14 and 16, with a level).
+
+    :param gain: K > 0 of K exp(-D s)/(tau s - 1) [y/u].
+    :param time_constant: tau > 0 [s].
+    :param dead_time: D [s].
+    :param relay: h [u].
+    :param level: epsilon [y].
+    :raises IdentificationError: unless (1 + epsilon/(K h)) e^{D/tau} < 2; for an ideal relay,
+        unless D/tau < ln 2.
+    """
+    g, growth = gain * relay, math.exp(dead_time / time_constant)
+    amplitude = (level + g) * growth - g
+    if not amplitude < g:
+        raise IdentificationError(
+            f"no limit cycle: D/tau = {dead_time / time_constant:g} must be less than ln 2 - ln(1 "
+            f"+ epsilon/(K h)) = {math.log(2.0 / (1.0 + level / g)):g}, or the process escapes "
+            "before the relay's switch takes effect"
+        )
+    return 4.0 * time_constant * math.atanh(amplitude / g), amplitude
+
+
+def _earliest(period: float, amplitude: float, level: float) -> float:
+    return 0.25 * period * (1.0 - level / amplitude)
+
+
+def _reach(period: float, amplitude: float, time_to_peak: float, level: float) -> float:
+    """Return v = a/(K h), negative for an unstable process.
+
+    P/(2 tau) = 2 atanh v and D/tau = ln[(1 - e v)/(1 - v)], e = epsilon/a, so that 2 D/P is a
+    function of v alone that rises from 0 at -1, by (1 - e)/2 at 0, to 1 at 1.
+    """
+    e = level / amplitude
+    if not (period > 0.0 and amplitude > 0.0 and abs(e) < 1.0):
+        raise IdentificationError(
+            f"a period of {period:g} s with an amplitude of {amplitude:g} about a switching level "
+            f"of {level:g} is no limit cycle: the amplitude must exceed the level"
+        )
+    share = 2.0 * time_to_peak / period
+    if not 0.0 < share < 1.0:
+        raise IdentificationError(
+            f"a peak {time_to_peak:g} s after the switch does not lie within the half period of "
+            f"{0.5 * period:g} s"
+        )
+
+    def excess(v: float) -> float:
+        if abs(v) < 1e-12:
+            return 0.5 * (1.0 - e) - share
+        return (math.log1p(-e * v) - math.log1p(-v)) / (2.0 * math.atanh(v)) - share
+
+    if excess(_NEARLY_ONE) < 0.0:
+        raise IdentificationError(
+            f"a peak {time_to_peak:g} s after the switch is at the very end of the half period "
+            f"of {0.5 * period:g} s: the process has no lag that shows"
+        )
+    if excess(-_NEARLY_ONE) > 0.0:
+        raise IdentificationError(
+            f"a peak {time_to_peak:g} s after the switch is at the very beginning of the half "
+            f"period of {0.5 * period:g} s: no FOPDT process does that"
+        )
+    return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
+
+
+def first_guess(frequency: float, dead_time: float) -> float:
+    """Return tau = tan(pi - D w_u)/w_u (eq 12) [s]; the solver here needs no guess.
+
+    :param frequency: w_u [rad/s].
+    :param dead_time: D [s].
+    """
+    return math.tan(math.pi - dead_time * frequency) / frequency
+
+
+def rise_time_constant(rise: float, rise_half: float) -> float:
+    """Return tau from the rise to the peak and to half of it (eq 20) [s].
+
+    With x = exp(-t_{a/2}/tau) it is 2 x - x^{t_a/t_{a/2}} = 1, whose trivial root x = 1 is
+    excluded. Both times count from where y passes zero, whatever the level at which the relay
+    switches.
+
+    :param rise: t_a [s].
+    :param rise_half: t_{a/2} [s].
+    :raises IdentificationError: unless 0 < t_{a/2}/t_a < 1/2.
+    """
+    if not 0.0 < rise_half < 0.5 * rise:
+        raise IdentificationError(
+            f"half the peak is reached after {rise_half:g} s and the peak after {rise:g} s, but "
+            "an exponential rise reaches half of it in less than half the time (eq 20)"
+        )
+    ratio = rise / rise_half
+    top = (2.0 / ratio) ** (1.0 / (ratio - 1.0))
+    x = float(brentq(lambda x: 2.0 * x - x**ratio - 1.0, 0.5, top, xtol=1e-300, rtol=1e-15))
+    return -rise_half / math.log(x)
+
+
+def flat_fopdt(
+    period: float,
+    amplitude: float,
+    rise: float,
+    rise_half: float,
+    relay: float,
+    level: float | None = None,
+) -> tuple[float, float, float]:
+    """Return (K, tau, D) of the FOPDT process of category 1b (eqs 20 to 22).
+
+    Literally D and K follow from the phase and the size of the first harmonic, so that a true
+    FOPDT process with D/tau = 10 gets 0.79 to 0.87 of its gain. Exactly, from y = epsilon at the
+    switch and the peak: K = a/(h tanh(P/(4 tau))), D = tau ln[(K h - epsilon)/(K h - a)].
+
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param rise: t_a, from the zero crossing to the peak [s].
+    :param rise_half: t_{a/2}, from the zero crossing to half of it [s].
+    :param relay: h [u].
+    :param level: epsilon [y]; None: eqs 21 and 22 literally.
+    :raises IdentificationError: if eq 20 has no root.
+    """
+    tau = rise_time_constant(rise, rise_half)
+    if level is None:
+        w, ultimate_gain = 2.0 * math.pi / period, 4.0 * relay / (math.pi * amplitude)
+        dead_time = (math.pi - math.atan(tau * w)) / w
+        return math.hypot(1.0, tau * w) / ultimate_gain, tau, dead_time
+    # K h - a and K h - epsilon without the difference of nearly equal numbers.
+    quarter = 0.25 * period / tau
+    g = amplitude / math.tanh(quarter)
+    left = amplitude * 2.0 / math.expm1(2.0 * quarter)
+    return g / relay, tau, tau * math.log((g - level) / left)
+
+
+def small_dead_time(
+    period: float,
+    amplitude: float,
+    relay: float,
+    ratio: float = SMALL_DEAD_TIME,
+    level: float | None = None,
+) -> tuple[float, float, float]:
+    """Return (K, tau, D) of K exp(-D s)/(tau s + 1)^2 with D = ratio tau (eqs 5, 23, 24).
+
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param relay: h [u].
+    :param ratio: D/tau, the paper's epsilon.
+    :param level: where the relay switches [y]; None: eqs 23 and 24 literally, with exact pi.
+    :raises IdentificationError: if no such process has this limit cycle.
+    """
+    if level is not None:
+        return equal_lags(2, period, amplitude, relay, level, ratio=ratio)
+    w = 2.0 * math.pi / period
+    x = float(
+        brentq(
+            lambda x: ratio * x + 2.0 * math.atan(x) - math.pi,
+            0.0,
+            math.pi / ratio,
+            xtol=1e-300,
+            rtol=1e-15,
+        )
+    )
+    return (1.0 + x * x) * math.pi * amplitude / (4.0 * relay), x / w, ratio * x / w
+
+
+def higher_order(
+    period: float,
+    amplitude: float,
+    relay: float,
+    order: int = HIGHER_ORDER,
+    level: float | None = None,
+) -> tuple[float, float]:
+    """Return (K, tau) of K/(tau s + 1)^n (eqs 6, 26, 27).
+
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param relay: h [u].
+    :param order: n >= 3.
+    :param level: where the relay switches [y]; None: eqs 26 and 27 literally.
+    :raises IdentificationError: if the order is less than 3, or no such process has this limit
+        cycle.
+    """
+    if order < 3:
+        raise IdentificationError(
+            f"{order} lags without dead time do not oscillate under a relay; at least 3 do"
+        )
+    if level is not None:
+        return equal_lags(order, period, amplitude, relay, level)[:2]
+    w, x = 2.0 * math.pi / period, math.tan(math.pi / order)
+    return math.hypot(1.0, x) ** order * math.pi * amplitude / (4.0 * relay), x / w
+
+
+def equal_lags(
+    order: int,
+    period: float,
+    amplitude: float,
+    relay: float,
+    level: float,
+    *,
+    ratio: float = 0.0,
+    dead_time: float = 0.0,
+) -> tuple[float, float, float]:
+    """Return (K, tau, D) of n equal lags, from y = epsilon at the switch and y = a at the peak.
+
+    :param order: n.
+    :param period: P [s].
+    :param amplitude: a [y].
+    :param relay: h [u].
+    :param level: epsilon [y].
+    :param ratio: what D has in proportion to tau, and
+    :param dead_time: what it has beside that [s].
+    :raises IdentificationError: if no such process has this limit cycle.
+    """
+    share = level / amplitude
+    if not abs(share) < 1.0:
+        raise IdentificationError(
+            f"an amplitude of {amplitude:g} does not exceed the switching level of {level:g}"
+        )
+
+    def excess(tau: float) -> float:
+        lags, part = (tau,) * order, 1.0 - 2.0 * (dead_time + ratio * tau) / period
+        return level_of_lags(lags, period, part) - share * peak_of_lags(lags, period)
+
+    # The limit cycle that a relay starts is that of the smallest tau, the lowest frequency.
+    longest = (0.5 * period - dead_time) / ratio if ratio else _LONGEST * period
+    before = tau = (0.5 * period - dead_time) / (3.0 * order + 60.0)
+    while 0.0 < tau * _STEP < longest:
+        before, tau = tau, tau * _STEP
+        if excess(tau) <= 0.0 < excess(before):
+            tau = float(brentq(excess, before, tau, xtol=1e-300, rtol=1e-15))
+            gain = amplitude / (relay * peak_of_lags((tau,) * order, period))
+            return gain, tau, dead_time + ratio * tau
+    raise IdentificationError(
+        f"no process of {order} equal lags with a dead time of {dead_time:g} s and {ratio:g} tau "
+        f"oscillates with a period of {period:g} s and an amplitude of {amplitude:g} when the "
+        f"relay switches at {level:g}"
+    )
+
+
+def dead_time_ratio(growth: float) -> float:
+    """Return D/tau of a second-order process (eq 25, the logarithm to base 10).
+
+    Within 10 % at D/tau = 0.001 and 0.01, 40 to 50 % too large between, useless above.
+
+    :param growth: tau_G/P, the time constant of the growing peaks over the period.
+    """
+    return float(10.0 ** (-0.3031 * growth - 1.4767))
+
+
+def order_from_curvature(curvature: float) -> float:
+    """Return the order n (eq 28, the logarithm to base 10).
+
+    The paper does not define tau_C; see :func:`~relay_autotune.identification.shown.envelope.
+    curvature_time`. Even for that reading n = 5 comes out as 7, and any other start of the test
+    than at rest under an ideal relay gives other numbers.
+
+    :param curvature: tau_C/P.
+    """
+    return float(10.0 ** (1.9040 - 1.3736 * curvature))

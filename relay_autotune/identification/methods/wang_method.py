@@ -1,0 +1,312 @@
+"""The methods `wang_biased` and `wang_unbiased`: FOPDT models from one relay test.
+
+Wang, Hang and Zou 1997. Peaks and fundamental are those of the averaged period, whose peaks noise
+does not raise; the levels at which the relay was seen to switch take the place of its hysteresis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.wang1997 import (
+    INTEGRATOR_RATIO,
+    PARAMETERS,
+    FopdtCycle,
+    fopdt_from_biased,
+    fopdt_from_unbiased,
+    fopdt_with_gain,
+)
+from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
+from relay_autotune.identification.shown.fold import Fold, as_switched, fold
+from relay_autotune.identification.shown.steady_state import (
+    UNKNOWN_REST,
+    StaticGain,
+    static_gain,
+    steady_state,
+)
+from relay_autotune.identification.shown.symmetric_cycle import require_unbiased
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import find_cycles
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+
+_LEAST_CYCLES = 3
+_MOST_PARTS = 20
+# So many standard deviations above that of an integrator a ratio is not one of noise.
+_CERTAIN = 3.0
+_LIKE_AN_INTEGRATOR = (
+    "the peaks are those of an integrator's limit cycle, or noise lets them look so: gain and "
+    "time constant are hardly more than their ratio; a biased relay or the method waveform tells "
+    "them apart"
+)
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What is the same for all cycles.
+
+    :param sign: +1, or -1 for a reverse-acting relay.
+    :param gain: K [y/u], with its sign; NaN: to be found.
+    :param rest: measurement at rest [y].
+    :param ratio: amplitude of the measurement over that of the relay times the response at the
+        fundamental; NaN: as it is in the cycles.
+    """
+
+    sign: int
+    gain: float
+    rest: float
+    ratio: float = math.nan
+
+
+def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
+    """Identify a FOPDT model from a biased relay test (eqs 6 to 11).
+
+    Deviations are taken from the measured steady state; where the set-point lies elsewhere, the
+    bias about it is ``mu0 - (setpoint - rest)/K``. What is not certain of the steady state is not
+    certain of the gain either.
+
+    :param record: a relay test with a bias.
+    :param known: a known gain takes the place of eq 6.
+    :raises IdentificationError: if the relay was unbiased, or the numbers are no limit cycle of a
+        FOPDT process.
+    """
+    test = relay_test("wang_biased", record)
+    rest = steady_state(record, test.whole.settings)
+    gain = (
+        static_gain(test, rest)
+        if math.isnan(known.gain)
+        else StaticGain(known.gain, 0.0, math.inf)
+    )
+    sign = -1 if test.whole.settings.reverse_acting else 1
+    if not sign * gain.value > 0.0:
+        raise IdentificationError(
+            f"a gain of {gain.value:g} is against the direction of the relay: the state before "
+            "the test was not steady, the load changed, or the known gain has the wrong sign"
+        )
+    facts = _Facts(sign, gain.value, rest.value)
+    uncertain = [replace(facts, gain=gain.value + gain.scatter)]
+    if rest.measured:
+        # A steady state that is a little higher makes the gain lower.
+        lower = gain.value - rest.std / gain.excursion
+        uncertain.append(replace(facts, gain=lower, rest=rest.value + rest.std))
+    remark = "" if rest.measured else UNKNOWN_REST
+    return _identified("wang_biased", test, record, _from_biased, facts, tuple(uncertain), remark)
+
+
+def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
+    """Identify a FOPDT model from an unbiased relay test (eqs 21 to 25).
+
+    Gain and time constant come of what the amplitude is above that of the fundamental, which is
+    at most that of an integrator. With a short dead time it is hardly less, and noise may put it
+    above: then the value that is expected of it below that limit takes its place, and what that
+    leaves open is told as uncertain.
+
+    :param record: a relay test without bias.
+    :param known: a known gain takes the place of eqs 23 to 25.
+    :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
+    """
+    test = relay_test("wang_unbiased", record)
+    require_unbiased("wang_unbiased", test.whole.settings)
+    sign = -1 if test.whole.settings.reverse_acting else 1
+    if sign * known.gain < 0.0:
+        raise IdentificationError(
+            f"a gain of {known.gain:g} is against the direction of the relay: the known gain has "
+            "the wrong sign"
+        )
+    facts = _Facts(sign, known.gain, math.nan)
+    run = partial(_identified, "wang_unbiased", test, record, _from_unbiased)
+    if not math.isnan(known.gain):
+        return run(facts, (), "")
+    try:
+        found = run(facts, (), "")
+    except IdentificationError:
+        likely = _likely_ratio(test, record)
+        if likely is None:
+            raise
+        ratio, std = likely
+        remark = _LIKE_AN_INTEGRATOR
+    else:
+        likely = None
+        if not bool(np.all(np.isfinite(found.covariance))):
+            likely = _likely_ratio(test, record)
+        if likely is None:
+            return found
+        (ratio, std), remark = likely, ""
+    lower = replace(facts, ratio=ratio - std)
+    return run(replace(facts, ratio=ratio), (lower,), remark)
+
+
+def _likely_ratio(test: RelayTest, record: Record) -> tuple[float, float] | None:
+    """Return what is expected of the ratio below that of an integrator, and how far it scatters.
+
+    :param test: the relay test.
+    :param record: the record.
+    :return: None where the cycles are too few to tell, or the ratio is above by far.
+    """
+    cycles = test.whole.cycle.cycles
+    if len(cycles) < _LEAST_CYCLES:
+        return None
+    record = replace(record, settings=test.whole.settings, cycle_start=_bounds(record))
+    whole = fold(record, cycles)
+    seen = _ratio(whole)
+    parts = np.array([_ratio(part) for part in _without_each(whole, record, cycles)])
+    scatter = math.sqrt(float(np.var(parts)) * (len(cycles) - 1))
+    room = INTEGRATOR_RATIO - seen
+    if room > 0.0:
+        return seen, scatter
+    if not -room < _CERTAIN * scatter:
+        return None
+    # Mean and variance of a normal distribution below a limit.
+    a = room / scatter
+    beyond = math.exp(-0.5 * a * a) / (math.sqrt(2.0 * math.pi) * float(ndtr(a)))
+    return seen - scatter * beyond, scatter * math.sqrt(1.0 - a * beyond - beyond**2)
+
+
+def _ratio(seen: Fold) -> float:
+    down, up = seen.peaks()
+    return 0.5 * (up - down) / (as_switched(seen).amplitude * abs(seen.fundamental()))
+
+
+def _without_each(whole: Fold, record: Record, cycles: tuple[int, ...]) -> Iterator[Fold]:
+    """Yield the averages without one cycle after the other, of some where they are many."""
+    for left_out in cycles[:: -(-len(cycles) // _MOST_PARTS)]:
+        yield fold(record, tuple(c for c in cycles if c != left_out), whole)
+
+
+def _from_biased(seen: Fold, facts: _Facts) -> FloatArray:
+    # With the command turned round a reverse-acting process has a positive gain.
+    settings, gain = as_switched(seen), facts.sign * facts.gain
+    high, low = (seen.period_high, seen.period_low)[:: facts.sign]
+    about = settings.setpoint
+    down, up = (p - about + seen.settings.setpoint for p in seen.peaks())
+    bias = facts.sign * settings.bias - (about - facts.rest) / gain
+    cycle = FopdtCycle(high, low, up, down)
+    k, t, dead = fopdt_from_biased(cycle, gain, settings.amplitude, bias, settings.hysteresis)
+    return np.array((facts.sign * k, t, dead))
+
+
+def _from_unbiased(seen: Fold, facts: _Facts) -> FloatArray:
+    settings = as_switched(seen)
+    down, up = seen.peaks()
+    amplitude, period = 0.5 * (up - down), seen.period
+    if math.isnan(facts.gain):
+        response = abs(seen.fundamental())
+        if not math.isnan(facts.ratio):
+            response = amplitude / (settings.amplitude * facts.ratio)
+        k, t, dead = fopdt_from_unbiased(
+            period, amplitude, response, settings.amplitude, settings.hysteresis
+        )
+    else:
+        k, t, dead = fopdt_with_gain(
+            facts.sign * facts.gain, period, amplitude, settings.amplitude, settings.hysteresis
+        )
+    return np.array((facts.sign * k, t, dead))
+
+
+_Measure = Callable[[Fold, _Facts], FloatArray]
+
+
+def _identified(
+    method: str,
+    test: RelayTest,
+    record: Record,
+    measure: _Measure,
+    facts: _Facts,
+    uncertain: tuple[_Facts, ...],
+    remark: str,
+) -> Identification:
+    """Measure on the averaged period; what leaving out each cycle changes is the uncertainty.
+
+    :param uncertain: the facts, each with one of them off by its standard deviation.
+    :param remark: for the user; may be empty.
+    """
+    settings = test.whole.settings
+    record = replace(record, settings=settings, cycle_start=_bounds(record))
+    cycles = test.whole.cycle.cycles
+    whole = fold(record, cycles)
+
+    def values(seen: Fold, known: _Facts) -> FloatArray:
+        found = measure(seen, known)
+        # What the relay added to the dead time is no part of the process.
+        found[2] = max(found[2] - settings.extra_delay, 0.0)
+        return found
+
+    best = values(whole, facts)
+    covariance = None
+    if len(cycles) >= _LEAST_CYCLES:
+        covariance = _jackknife(
+            whole,
+            record,
+            cycles,
+            lambda part: values(part, facts),
+            partly=method == "wang_biased",
+        )
+    if covariance is not None:
+        for other in uncertain:
+            covariance = covariance + _by(lambda known: values(whole, known), other, best)
+    remarks = [remark, "" if test.whole.cycle.converged else NOT_SETTLED]
+    return with_uncertainty(
+        method,
+        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
+        PARAMETERS,
+        best,
+        covariance,
+        float(stdtrit(max(len(cycles) - 1, 1), 0.975)),
+        warnings=tuple(r for r in remarks if r),
+    )
+
+
+def _bounds(record: Record) -> tuple[int, ...]:
+    return record.cycle_start or find_cycles(record)
+
+
+def _jackknife(
+    whole: Fold,
+    record: Record,
+    cycles: tuple[int, ...],
+    measure: Callable[[Fold], FloatArray],
+    *,
+    partly: bool,
+) -> FloatArray | None:
+    """Return the covariance by leaving out one cycle after the other; None: too few solve.
+
+    :param partly: True: some need not solve.
+    """
+    parts, tried = [], 0
+    for part in _without_each(whole, record, cycles):
+        tried += 1
+        try:
+            parts.append(measure(part))
+        except IdentificationError:
+            # Without that cycle the numbers are no limit cycle; the others tell the scatter.
+            continue
+    if len(parts) < (_LEAST_CYCLES if partly else tried):
+        return None
+    away = np.array(parts) - np.mean(parts, axis=0)
+    return np.asarray(away.T @ away * (len(cycles) - 1) / len(parts))
+
+
+def _by(
+    measure: Callable[[_Facts], FloatArray], uncertain: _Facts, best: FloatArray
+) -> FloatArray:
+    """Return the covariance that one uncertain fact makes."""
+    if math.isnan(uncertain.ratio) and not math.isfinite(uncertain.gain + uncertain.rest):
+        return np.full((best.size, best.size), math.nan)
+    try:
+        change = measure(uncertain) - best
+    except IdentificationError:
+        # So far off no FOPDT process has the limit cycle: nothing bounds the error.
+        return np.full((best.size, best.size), math.nan)
+    return np.outer(change, change)

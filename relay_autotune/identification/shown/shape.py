@@ -1,0 +1,319 @@
+"""Shape of a limit cycle, and the structure that it suggests.
+
+Thyagarajan and Yu, "Improved Autotuning Using the Shape Factor from Relay Feedback", Ind. Eng.
+Chem. Res. 2003, tell four shapes apart by eye: sharp edges (category 1a, FOPDT), almost
+rectangular (1b, a high order with much dead time, taken for FOPDT), sinusoidal and growing over
+many cycles (2, second order with little dead time), sinusoidal at once (3, higher order). The
+numbers that tell them apart here reproduce every category of the paper's examples.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.shown.envelope import envelope, growth_time, normalised_growth
+from relay_autotune.identification.shown.fold import Fold, fold
+from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.record.cycles import cycles_of, limit_cycle
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+SHARP = 0.25
+SLOW = 1.0
+FLAT = 0.42
+
+_GRID = 2001
+_SHARP_FOPDT = 0.2
+_DEVIATIONS = 6.0
+_SHARE = 0.02
+
+
+class Curve(Protocol):
+    """A signal with its rate, at any times [s], shape (n,)."""
+
+    def __call__(self, time: FloatArray, /) -> FloatArray:
+        """Return its values [y], shape (n,)."""
+        ...
+
+    def slope(self, time: FloatArray, /) -> FloatArray:
+        """Return its rates [y/s], shape (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Shape factors of the half of a limit cycle in which the deviation is positive.
+
+    Of a direct-acting process: the command switches to low at t = 0, where y rises through the
+    switching level; for an ideal relay that is the zero crossing.
+
+    :param half_period: T, to the next switch [s].
+    :param amplitude: a, highest deviation from the set-point [y].
+    :param level: deviation at the switch, the hysteresis of an ideal relay [y].
+    :param time_to_peak: t_p, from the switch [s].
+    :param rise: t_a, from the upward zero crossing to the peak [s].
+    :param rise_half: t_{a/2}, from the upward zero crossing to half the peak [s].
+    :param sharpness: q = (t(0.9 a) - t_p)/(t(0.5 a) - t_p) on the falling side.
+    :param plateau: time with y > 0.9 a, over T.
+    :param growth: tau_G/P, the time constant with which the peaks grow to their limit, over the
+        period; of a model -0.5/ln(rho), rho the ratio of successive differences of the peaks in
+        each half cycle; 0: steady at once; NaN: not known.
+    """
+
+    half_period: float
+    amplitude: float
+    level: float
+    time_to_peak: float
+    rise: float
+    rise_half: float
+    sharpness: float
+    plateau: float
+    growth: float = math.nan
+
+    @property
+    def period(self) -> float:
+        """P = 2 T [s]."""
+        return 2.0 * self.half_period
+
+    @property
+    def category(self) -> str:
+        """One of "1a", "1b", "2", "3"."""
+        return category(self)
+
+
+def category(shape: Shape) -> str:
+    """Return the category of a shape: "1a", "1b", "2" or "3".
+
+    1. q < 0.25: 1a. A FOPDT process has 0.178 to 0.200 whatever its D/tau, a smooth peak at least
+       0.370. Where t_p < P/4 only an unstable FOPDT fits, whose q grows with D/tau; the limit
+       then grows in proportion.
+    2. else tau_G/P > 1: 2.
+    3. else plateau > 0.42: 1b.
+    4. else 3.
+
+    :param shape: with ``growth``; NaN counts as steady at once.
+    """
+    if shape.sharpness < SHARP * _widened(shape):
+        return "1a"
+    if shape.growth > SLOW:
+        return "2"
+    return "1b" if shape.plateau > FLAT else "3"
+
+
+def _widened(shape: Shape) -> float:
+    """How much larger q is for the unstable FOPDT through this peak than for a stable one."""
+    ratio, e = shape.time_to_peak / shape.half_period, shape.level / shape.amplitude
+    if not (abs(e) < 1.0 and 0.0 < ratio < 0.5 * (1.0 - e)):
+        return 1.0
+
+    def excess(v: float) -> float:
+        return math.log((1.0 + v) / (1.0 + e * v)) / (2.0 * math.atanh(v)) - ratio
+
+    if excess(1.0 - 1e-12) > 0.0:
+        return 1.0
+    v = float(brentq(excess, 1e-9, 1.0 - 1e-12))
+    # From the peak the deviation falls as 1/v - (1/v - 1) exp(t/tau), in units of a.
+    to_tenth, to_half = (math.log((1.0 - x * v) / (1.0 - v)) for x in (0.9, 0.5))
+    return max(to_tenth / to_half / _SHARP_FOPDT, 1.0)
+
+
+def shape_of_curve(
+    y: Curve,
+    half_period: float,
+    growth: float = math.nan,
+    *,
+    edge: float = math.nan,
+    tolerance: float = 0.0,
+) -> Shape:
+    """Measure the shape of one half of a limit cycle.
+
+    :param y: deviation from the set-point; the half begins with the switch at t = 0 and the
+        curve goes on before and after it.
+    :param half_period: T [s].
+    :param growth: tau_G/P, see :class:`Shape`.
+    :param edge: where the rate is known to jump [s]; NaN: nowhere.
+    :param tolerance: how much lower than the highest point the edge may lie and still count as
+        the peak [y]; on a flat top noise would place it anywhere.
+    :raises IdentificationError: if the deviation never becomes positive in the half, or does not
+        pass zero on both sides of its peak.
+    """
+    period = half_period
+    grid = np.linspace(0.0, period, _GRID)
+    values = y(grid)
+    top = int(np.argmax(values))
+    if not values[top] > 0.0:
+        raise IdentificationError(
+            "the measurement does not pass the set-point between two switches: this is no limit "
+            "cycle of a relay, or its hysteresis is not the one given"
+        )
+    peak = _turning_point(y, float(grid[max(top - 1, 0)]), float(grid[min(top + 1, _GRID - 1)]))
+    a = max(_at(y, peak), float(values[top]))
+    if not math.isnan(edge) and _at(y, edge) >= a - tolerance:
+        peak, a = edge, _at(y, edge)
+    before = np.linspace(peak - period, peak, _GRID)
+    after = np.linspace(peak, peak + period, _GRID)
+    zero = _crossing(y, 0.0, before[::-1])
+    half = _crossing(y, 0.5 * a, before[::-1])
+    tenth_down, half_down = _crossing(y, 0.9 * a, after), _crossing(y, 0.5 * a, after)
+    return Shape(
+        half_period=half_period,
+        amplitude=a,
+        level=_at(y, 0.0),
+        time_to_peak=peak,
+        rise=peak - zero,
+        rise_half=half - zero,
+        sharpness=(tenth_down - peak) / (half_down - peak),
+        plateau=(tenth_down - _crossing(y, 0.9 * a, before[::-1])) / half_period,
+        growth=growth,
+    )
+
+
+def _at(y: Curve, time: float) -> float:
+    return float(y(np.array([time]))[0])
+
+
+def _turning_point(y: Curve, low: float, high: float) -> float:
+    """Where the rate changes its sign, smoothly or at an edge."""
+
+    def rate(t: float) -> float:
+        return float(y.slope(np.array([t]))[0])
+
+    if not rate(low) > 0.0 > rate(high):
+        return low if rate(low) <= 0.0 else high
+    return float(brentq(rate, low, high, xtol=1e-15 * (high - low), rtol=1e-15))
+
+
+def _crossing(y: Curve, level: float, path: FloatArray) -> float:
+    """Where the curve first falls to a level along a path that begins above it."""
+    below = np.flatnonzero(y(path) <= level)
+    if below.size == 0 or below[0] == 0:
+        raise IdentificationError(
+            f"the measurement does not fall to {level:g} beside its peak within half a period: "
+            "the oscillation does not pass its set-point both ways"
+        )
+    i = int(below[0])
+
+    def excess(t: float) -> float:
+        return _at(y, t) - level
+
+    a, b = sorted((float(path[i - 1]), float(path[i])))
+    if excess(a) * excess(b) >= 0.0:
+        return a
+    # A crossing may lie at zero, where no relative accuracy would do.
+    return float(brentq(excess, a, b, xtol=1e-15 * abs(float(path[-1] - path[0])), rtol=1e-15))
+
+
+def shape_of_half_cycle(cycle: HalfCycle) -> Shape:
+    """Return the shape of a model's exact limit cycle, with the growth of its multiplier.
+
+    :param cycle: the limit cycle.
+    """
+    growth = normalised_growth(cycle.multiplier())
+    return shape_of_curve(cycle, cycle.half_period, growth)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The shape of a relay test with its uncertainty.
+
+    :param shape: the mean of its two halves.
+    :param names: those numbers of the shape that the covariance is of.
+    :param covariance: of these, by leaving out one cycle after the other, shape (n, n); None for
+        fewer than three cycles.
+    :param cycles: how many cycles were averaged.
+    """
+
+    shape: Shape
+    names: tuple[str, ...]
+    covariance: FloatArray | None
+    cycles: int
+
+    def std(self, name: str) -> float:
+        """Return the standard deviation of one number; NaN: not estimated."""
+        if self.covariance is None:
+            return math.nan
+        i = self.names.index(name)
+        return math.sqrt(float(self.covariance[i, i]))
+
+
+_VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_half")
+_LEAST_CYCLES = 3
+
+
+def shape_of_record(record: Record) -> Shape:
+    """Return the shape of a relay test, the mean of its two halves.
+
+    :param record: with at least one whole cycle.
+    :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
+    """
+    whole = fold(record)
+    return shape_of_fold(whole, _growth(record, whole.period))
+
+
+def read_shape(record: Record, *, sharp: bool = False) -> Reading:
+    """Return the shape of a relay test, and how certain it is.
+
+    :param record: with at least one whole cycle.
+    :param sharp: True if the peaks are known to be sharp, however much noise there is.
+    :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
+    """
+    cycles = limit_cycle(record).cycles if cycles_of(record) else ()
+    whole = fold(record, cycles, sharp=sharp)
+    shape = shape_of_fold(whole, _growth(record, whole.period))
+    parts = []
+    for left_out in cycles if len(cycles) >= _LEAST_CYCLES else ():
+        rest = tuple(c for c in cycles if c != left_out)
+        part = shape_of_fold(fold(record, rest, whole))
+        parts.append([getattr(part, name) for name in _VARYING])
+    covariance = None
+    if parts:
+        away = np.array(parts) - np.mean(parts, axis=0)
+        covariance = away.T @ away * (len(parts) - 1) / len(parts)
+    return Reading(shape, _VARYING, covariance, len(cycles))
+
+
+def _growth(record: Record, period: float) -> float:
+    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
+    return growth_time(envelope(record), noise) / period
+
+
+@dataclass(frozen=True)
+class _Half:
+    """The half of a fold from one of its switches on, with its deviation counted positive."""
+
+    whole: Fold
+    begin: float
+    sign: float
+
+    def __call__(self, time: FloatArray) -> FloatArray:
+        return self.sign * self.whole(time + self.begin)
+
+    def slope(self, time: FloatArray) -> FloatArray:
+        return self.sign * self.whole.slope(time + self.begin)
+
+
+def shape_of_fold(period: Fold, growth: float = math.nan) -> Shape:
+    """Return the shape of an averaged period, the mean of its two halves.
+
+    :param period: the averaged period.
+    :param growth: tau_G/P, see :class:`Shape`.
+    :raises IdentificationError: if a half never passes the set-point.
+    """
+    # The switch to low begins the half above the set-point, of a reverse process that below.
+    sign = -1.0 if period.settings.reverse_acting else 1.0
+    # At an edge the curve is less certain than on average, and splines swing a little about it.
+    swing = 0.5 * float(np.ptp(period(np.linspace(0.0, period.period, _GRID))))
+    tolerance = _DEVIATIONS * period.curve_std + _SHARE * swing
+    hints = {"edge": period.edge, "tolerance": tolerance}
+    low = shape_of_curve(_Half(period, period.period_high, sign), period.period_low, **hints)
+    high = shape_of_curve(_Half(period, 0.0, -sign), period.period_high, **hints)
+    means = {f.name: 0.5 * (getattr(low, f.name) + getattr(high, f.name)) for f in fields(Shape)}
+    return Shape(**{**means, "growth": growth})

@@ -1,0 +1,239 @@
+"""The limit cycle of an unbiased relay in numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.shown.cycle_scatter import Stretch
+from relay_autotune.record.record import Record, RelaySettings
+
+FloatArray = NDArray[np.float64]
+
+_MOST_BIAS = 0.01
+_MOST_SKEW = 0.05
+
+# Noise below this share of the amplitude is none.
+_QUIET = 2e-3
+_BINS = 100
+_SAMPLES_PER_BIN = 8
+_WINDOW = 0.05
+_LEAST_NEAR = 4
+
+
+@dataclass(frozen=True)
+class SymmetricCycle:
+    """What the methods for an unbiased relay take from a limit cycle.
+
+    :param period: P [s].
+    :param amplitude: a, half of peak to peak [y].
+    :param relay: h, amplitude of the relay [u].
+    :param hysteresis: epsilon [y].
+    :param dead_time: D, of the process and what the relay added to it [s].
+    :param switch_level: measurement at the switch, where it is not the hysteresis since the
+        relay is sampled or sees noise [y]; NaN: the hysteresis.
+    """
+
+    period: float
+    amplitude: float
+    relay: float
+    hysteresis: float
+    dead_time: float
+    switch_level: float = math.nan
+
+    @property
+    def frequency(self) -> float:
+        """Frequency of the limit cycle, eq 1 of Chang et al. [rad/s]."""
+        return 2.0 * math.pi / self.period
+
+    @property
+    def level(self) -> float:
+        """Measurement at the switch [y]."""
+        return self.hysteresis if math.isnan(self.switch_level) else self.switch_level
+
+    @property
+    def part(self) -> float:
+        """Part of a half period that is left when the command has arrived, m of Chang et al."""
+        return 1.0 - 2.0 * self.dead_time / self.period
+
+
+def require_unbiased(method: str, settings: RelaySettings) -> None:
+    """Refuse a biased relay.
+
+    :raises IdentificationError: if the bias is more than 1 % of the relay's amplitude.
+    """
+    if abs(settings.bias) > _MOST_BIAS * settings.amplitude:
+        raise IdentificationError(
+            f"the relay had a bias of {settings.bias:g}, but the equations of {method} hold for "
+            "a symmetric one: use the method wang_biased or waveform"
+        )
+
+
+def known_gain(known: Known, sign: int) -> float:
+    """Return the size of the known gain, NaN if it is not known.
+
+    :param known: the gain.
+    :param sign: +1, or -1 for a reverse-acting relay.
+    :raises IdentificationError: if the gain has the wrong sign for the relay.
+    """
+    if sign * known.gain < 0.0:
+        raise IdentificationError(
+            f"a gain of {known.gain:g} is against the direction of the relay: the known gain has "
+            "the wrong sign"
+        )
+    return abs(known.gain)
+
+
+@dataclass(frozen=True)
+class CycleReader:
+    """Reads the numbers of a limit cycle from stretches of one relay test.
+
+    :param excess: how much higher noise makes the peaks on average [y].
+    :param noisy: True if the noise matters for where the measurement is at a switch.
+    """
+
+    excess: float
+    noisy: bool
+
+    @classmethod
+    def of(cls, whole: Stretch) -> CycleReader:
+        """Return the reader for the cycles of a relay test.
+
+        :param whole: all of them.
+        """
+        record = whole.record
+        noise = record.noise_std if math.isfinite(record.noise_std) else roughness(record)
+        _, amplitude = features(whole)
+        if noise <= _QUIET * amplitude:
+            return cls(0.0, False)
+        return cls(min(_excess_of_peaks(whole, noise), 0.5 * float(amplitude)), True)
+
+    def read(self, stretch: Stretch, dead_time: float) -> SymmetricCycle:
+        """Return the numbers of some cycles.
+
+        :param stretch: the cycles.
+        :param dead_time: of the process [s].
+        :raises IdentificationError: if they do not stand out of the noise.
+        """
+        settings = stretch.settings
+        period, amplitude = features(stretch).tolist()
+        if not amplitude > self.excess:
+            raise IdentificationError(
+                f"an amplitude of {amplitude:g} is no more than noise alone gives: raise the "
+                "amplitude of the relay"
+            )
+        delay = dead_time + settings.extra_delay
+        level = _level_at_switch(stretch, self.noisy)
+        return SymmetricCycle(
+            period,
+            amplitude - self.excess,
+            settings.amplitude,
+            settings.hysteresis,
+            delay,
+            min(max(level, 0.0), 0.99 * (amplitude - self.excess)),
+        )
+
+
+def skew_warning(stretch: Stretch) -> str:
+    """Return a sentence if the half periods differ too much for a symmetric relay, else none."""
+    cycle = stretch.cycle
+    skew = abs(cycle.period_high - cycle.period_low) / cycle.period
+    if skew < _MOST_SKEW:
+        return ""
+    return (
+        f"the half periods differ by {100.0 * skew:.0f} % of the period: the set-point is not "
+        "where the process rests, or the load changed; the equations are those of equal halves"
+    )
+
+
+def features(stretch: Stretch) -> FloatArray:
+    """Return period [s] and amplitude [y] of a stretch of cycles."""
+    cycle = stretch.cycle
+    return np.array((cycle.period, 0.5 * (cycle.peak_max - cycle.peak_min)))
+
+
+def half_cycles(stretch: Stretch) -> tuple[FloatArray, FloatArray]:
+    """Lay the samples of all half cycles over one another.
+
+    :param stretch: the cycles.
+    :return: time since the switch that turns the measurement down [s], and the measurement from
+        the middle of its peaks, turned over in the other halves [y]; shape (n,) each.
+    """
+    record, settings = stretch.record, stretch.settings
+    first, last = record.cycle_start[0], record.cycle_start[-1]
+    time = record.time[first:last]
+    u = record.input()
+    middle = 0.5 * (stretch.cycle.peak_max + stretch.cycle.peak_min)
+    index = np.searchsorted(u.times, time, side="right") - 1
+    since = time - u.times[np.maximum(index, 0)]
+    high = u.values[np.maximum(index, 0)] > settings.baseline + settings.bias
+    side = np.where(high != settings.reverse_acting, -1.0, 1.0)
+    inside = (index >= 0) & (since < 0.5 * stretch.cycle.period)
+    return since[inside], (side * (record.measurement[first:last] - middle))[inside]
+
+
+def roughness(record: Record) -> float:
+    """Estimate white noise from second differences, of which a smooth signal has little [y]."""
+    second = np.diff(record.measurement, 2)
+    return (
+        0.0 if second.size == 0 else float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))
+    )
+
+
+def _excess_of_peaks(whole: Stretch, noise: float) -> float:
+    """Return by how much the highest sample of a half cycle exceeds its peak on average [y].
+
+    With heights s_i and standard deviation sigma of the noise, the highest sample is below z with
+    the probability prod Phi((z - s_i)/sigma).
+    """
+    since, y = half_cycles(whole)
+    halves = 2 * len(whole.cycle.cycles)
+    bins = max(min(_BINS, since.size // _SAMPLES_PER_BIN), 2)
+    number = np.minimum((since / (0.5 * whole.cycle.period) * bins).astype(np.int64), bins - 1)
+    count = np.bincount(number, minlength=bins)
+    used = count > 0
+    height = np.bincount(number, y, bins)[used] / count[used]
+    top = float(np.max(height))
+    z = np.linspace(top - noise, top + 6.0 * noise, 300)
+    below = np.sum(count[used] / halves * log_ndtr((z[:, None] - height) / noise), axis=1)
+    above = 1.0 - np.exp(below)
+    step = z[1] - z[0]
+    mean = z[0] + float(np.sum(0.5 * (above[:-1] + above[1:])) * step)
+    return max(mean - top, 0.0)
+
+
+def _level_at_switch(stretch: Stretch, noisy: bool) -> float:
+    """Return where the measurement is at a switch, from the middle of the peaks [y].
+
+    In noise a straight line through the samples around each switch tells it, without the sample
+    that made the relay switch: that one's noise was on the side of the switch.
+    """
+    record, settings, cycle = stretch.record, stretch.settings, stretch.cycle
+    first, last = record.cycle_start[0], record.cycle_start[-1]
+    time, y = record.time, record.measurement
+    # The rate may jump where the command arrives.
+    peak = 0.5 * (cycle.time_to_peak_max + cycle.time_to_peak_min)
+    window = min(_WINDOW * cycle.period, 0.8 * peak)
+    middle = 0.5 * (cycle.peak_max + cycle.peak_min)
+    u = record.input()
+    # Where noise makes the relay switch to and fro, the switch before a long stay counts.
+    stay = np.diff(np.append(u.times, time[-1]))
+    chosen = (u.times >= time[first]) & (u.times < time[last]) & (stay > 0.2 * cycle.period)
+    found = []
+    for at, value in zip(u.times[chosen].tolist(), u.values[chosen].tolist(), strict=True):
+        went_high = value > settings.baseline + settings.bias
+        side = -1.0 if went_high != settings.reverse_acting else 1.0
+        near = np.arange(*np.searchsorted(time, (at - window, at + window)))
+        near = near[time[near] != at]
+        if noisy and near.size >= _LEAST_NEAR:
+            here = np.polyfit(time[near] - at, y[near], 1)[1]
+        else:
+            here = np.interp(at, time, y)
+        found.append(side * (float(here) - middle))
+    return float(np.mean(found)) if found else settings.hysteresis

@@ -1,0 +1,80 @@
+"""Uncertainty that knows that the structure was chosen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.identification.combinations import point_of
+from relay_autotune.identification.result import Identification, Rival, ultimate_std
+from relay_autotune.identification.uncertainty import is_logarithmic
+
+# How far a value of a rival may stray for the first order to stand for it: of a logarithm, and
+# of a dead time or a zero, in radians at the ultimate frequency.
+_FARTHEST_RATIO = 2.0
+_FARTHEST_PHASE = 1.0
+
+
+def averaged_point(
+    found: Identification, support: float, rivals: Sequence[Rival]
+) -> tuple[float, float]:
+    """Return the standard deviations of K_u and w_u over all structures with support.
+
+    About the chosen model's value x, with the weights w_m of the structures,
+
+        var = sum_m w_m (var_m + (x_m - x)^2)
+
+    (Buckland, Burnham and Augustin 1997): what one structure leaves open, and how far they
+    differ.
+
+    :param found: the chosen model.
+    :param support: its weight.
+    :param rivals: those with a covariance count.
+    """
+    own = (found.ultimate_gain, found.ultimate_frequency)
+    stds = (found.ultimate_gain_std, found.ultimate_frequency_std)
+    if not all(math.isfinite(x) for x in (*own, *stds)):
+        return stds
+    total = support
+    sums = [support * std**2 for std in stds]
+    for rival in rivals:
+        point = point_of(rival.model) if rival.parameters else (math.nan, math.nan)
+        if not math.isfinite(point[0]) or point[0] * own[0] < 0.0:
+            continue
+        if not np.all(np.isfinite(rival.root)):
+            continue
+        theirs = ultimate_std(_within_reach(rival, point[1]), *point)
+        if not all(math.isfinite(s) for s in theirs):
+            continue
+        total += rival.support
+        for k in (0, 1):
+            sums[k] += rival.support * (theirs[k] ** 2 + (point[k] - own[k]) ** 2)
+    if not total > 0.0:
+        return stds
+    return math.sqrt(sums[0] / total), math.sqrt(sums[1] / total)
+
+
+def _within_reach(rival: Rival, frequency: float) -> Rival:
+    """Return a rival with the covariance of its values as far as the first order goes.
+
+    A lag or a zero far below the sampling period can hardly be told from dead time. To first
+    order the two may then differ by more than the whole record, with a standard deviation S
+    where the value is next to nothing; K_u, a curved function of both, would inherit that. A
+    value is therefore taken to be known beforehand to within a limit L, many times what the data
+    leave of one that they show:  ``(S^-1 + L^-1)^-1 = L^1/2 U s^2/(1 + s^2) U' L^1/2`` with the
+    singular values s of the root of S over that of L.
+
+    :param rival: with a covariance.
+    :param frequency: w_u [rad/s].
+    """
+    phase = _FARTHEST_PHASE / frequency
+    limits = [
+        _FARTHEST_RATIO * abs(value) if is_logarithmic(name) else phase
+        for name, value in zip(rival.parameters, rival.values, strict=True)
+    ]
+    size = np.maximum(np.array(limits), 1e-12 * phase)
+    axes, std, _ = np.linalg.svd(rival.root / size[:, None], full_matrices=False)
+    return replace(rival, root=size[:, None] * axes * (std / np.sqrt(1.0 + std**2)))

@@ -1,0 +1,130 @@
+"""Intervals of what a fit does not determine, and what it does determine all the same."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.confidence import NORMAL_95
+from relay_autotune.identification.combinations import determined_combinations, is_determined
+from relay_autotune.identification.judgement.advice import advice
+from relay_autotune.identification.result import Identification
+from relay_autotune.identification.uncertainty import Estimate, is_logarithmic
+from relay_autotune.identification.waveform.fit_covariance import (
+    NEGLIGIBLE,
+    Fit,
+    Noise,
+    covariance_of_values,
+)
+from relay_autotune.identification.waveform.profiles import profile_ends
+from relay_autotune.identification.waveform.separable import Problem, State, refine
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+_MOST_FOR_PROFILES = 4096
+# Of a logarithm, or in standard deviations.
+_WIDE = 2.0
+_FARTHEST = 8.0
+
+
+def with_what_is_determined(
+    found: Identification, records: Sequence[Record], fit: Fit, quantile: float
+) -> Identification:
+    """Replace intervals that linear ones do not stand for, and say what is known beside them.
+
+    :param found: the identification with its linear intervals.
+    :param records: what it was identified from.
+    :param fit: the fit.
+    :param quantile: half width of an interval in standard deviations.
+    """
+    found = _profiled(found, fit, quantile)
+    if not found.undetermined:
+        return found
+    point = tuple(
+        Estimate(value, std, value - NORMAL_95 * std, value + NORMAL_95 * std)
+        for value, std in (
+            (found.ultimate_gain, found.ultimate_gain_std),
+            (found.ultimate_frequency, found.ultimate_frequency_std),
+        )
+    )
+    combinations = determined_combinations(found, (point[0], point[1]))
+    found = replace(found, combinations=combinations)
+    return replace(found, advice=advice(found, records))
+
+
+def _profiled(found: Identification, fit: Fit, quantile: float) -> Identification:
+    """Give parameters that are not determined the intervals of their profile likelihood."""
+    if fit.loss != "squares" or fit.state.cost <= fit.state.residual.size * NEGLIGIBLE**2:
+        return found
+    wide = {i for i, name in enumerate(found.parameters) if name in found.undetermined}
+    wide |= {
+        i
+        for i, name in enumerate(found.parameters)
+        if name == "dead_time" and found.ci95_low[i] == 0.0
+    }
+    if not wide:
+        return found
+    few = fit.problem.thinned(_MOST_FOR_PROFILES)
+    whole = few.time.size == fit.problem.time.size
+    state = fit.state if whole else refine(few, fit.state.theta)
+    # Fewer samples rise less: the curve of all is so many times as steep.
+    fewer = few.time.size / fit.problem.time.size
+    low, high = found.ci95_low.copy(), found.ci95_high.copy()
+    white = covariance_of_values(fit.problem, fit.state, fit, Noise(False))
+    for i in sorted(wide):
+        name, value = found.parameters[i], float(found.values[i])
+        std = float(found.std[i])
+        if not (math.isfinite(std) and std > 0.0):
+            continue
+        inflation = fewer * found.covariance[i, i] / max(white[i, i], 1e-300)
+        logarithmic = is_logarithmic(name)
+        ends = profile_ends(
+            few,
+            state,
+            _Parameter(few, state, fit.scale, i, logarithmic),
+            min(std / abs(value), _WIDE) if logarithmic else std,
+            quantile,
+            farthest=_FARTHEST if logarithmic else _FARTHEST * std,
+            least=0.0 if name == "dead_time" else -math.inf,
+            inflation=inflation,
+        )
+        if logarithmic:
+            near, far = (math.exp(min(e, 700.0)) if math.isfinite(e) else _limit(e) for e in ends)
+            ends = (near, far) if value > 0.0 else (-far, -near)
+        low[i], high[i] = min(ends[0], value), max(ends[1], value)
+    undetermined = tuple(
+        name
+        for i, name in enumerate(found.parameters)
+        if (name in found.undetermined if i not in wide else True)
+        and not is_determined(float(found.values[i]), float(low[i]), float(high[i]))
+    )
+    return replace(found, ci95_low=low, ci95_high=high, undetermined=undetermined)
+
+
+def _limit(logarithm: float) -> float:
+    """Return the exponential of an infinite logarithm."""
+    return math.inf if logarithm > 0.0 else 0.0
+
+
+class _Parameter:
+    """One parameter of the field as a function of theta and the linear coefficients."""
+
+    def __init__(
+        self, problem: Problem, state: State, scale: float, number: int, logarithmic: bool
+    ) -> None:
+        self._structure, self._like, self._scale = problem.structure, state.theta, scale
+        self._number, self._logarithmic = number, logarithmic
+
+    def __call__(self, theta: FloatArray, coefficients: FloatArray) -> float:
+        reading = self._structure.read(theta, self._scale * coefficients, like=self._like)
+        if reading is None:
+            return math.nan
+        value = float(reading.values[self._number])
+        if not self._logarithmic:
+            return value
+        return math.log(abs(value)) if value != 0.0 else math.nan

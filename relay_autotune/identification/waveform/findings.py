@@ -1,0 +1,233 @@
+"""What a waveform fit tells: model, covariance, rivals, quality of the fit, warnings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
+from relay_autotune.identification.result import (
+    FitReport,
+    Identification,
+    Rival,
+    with_uncertainty,
+)
+from relay_autotune.identification.waveform.averaging import averaged_point
+from relay_autotune.identification.waveform.choice import support
+from relay_autotune.identification.waveform.determination import with_what_is_determined
+from relay_autotune.identification.waveform.fit_covariance import (
+    NEGLIGIBLE,
+    Fit,
+    Noise,
+    covariance_of_values,
+    noise_of,
+    raw_residual,
+    root_of_covariance,
+)
+from relay_autotune.identification.waveform.residuals import ljung_box
+from relay_autotune.identification.waveform.selection import Candidate
+from relay_autotune.identification.waveform.separable import Problem, State, evaluate, refine
+from relay_autotune.identification.waveform.structures import Reading
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+_UNEXPLAINED = 1.5
+_WHITE = 1e-3
+_WORTH_TELLING = 1e-3
+# Rivals with more support than this have a share in the uncertainty of K_u and w_u.
+_WORTH_COUNTING = 1e-2
+_MOST_COUNTED = 6
+_OPEN = 0.01
+_PREDICTED = 1e-6
+
+
+def report(records: Sequence[Record], fit: Fit) -> Identification:
+    """Return the identification that a fit gives.
+
+    :param records: what was fitted.
+    :param fit: the fit.
+    :raises IdentificationError: if the fit left its structure.
+    """
+    problem, state, scale = fit.problem, fit.state, fit.scale
+    n = problem.time.size
+    residual = raw_residual(problem, state)
+    rms = scale * math.sqrt(float(residual @ residual) / n)
+    exact = rms <= scale * NEGLIGIBLE
+    whiteness = math.nan if exact else ljung_box(state.residual)
+    noise = noise_of(records, rms, not math.isnan(whiteness) and whiteness < _WHITE)
+    reading = _read(problem, state, scale)
+    spread = scale * math.sqrt(
+        sum(float(np.sum((problem.y[p] - problem.y[p].mean()) ** 2)) for p in problem.experiments)
+        / n
+    )
+    quality = FitReport(
+        residual_rms=rms,
+        noise_std=_measured_noise(records),
+        fit=1.0 - rms / spread if spread > 0.0 else math.nan,
+        whiteness_p=whiteness,
+        prediction=scale * _prediction(records, problem, state),
+    )
+    quantile = float(stdtrit(max(n - state.parameters, 1), 0.975))
+    warnings = (*fit.warnings, *_warnings(records, quality, noise, fit, residual))
+    found = with_uncertainty(
+        "waveform",
+        reading.build,
+        reading.parameters,
+        reading.values,
+        covariance_of_values(problem, state, fit, noise),
+        quantile=quantile,
+        fit=quality,
+        warnings=warnings,
+        fitted=_fitted(records[0], problem, residual, scale),
+    )
+    gain_std = found.ultimate_gain_std / abs(found.ultimate_gain)
+    notes = [note for r in records for note in _checks(r, found, gain_std)]
+    found = replace(found, warnings=(*found.warnings, *dict.fromkeys(notes)))
+    found = _beside_rivals(found, fit, noise)
+    return with_what_is_determined(found, records, fit, quantile)
+
+
+def _read(problem: Problem, state: State, scale: float) -> Reading:
+    reading = problem.structure.read(state.theta, scale * state.coefficients)
+    if reading is None:
+        raise IdentificationError(
+            f"the fit of a {problem.structure.name} model left its structure; name another "
+            "structure"
+        )
+    return reading
+
+
+def _fitted(record: Record, problem: Problem, residual: FloatArray, scale: float) -> FloatArray:
+    fitted = np.full(len(record), math.nan)
+    own = problem.index < len(record)
+    used = problem.index[own]
+    fitted[used] = record.measurement[used] - scale * residual[own]
+    return fitted
+
+
+def _checks(record: Record, found: Identification, gain_std: float) -> list[str]:
+    notes = (
+        unequal_gains(record, found.model),
+        disagreeing_point(record, found.model, gain_std),
+    )
+    return [note for note in notes if note]
+
+
+def _beside_rivals(found: Identification, fit: Fit, noise: Noise) -> Identification:
+    """Tell the rivals, and let them widen what is said of K_u and w_u."""
+    shares = support(list(fit.candidates))
+    chosen = fit.problem.structure
+    own = 0.0
+    rivals: list[Rival] = []
+    for candidate, share in zip(fit.candidates, shares, strict=True):
+        if (candidate.structure.name, candidate.structure.order) == (chosen.name, chosen.order):
+            own += share
+        elif share >= _WORTH_TELLING:
+            counted = share >= _WORTH_COUNTING and len(rivals) < _MOST_COUNTED
+            rival = _rival(candidate, share, fit, noise if counted else None)
+            if rival is not None:
+                rivals.append(rival)
+    gain_std, frequency_std = averaged_point(found, own, rivals)
+    found = replace(
+        found,
+        support=own,
+        rivals=tuple(rivals),
+        ultimate_gain_std=gain_std,
+        ultimate_frequency_std=frequency_std,
+    )
+    stable = [r for r in rivals if r.model.is_stable and r.support > _OPEN]
+    if not (found.model.integrators and stable):
+        return found
+    best = stable[0]
+    told = (
+        "whether the process integrates is not in the data: a stable "
+        f"{best.model.structure} with gain {best.model.gain:.3g} has {100 * best.support:.0f} "
+        "% of the support; a biased relay or a longer step would tell; K_u and w_u are "
+        "determined all the same"
+    )
+    return replace(found, warnings=(*found.warnings, told))
+
+
+def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) -> Rival | None:
+    """Return a rival; with its covariance where the noise is given."""
+    problem, state = candidate.problem, candidate.state
+    reading = problem.structure.read(state.theta, fit.scale * state.coefficients)
+    if reading is None:
+        return None
+    model = reading.build(reading.values)
+    if noise is None:
+        return Rival(model, share)
+    root = root_of_covariance(problem, state, replace(fit, loss="squares"), noise)
+    # It was fitted to some of the samples, where they are many.
+    root = root * math.sqrt(problem.time.size / fit.problem.time.size)
+    return Rival(model, share, reading.build, reading.parameters, reading.values, root)
+
+
+def _prediction(records: Sequence[Record], problem: Problem, state: State) -> float:
+    """Return the error over the last cycle of the model that the samples before it give."""
+    record = records[0]
+    if len(records) > 1 or len(record.cycle_start) < 3:
+        return math.nan
+    split = record.time[record.cycle_start[-2]]
+    end = record.time[record.cycle_start[-1]]
+    before = problem.part(problem.time < split)
+    last = problem.part((problem.time >= split) & (problem.time < end))
+    if before.y.size < 4 * state.parameters or last.y.size == 0:
+        return math.nan
+    if before.relaxation or before.drift or before.structure.unstable:
+        # These are counted from the ends of the samples given.
+        return math.nan
+    earlier = refine(before, state.theta, tolerance=_PREDICTED)
+    error = last.y - earlier.coefficients @ evaluate(last, earlier.theta).columns
+    return math.sqrt(float(np.mean(error**2)))
+
+
+def _measured_noise(records: Sequence[Record]) -> float:
+    """Return the noise measured before the tests, of all of them together."""
+    if len(records) == 1:
+        return records[0].noise_std
+    squares = [r.noise_std**2 for r in records if math.isfinite(r.noise_std)]
+    return math.sqrt(sum(squares) / len(squares)) if len(squares) == len(records) else math.nan
+
+
+def _warnings(
+    records: Sequence[Record], quality: FitReport, noise: Noise, fit: Fit, residual: FloatArray
+) -> list[str]:
+    found = []
+    if noise.coloured:
+        found.append(
+            f"the residual is not white (p = {quality.whiteness_p:.2g}): something is not in the "
+            "model, such as a second input, another structure or a disturbance; the intervals "
+            "are widened for it, but do not cover a wrong structure"
+        )
+    if noise.step:
+        found.append(
+            f"the measurement comes in steps of {noise.step:.3g}, which are larger than its noise "
+            f"({quality.residual_rms:.3g} rms): rounding is no noise, and the intervals are "
+            "widened for it; a finer sensor or a larger amplitude would help"
+        )
+    for number, (record, part) in enumerate(
+        zip(records, fit.problem.experiments, strict=True), start=1
+    ):
+        which = f"test {number}: " if len(records) > 1 else ""
+        rms = fit.scale * math.sqrt(float(np.mean(residual[part] ** 2)))
+        measured = record.noise_std
+        if math.isfinite(measured) and rms > max(_UNEXPLAINED * measured, 1e-6 * fit.scale):
+            found.append(
+                f"{which}the residual ({rms:.3g} rms) is larger than the noise measured before "
+                f"the test ({measured:.3g}): the model leaves part of the response unexplained"
+            )
+        if record.lost_samples:
+            found.append(f"{which}{record.lost_samples} samples were lost on the way")
+    if fit.problem.drift:
+        found.append("the measurement drifts beside the response; the drift was estimated")
+    if fit.loss != "squares":
+        found.append(f"the {fit.loss} loss was minimised, as asked for, in place of the squares")
+    return found

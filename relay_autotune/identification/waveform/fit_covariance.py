@@ -1,0 +1,179 @@
+"""What a waveform fit is, and the covariance of its parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.waveform.quantisation import quantisation_step
+from relay_autotune.identification.waveform.residuals import covariance_meat
+from relay_autotune.identification.waveform.robust import mean_slope, scale_of, weights
+from relay_autotune.identification.waveform.selection import Candidate
+from relay_autotune.identification.waveform.separable import Problem, State
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+# Parts of the measurement's range that are rounding.
+NEGLIGIBLE = 1e-10
+_EPSILON = float(np.finfo(float).eps)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fit with all that it came from.
+
+    :param problem: what was fitted.
+    :param state: the fit.
+    :param candidates: all structures tried, the best first.
+    :param scale: range of the measurement, in which the problem counts [y].
+    :param base: what the samples' weights would be without the loss, shape (n,); None: the
+        weights themselves.
+    :param loss: what was minimised.
+    :param warnings: sentences on what was left out.
+    """
+
+    problem: Problem
+    state: State
+    candidates: tuple[Candidate, ...]
+    scale: float
+    base: FloatArray | None = None
+    loss: str = "squares"
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the residual is like.
+
+    :param coloured: True: its samples are correlated.
+    :param inflation: how many times larger the covariance is than for white noise of its size.
+    :param step: of the sensor's grid [y]; 0: none, or far below the noise.
+    """
+
+    coloured: bool
+    inflation: float = 1.0
+    step: float = 0.0
+
+
+def raw_residual(problem: Problem, state: State) -> FloatArray:
+    """Return what a fit leaves of each sample, whatever it counts, shape (n,)."""
+    if problem.weight is None:
+        return state.residual
+    columns, _ = problem.columns(state.theta)
+    return np.asarray(problem.y - state.coefficients @ columns)
+
+
+def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
+    """Recognise correlated noise, and a sensor whose steps are larger than its noise."""
+    step = max(quantisation_step(r.measurement) for r in records)
+    if step == 0.0 or rms >= step:
+        return Noise(coloured)
+    # Rounding errors stay alike until the next level is crossed: each level that is held is
+    # one piece of news, however many samples it lasts, with the variance of a rounding.
+    held = sum(1 + int(np.count_nonzero(np.diff(r.measurement))) for r in records)
+    samples = sum(len(r) for r in records)
+    larger = max(step**2 / 12.0 / rms**2, 1.0) if rms > 0.0 else 1.0
+    return Noise(coloured, larger * samples / held, step)
+
+
+def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return the covariance of the parameters of the field, to first order, shape (p, p).
+
+    NaN: what is not determined is so large that numbers do not hold it.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    :param fit: where scale and loss are told.
+    :param noise: what the residual is like.
+    """
+    root = root_of_covariance(problem, state, fit, noise)
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance = root @ root.T
+    if not np.all(np.isfinite(covariance)):
+        return np.full_like(covariance, math.nan)
+    return np.asarray(covariance)
+
+
+def root_of_covariance(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return B of the covariance B B' of the parameters of the field, shape (p, k).
+
+    It has twice the digits for what parameters leave open together that are hardly told apart.
+    Not finite: what is not determined is so large that numbers do not hold it.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    :param fit: where scale and loss are told.
+    :param noise: what the residual is like.
+    """
+    gradient = _gradient(problem, state, fit.scale)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(gradient @ _root(problem, state, fit, noise))
+
+
+def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+    """Return B of the covariance B B' of all linear coefficients and theta, in this order.
+
+    Of least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
+    ``J r`` between two inverses. Of a robust loss r is its derivative, over the mean of its
+    second one (Huber 1981). With J = Q R the inverses are those of R: where two parameters can
+    hardly be told apart, J'J keeps half of the digits that it takes to tell what both together
+    leave open.
+    """
+    n = state.residual.size
+    jacobian, scores, slope = _scores(problem, state, fit)
+    size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
+    size[size == 0.0] = 1.0
+    q, r = np.linalg.qr((jacobian / size[:, None]).T)
+    left, singular, right = np.linalg.svd(r, full_matrices=False)
+    # What has no effect beyond rounding is as uncertain as that tells, not certain.
+    singular = np.maximum(singular, _EPSILON * n * singular[0])
+    inverse = (right.T / singular) @ left.T / size[:, None]
+    degrees = max(n - state.parameters, 1)
+    if not noise.coloured:
+        variance = float(scores @ scores) / degrees * noise.inflation
+        return np.asarray(inverse * math.sqrt(variance) / slope)
+    meat = covariance_meat(q.T * scores, scores) * (n / degrees)
+    variances, axes = np.linalg.eigh(meat)
+    root = inverse @ (axes * np.sqrt(np.maximum(variances, 0.0)))
+    white = np.sum(inverse**2, axis=1) * (float(scores @ scores) / degrees)
+    # Each of the two reasons for fewer independent samples may hold; the larger one counts.
+    larger = np.sqrt(white * noise.inflation / np.maximum(np.sum(root**2, axis=1), 1e-300))
+    return np.asarray(root * np.maximum(larger, 1.0)[:, None] / slope)
+
+
+def _scores(problem: Problem, state: State, fit: Fit) -> tuple[FloatArray, FloatArray, float]:
+    """Return Jacobian, derivative of the loss at each sample, and mean of its second one."""
+    if fit.loss == "squares" or fit.base is None:
+        return np.concatenate((state.columns, state.derivative)), state.residual, 1.0
+    columns, derivatives = problem.columns(state.theta)
+    derivative = np.einsum("k,mkn->mn", state.coefficients[: derivatives.shape[1]], derivatives)
+    residual = fit.base * (problem.y - state.coefficients @ columns)
+    scale = max(scale_of(residual), NEGLIGIBLE)
+    scores = weights(residual, scale, fit.loss) * residual
+    jacobian = fit.base * np.concatenate((columns, derivative))
+    return jacobian, scores, max(mean_slope(residual, scale, fit.loss), 0.1)
+
+
+def _gradient(problem: Problem, state: State, scale: float) -> FloatArray:
+    """Return d(parameters of the field)/d(linear coefficients, theta), shape (p, k + m)."""
+    structure, k = problem.structure, state.coefficients.size
+    point = np.concatenate((state.coefficients, state.theta))
+    columns = []
+    for i, value in enumerate(point):
+        h = 1e-6 * (abs(value) or 1.0)
+        # A logarithm near zero is a time near one second, not a small one.
+        h = max(h, 1e-6) if k <= i < point.size - 1 else h
+        ends = []
+        for side in (h, -h):
+            moved = point.copy()
+            moved[i] += side
+            reading = structure.read(moved[k:], scale * moved[:k], like=state.theta)
+            assert reading is not None
+            ends.append(reading.values)
+        columns.append((ends[0] - ends[1]) / (2.0 * h))
+    return np.stack(columns, axis=1)

@@ -1,0 +1,338 @@
+"""Separable least squares: linear coefficients by QR, the others by Levenberg and Marquardt.
+
+Variable projection (Golub and Pereyra 1973) with Kaufman's approximation of the Jacobian.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.waveform.structures import RationalStructure
+from relay_autotune.record.record import Input
+
+FloatArray = NDArray[np.float64]
+
+_MOST_ITERATIONS = 80
+_MOST_ROUGH_ITERATIONS = 25
+_LEAST_GAIN = 1e-15
+_SMALLEST_STEP = 1e-14
+_FIRST_DAMPING = 1e-3
+_LITTLE_DAMPING = 0.1
+# Trials in a row that gain nothing worth it: a rough fit stands at a kink, as of a dead time.
+_PATIENCE = 10
+_LEAST_DAMPING = 1e-12
+_MOST_DAMPING = 1e12
+_GROWTH = 4.0
+# In lengths of the record: a slower lag answers as an integrator does, to a thousandth.
+_LONGEST = 1e3
+_WEAK = 1e-13
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Samples, inputs and structure, with the terms that are estimated beside the model.
+
+    The samples of several experiments on one process follow one another; gain and theta are
+    common to them, offset, drift and initial state are each one's own.
+
+    :param time: sample times, in each experiment not decreasing [s], shape (n,).
+    :param y: what is fitted, in units of its own range, shape (n,).
+    :param inputs: the input of each experiment.
+    :param structure: the structure.
+    :param index: number of each sample among all that were recorded, shape (n,).
+    :param bounds: number of the first sample of each experiment.
+    :param drift: True: a straight line is estimated, not only an offset.
+    :param relaxation: True: a free initial state is estimated.
+    :param weight: square root of what each sample counts, shape (n,); None: all count alike.
+    """
+
+    time: FloatArray
+    y: FloatArray
+    inputs: tuple[Input, ...]
+    structure: RationalStructure
+    index: NDArray[np.int64]
+    bounds: tuple[int, ...] = (0,)
+    drift: bool = False
+    relaxation: bool = False
+    weight: FloatArray | None = None
+
+    @property
+    def experiments(self) -> list[slice]:
+        """The samples of each experiment."""
+        if len(self.bounds) == 1:
+            return [slice(0, self.time.size)]
+        ends = [*np.searchsorted(self.index, self.bounds).tolist(), self.time.size]
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    @property
+    def starts(self) -> FloatArray:
+        """Time of the first sample of each sample's experiment [s], shape (n,)."""
+        found = np.empty(self.time.size)
+        for part in self.experiments:
+            found[part] = self.time[part][0]
+        return found
+
+    def columns(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the linear coefficients' columns and the derivatives of those that have some.
+
+        :param theta: shape (m,).
+        :return: shapes (k, n) and (m, l, n); the k - l columns that theta does not change come
+            last.
+        """
+        parts = self.experiments
+        if len(parts) == 1:
+            common, by_theta, own, own_by_theta, rest = self._of_one(theta, parts[0], 0)
+            columns = np.concatenate((common, own, rest))
+            if own.shape[0]:
+                by_theta = np.concatenate((by_theta, own_by_theta), axis=1)
+            return columns, by_theta
+        found = [self._of_one(theta, part, i) for i, part in enumerate(parts)]
+        own_rows = sum(f[2].shape[0] for f in found)
+        rest_rows = sum(f[4].shape[0] for f in found)
+        k, n = found[0][0].shape[0], self.time.size
+        columns = np.zeros((k + own_rows + rest_rows, n))
+        derivatives = np.zeros((theta.size, k + own_rows, n))
+        first, last = k, k + own_rows
+        for part, (common, by_theta, own, own_by_theta, rest) in zip(parts, found, strict=True):
+            columns[:k, part], derivatives[:, :k, part] = common, by_theta
+            place = slice(first, first + own.shape[0])
+            columns[place, part], derivatives[:, place, part] = own, own_by_theta
+            columns[last : last + rest.shape[0], part] = rest
+            first, last = place.stop, last + rest.shape[0]
+        return columns, derivatives
+
+    def _of_one(
+        self, theta: FloatArray, part: slice, number: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return one experiment's responses, free motion and straight line, with derivatives."""
+        time = self.time[part]
+        common, by_theta = self.structure.columns(theta, time, self.inputs[number])
+        own, own_by_theta = np.zeros((0, time.size)), np.zeros((theta.size, 0, time.size))
+        if self.relaxation or self.structure.unstable:
+            own, own_by_theta = self.structure.relaxation(
+                theta, time, growing_only=not self.relaxation
+            )
+        rest = np.ones((1 + self.drift, time.size))
+        if self.drift:
+            rest[1] = (time - time.mean()) / np.ptp(time)
+        return common, by_theta, own, own_by_theta, rest
+
+    def part(self, chosen: NDArray[np.bool_] | slice) -> Problem:
+        """Return the problem of some of the samples, of each experiment at least a few."""
+        return replace(
+            self,
+            time=self.time[chosen],
+            y=self.y[chosen],
+            index=self.index[chosen],
+            weight=None if self.weight is None else self.weight[chosen],
+        )
+
+    def thinned(self, most: int) -> Problem:
+        """Return the problem of evenly spaced samples.
+
+        :param most: of all experiments together; hardly more are kept.
+        """
+        share = most // len(self.bounds)
+        parts = self.experiments
+        steps = [max(1, (part.stop - part.start) // share) for part in parts]
+        if len(parts) == 1:
+            return self if steps[0] == 1 else self.part(slice(None, None, steps[0]))
+        chosen = np.zeros(self.time.size, dtype=bool)
+        for part, step in zip(parts, steps, strict=True):
+            chosen[part][::step] = True
+        return self.part(chosen)
+
+
+def problem_of(
+    records: Sequence[tuple[FloatArray, FloatArray, Input]],
+    structure: RationalStructure,
+) -> Problem:
+    """Return the problem of fitting a structure to one or several experiments.
+
+    :param records: sample times [s], what is fitted, and input of each.
+    :param structure: the structure.
+    """
+    sizes = [time.size for time, _, _ in records]
+    return Problem(
+        np.concatenate([time for time, _, _ in records]),
+        np.concatenate([y for _, y, _ in records]),
+        tuple(u for _, _, u in records),
+        structure,
+        np.arange(sum(sizes)),
+        tuple(int(b) for b in np.cumsum([0, *sizes[:-1]])),
+    )
+
+
+@dataclass(frozen=True)
+class State:
+    """A trial theta with everything that follows from it.
+
+    :param theta: shape (m,).
+    :param coefficients: the best linear coefficients, shape (k,).
+    :param residual: what is left, weighted as the samples are, shape (n,).
+    :param cost: its sum of squares.
+    :param basis: orthonormal columns of the linear part, shape (n, k).
+    :param derivative: of the model by theta, weighted, shape (m, n).
+    :param columns: of the linear part, weighted, shape (k, n).
+    :param damping: Marquardt's, where a fit ended.
+    """
+
+    theta: FloatArray
+    coefficients: FloatArray
+    residual: FloatArray
+    cost: float
+    basis: FloatArray
+    derivative: FloatArray
+    columns: FloatArray
+    damping: float = _FIRST_DAMPING
+
+    @property
+    def parameters(self) -> int:
+        """Number of all that was estimated."""
+        return int(self.theta.size + self.coefficients.size)
+
+
+def evaluate(problem: Problem, theta: FloatArray) -> State:
+    """Return the best linear coefficients for one theta, and what they leave.
+
+    :param problem: the problem.
+    :param theta: shape (m,).
+    """
+    columns, derivatives = problem.columns(theta)
+    y = problem.y
+    if problem.weight is not None:
+        y, columns, derivatives = (x * problem.weight for x in (y, columns, derivatives))
+    size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
+    size[size == 0.0] = 1.0
+    q, r = np.linalg.qr((columns / size[:, None]).T)
+    coefficients = _backward(r.tolist(), (q.T @ y).tolist()) / size
+    residual = y - coefficients @ columns
+    derivative = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
+    cost = float(residual @ residual)
+    return State(theta, coefficients, residual, cost, q, derivative, columns)
+
+
+def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
+    """Solve ``r c = right`` for an upper triangle r of a few columns, each of length one.
+
+    A column that the others make up carries no information: its coefficient stays zero.
+    """
+    # Of so few, plain numbers are quicker than arrays.
+    found = [0.0] * len(right)
+    for i in range(len(right) - 1, -1, -1):
+        if abs(r[i][i]) >= _WEAK:
+            rest = sum(a * c for a, c in zip(r[i][i + 1 :], found[i + 1 :], strict=True))
+            found[i] = (right[i] - rest) / r[i][i]
+    return np.array(found)
+
+
+def refine(
+    problem: Problem,
+    theta: FloatArray,
+    *,
+    tolerance: float = _LEAST_GAIN,
+    most: int = _MOST_ITERATIONS,
+    damping: float = _FIRST_DAMPING,
+) -> State:
+    """Return the least sum of squares near a theta.
+
+    :param problem: the problem.
+    :param theta: where to begin, shape (m,).
+    :param tolerance: relative gain of a step that is not worth another one; by default, rounding.
+    :param most: steps that are tried at most.
+    :param damping: Marquardt's, at the start; that of an earlier fit lets it go on.
+    """
+    state = evaluate(problem, theta)
+    growth = _GROWTH
+    longest = _LONGEST * float(np.ptp(problem.time))
+    # A rough answer must not take as many trials as an exact one.
+    rough = tolerance > _LEAST_GAIN
+    idle = 0
+    scale, normal, gradient = _linearised(problem, state)
+    for _ in range(min(most, _MOST_ROUGH_ITERATIONS) if rough else most):
+        step = _solve(normal, gradient, damping)
+        least = -float(state.theta[-1] / scale[-1])
+        if step[-1] < least:
+            # The dead time stops at zero, and the others go where that leaves them to go.
+            rest = gradient[:-1] - normal[:-1, -1] * least
+            step = np.append(_solve(normal[:-1, :-1], rest, damping), least)
+        predicted = float(step @ (2.0 * gradient - normal @ step))
+        if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
+            break
+        trial = evaluate(problem, problem.structure.move(state.theta, step, longest))
+        smallest = float(np.abs(step).max()) < _SMALLEST_STEP
+        idle = 0 if state.cost - trial.cost > tolerance * state.cost else idle + 1
+        if rough and idle == _PATIENCE:
+            state = min(state, trial, key=lambda s: s.cost)
+            break
+        if not trial.cost < state.cost:
+            damping *= growth
+            growth *= 2.0
+            # Where even the undamped step promises less than rounding, no other will be seen.
+            undamped = float(gradient @ _solve(normal, gradient, 0.0))
+            if undamped <= tolerance * state.cost or damping > _MOST_DAMPING or smallest:
+                break
+            continue
+        gained = state.cost - trial.cost
+        # By how well the linear model foretold the gain (Nielsen 1999).
+        factor = 1.0 - (2.0 * gained / predicted - 1.0) ** 3 if predicted > 0.0 else 1.0
+        damping = max(damping * min(max(factor, 0.1), 2.0), _LEAST_DAMPING)
+        growth = _GROWTH
+        state = trial
+        # A step that damping made small gains little wherever it begins.
+        if smallest or (gained <= tolerance * state.cost and damping <= _LITTLE_DAMPING):
+            break
+        scale, normal, gradient = _linearised(problem, state)
+    return replace(state, damping=damping)
+
+
+def promised(problem: Problem, state: State) -> float:
+    """Return how much less the sum of squares would be if the model were linear in theta.
+
+    :param problem: the problem.
+    :param state: any of its states.
+    """
+    _, normal, gradient = _linearised(problem, state)
+    return float(gradient @ _solve(normal, gradient, 0.0))
+
+
+def _linearised(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the units of steps, and the normal equations' matrix and right side in them."""
+    scale = problem.structure.scale(state.theta)
+    jacobian = state.derivative * scale[:, None]
+    jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
+    return scale, jacobian @ jacobian.T, jacobian @ state.residual
+
+
+def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """Solve the normal equations, each direction in its own units, with Marquardt's damping."""
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scaled = normal / size[:, None] / size
+    scaled.flat[:: size.size + 1] += damping
+    try:
+        step = np.linalg.solve(scaled, gradient / size)
+    except np.linalg.LinAlgError:
+        # Without damping, directions that the data do not tell apart.
+        step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0]
+    return np.asarray(step / size)
+
+
+def information_criterion(
+    cost: float, samples: int, parameters: int, floor: float, worth: float = 1.0
+) -> float:
+    """Return the Bayesian information criterion, ``n log(cost/samples) + p log n``.
+
+    :param cost: sum of squared residuals.
+    :param samples: how many they are.
+    :param parameters: p, all that was estimated.
+    :param floor: what lies below it is rounding, and counts as equal.
+    :param worth: how many independent samples each is worth; n is so many times their number.
+    """
+    n = samples * worth
+    return n * math.log(max(cost, floor) / samples) + parameters * math.log(max(n, 3.0))

@@ -1,0 +1,320 @@
+"""Where a fit begins: a grid for FOPDT, and from its fit every other structure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.waveform.separable import (
+    Problem,
+    State,
+    evaluate,
+    promised,
+    refine,
+)
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Input, PiecewiseConstant
+
+FloatArray = NDArray[np.float64]
+
+_GRID_SAMPLES = 240
+_BEST = 3
+_COARSE = 1e-4
+# Of several starts: steps that each may take, how many go on, and from which sum of squares not.
+_FIRST_STEPS = 5
+_SECOND_STEPS = 8
+_MORE = 3
+_HOPELESS = 4.0
+# A relay switches at no more than this part of the samples. Where a command changes more often,
+# the changes that count are those by this part of its range.
+_MOST_SWITCHES = 0.5
+_SWITCH = 0.25
+# Nearer in every direction two are one; of two whose sums differ by less, all samples decide.
+_SAME = 0.02
+_UNDECIDED = 1.05
+_EXACT = 1e-15
+
+# Dead times tried at the start, as shares of the longest one.
+# Noise may make a relay switch faster than the process answers, hence those beyond 1.
+_SHARES = (
+    *(0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95),
+    *(1.2, 1.5, 1.9, 2.4),
+)
+
+
+def two_lags(large: float, small: float, dead_time: float) -> FloatArray:
+    """Return theta of a second order with two lags, which are kept apart.
+
+    :param large: time constant [s].
+    :param small: the other one [s].
+    :param dead_time: [s].
+    """
+    pair = math.sqrt(large * small)
+    ratio = max((large + small) / (2.0 * pair), 1.05)
+    return np.array((math.log(pair), math.log(ratio), dead_time))
+
+
+def changes_within(u: Input, time: FloatArray) -> FloatArray:
+    """Return when an input changes within samples, so that one of them follows [s].
+
+    :param u: the input.
+    :param time: of the samples [s], shape (n,).
+    """
+    return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
+
+
+def time_scales(problem: Problem) -> tuple[float, float]:
+    """Return the shortest time that samples resolve, and the longest that a dead time can be.
+
+    :param problem: the inputs change within the samples [s].
+    """
+    scales = []
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        time = problem.time[part]
+        gaps = np.diff(time)
+        shortest = float(np.median(gaps[gaps > 0.0]))
+        inside = changes_within(u, time)
+        rest = float(time[-1] - inside[0])
+        if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
+            # A controller answers each sample, and now and then a set-point that is switched.
+            steps = np.abs(np.diff(u.values, prepend=u.initial))
+            large = u.times[steps >= _SWITCH * float(np.ptp(u.values))]
+            inside = large[(large >= time[0]) & (large < time[-1])]
+        if inside.size >= 4:
+            # In a relay test the process answers one switch before the next.
+            rest = min(1.1 * float(np.max(np.diff(inside))), rest)
+        scales.append((shortest, rest))
+    return min(s for s, _ in scales), min(longest for _, longest in scales)
+
+
+def coarse(problem: Problem) -> Problem:
+    """Return the problem of a few hundred samples."""
+    return problem.thinned(_GRID_SAMPLES)
+
+
+def begin(problem: Problem, thetas: list[FloatArray]) -> list[State]:
+    """Return where a few steps on few samples lead from each start, the best first.
+
+    They show which starts are worth more. A single start is followed to its end.
+
+    :param problem: the problem.
+    :param thetas: starts, at least one.
+    """
+    few, most = coarse(problem), {} if len(thetas) == 1 else {"most": _FIRST_STEPS}
+    begun = [refine(few, theta, tolerance=_COARSE, **most) for theta in thetas]
+    return sorted(begun, key=lambda s: s.cost)
+
+
+def go_on(problem: Problem, begun: list[State]) -> list[State]:
+    """Return the fits to few samples that a beginning leads to, the best first.
+
+    :param problem: the problem.
+    :param begun: from :func:`begin`.
+    :return: two where few samples do not tell which of two places is the better one.
+    """
+    if len(begun) == 1:
+        return begun
+    few = coarse(problem)
+    reached = [
+        refine(few, s.theta, tolerance=_COARSE, most=_SECOND_STEPS, damping=s.damping)
+        for s in _apart_from_each_other(problem, begun, _HOPELESS)[:_MORE]
+    ]
+    return _apart_from_each_other(problem, reached, _UNDECIDED)[:2]
+
+
+def least_promised(problem: Problem, begun: list[State]) -> float:
+    """Return the least mean square that any beginning would lead to if models were linear.
+
+    :param problem: the problem.
+    :param begun: from :func:`begin`.
+    """
+    few = coarse(problem)
+    return min(s.cost - promised(few, s) for s in begun) / few.time.size
+
+
+def _apart_from_each_other(problem: Problem, states: list[State], limit: float) -> list[State]:
+    """Return the best state and those of little higher cost that are elsewhere."""
+    states = sorted(states, key=lambda s: s.cost)
+    chosen: list[State] = []
+    for state in states:
+        size = problem.structure.scale(state.theta)
+        near = (np.abs((state.theta - c.theta) / size).max() < _SAME for c in chosen)
+        if state.cost <= limit * states[0].cost and not any(near):
+            chosen.append(state)
+    return chosen
+
+
+def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> State:
+    """Return the best fit that any of the starts leads to: first on few samples, then on all.
+
+    :param problem: the problem.
+    :param thetas: starts, at least one.
+    :param tolerance: relative gain of a step that is not worth another one; 0: rounding.
+    """
+    return refine_all(problem, go_on(problem, begin(problem, thetas)), tolerance or _EXACT)
+
+
+def refine_all(problem: Problem, rough: list[State], tolerance: float) -> State:
+    """Return the best fit to all samples from fits to few of them.
+
+    :param problem: the problem.
+    :param rough: fits to few samples, at least one.
+    :param tolerance: relative gain of a step that is not worth another one.
+    """
+    fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in rough]
+    return min(fits, key=lambda s: s.cost)
+
+
+def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
+    """Return the best few of a grid of (log tau, D) for a FOPDT.
+
+    :param problem: with a FOPDT structure.
+    :param sign: of the gain, 1 or -1; 0: not known.
+    """
+    shortest, longest = time_scales(problem)
+    few = coarse(problem)
+    taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
+    dead_times = longest * np.array(_SHARES)
+    costs = np.array([_costs(few, tau, dead_times, sign) for tau in taus])
+    best: list[FloatArray] = []
+    for flat in np.argsort(costs, axis=None, kind="stable"):
+        i, j = np.unravel_index(flat, costs.shape)
+        theta = np.array((math.log(taus[i]), dead_times[j] + 1e-3 * longest))
+        if all(_apart(theta, other) for other in best):
+            best.append(theta)
+        if len(best) == _BEST:
+            break
+    return best
+
+
+def _apart(a: FloatArray, b: FloatArray) -> bool:
+    return abs(a[0] - b[0]) > 0.5 or abs(math.log(a[1] / b[1])) > 0.5
+
+
+def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> FloatArray:
+    """Return the sums of squares that a lag and an offset leave, for each dead time.
+
+    A limit cycle looks much the same half a period later with the other sign; a lag with the
+    wrong one explains nothing here.
+    """
+    theta = np.array((math.log(tau), 0.0))
+    along, power, total = np.zeros(dead_times.size), np.zeros(dead_times.size), 0.0
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        # A dead time only moves the response, so that one pass over moved samples gives all.
+        moved = (problem.time[part] - dead_times[:, None]).ravel()
+        order = np.argsort(moved, kind="stable")
+        columns, _ = problem.structure.columns(theta, moved[order], u)
+        r = np.empty(moved.size)
+        r[order] = columns[0]
+        table = r.reshape(dead_times.size, -1)
+        table = table - table.mean(axis=1, keepdims=True)
+        y = problem.y[part] - problem.y[part].mean()
+        power += np.einsum("dn,dn->d", table, table)
+        along += table @ y
+        total += float(y @ y)
+    power[power == 0.0] = 1.0
+    return np.asarray(total - np.where(sign * along < 0.0, 0.0, along**2 / power))
+
+
+class Starts:
+    """Starts of every structure from the FOPDT that fits best.
+
+    :param problem: the problem with its FOPDT structure.
+    :param fopdt: its best fit.
+    """
+
+    def __init__(self, problem: Problem, fopdt: State) -> None:
+        self._unstable: list[FloatArray] | None = None
+        shortest, self.longest = time_scales(problem)
+        # A FOPDT that fits badly may run off to an integrator, which tells the others nothing.
+        self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
+        self.dead_time = float(fopdt.theta[1])
+        self._least = 0.1 * shortest
+        point = ultimate_point(
+            TransferFunction.fopdt(1.0, self.tau, max(self.dead_time, self._least))
+        )
+        # Where the fit is judged: about the frequency at which a relay test oscillates.
+        self._w = point.frequency if point is not None else 1.0 / self.longest
+
+    def lag_n(self, order: int) -> FloatArray:
+        """Return (log tau, D) of n equal lags of the same gain and phase at one frequency."""
+        w = self._w
+        square = (1.0 + (w * self.tau) ** 2) ** (1.0 / order) - 1.0
+        tau = max(math.sqrt(square) / w, self._least)
+        phase = w * self.dead_time + math.atan(w * self.tau) - order * math.atan(w * tau)
+        return np.array((math.log(tau), max(phase / w, self._least)))
+
+    def lag_n_zero(self, order: int) -> list[FloatArray]:
+        """Return starts of equal lags with a zero, which can look like dead time or hide it."""
+        theta = self.lag_n(order)
+        return [
+            np.array((theta[0] + math.log(scale), share * theta[1]))
+            for scale, share in ((1.0, 1.0), (1.0, 0.3), (0.6, 0.6), (0.6, 0.15))
+        ]
+
+    def sopdt(self) -> list[FloatArray]:
+        """Return starts of a second order: overdamped, critical, underdamped."""
+        tau, dead_time = self.lag_n(2)
+        small = max(0.3 * self.dead_time, self._least)
+        return [
+            two_lags(self.tau, small, max(self.dead_time - small, self._least)),
+            np.array((tau, math.log(0.9), dead_time)),
+            np.array((tau, math.log(0.4), dead_time)),
+        ]
+
+    def third(self) -> list[FloatArray]:
+        """Return starts of a second order with one more lag, near each other or slow."""
+        tau, dead_time = self.lag_n(3)
+        slow = math.log(self.tau)
+        fast = math.log(max(0.3 * self.dead_time, self._least))
+        rest = max(0.5 * self.dead_time, self._least)
+        return [
+            *(np.array((tau, damping, tau, dead_time)) for damping in (0.3, -0.05, -1.0)),
+            np.array((fast, -0.4, slow, rest)),
+        ]
+
+    def two_equal_one(self) -> list[FloatArray]:
+        """Return starts of two equal lags and another: near each other, and either one small."""
+        tau, dead_time = self.lag_n(3)
+        slow = math.log(self.tau)
+        fast = math.log(max(0.3 * self.dead_time, self._least))
+        rest = max(0.5 * self.dead_time, self._least)
+        return [
+            np.array((tau, tau, dead_time)),
+            np.array((slow, fast, rest)),
+            np.array((fast, slow, rest)),
+        ]
+
+    def integrator(self) -> FloatArray:
+        """Return (D,) of an integrator with dead time."""
+        return np.array((max(self.dead_time, self._least),))
+
+    def integrator_lag(self) -> list[FloatArray]:
+        """Return starts of an integrator with a lag that shares the dead time, or is longer."""
+        d = max(self.dead_time, self._least)
+        return [np.array((math.log(s * d), max(1.0 - s, 0.2) * d)) for s in (0.2, 0.7, 3.0)]
+
+    def unstable(self, problem: Problem) -> list[FloatArray]:
+        """Return the best few of a grid of (log tau, D) for an unstable FOPDT.
+
+        :param problem: with an unstable FOPDT structure.
+        """
+        if self._unstable is not None:
+            return self._unstable
+        few = coarse(problem)
+        grid = [
+            np.array((math.log(tau * self.longest), share * self.longest))
+            for tau in (0.4, 1.0, 2.5, 6.0, 20.0)
+            for share in (0.05, 0.2, 0.4, 0.7)
+        ]
+        states = [evaluate(few, theta) for theta in grid]
+        self._unstable = [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
+        return self._unstable
+
+    def unstable_second(self, first: FloatArray) -> list[FloatArray]:
+        """Return starts of an unstable pole with a lag, from an unstable FOPDT's theta."""
+        d = max(float(first[1]), self._least)
+        return [np.array((first[0], math.log(s * d), max(1.0 - s, 0.2) * d)) for s in (0.2, 0.7)]

@@ -1,0 +1,1 @@
+"""Processes: transfer functions and structures, their exact responses and simulation."""

@@ -1,0 +1,74 @@
+"""Exact response of a process to a piecewise-constant input."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from relay_autotune.process.modes import Coordinates, Modes
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
+
+FloatArray = NDArray[np.float64]
+
+
+def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> FloatArray:
+    """Return the output's deviation from rest, exact for any real dead time.
+
+    The process rests at ``u.initial`` before the first change of the input (an integrating
+    process: in balance). Nothing is discretised: between the delayed changes the response is
+    evaluated in closed form at the times asked for.
+
+    :param model: the process.
+    :param time: when the output is wanted [s], any shape and order.
+    :param u: the input.
+    :return: deviation of y, shape of ``time``.
+    """
+    t = np.asarray(time, dtype=np.float64)
+    flat = t.ravel()
+    changes = u.times + model.dead_time
+    if changes.size == 0 or flat.size == 0:
+        return np.zeros(t.shape)
+    end = max(float(flat.max()), float(changes[-1]))
+    modes = Modes.of(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
+    steps = np.diff(u.values, prepend=u.initial)
+    z = coordinates_at_changes(modes, changes, steps)
+    segment = np.searchsorted(changes, flat, side="right") - 1
+    after = segment >= 0
+    y = np.zeros(flat.shape)
+    index = segment[after]
+    weights = [w[index] for w in modes.weights(z)]
+    y[after] = modes.outputs(weights, flat[after] - changes[index])[:, 0]
+    return y.reshape(t.shape)
+
+
+def coordinates_at_changes(
+    modes: Modes, changes: FloatArray, steps: FloatArray, *, backward: bool = False
+) -> Coordinates:
+    """Return the coordinates just after each change of the input, from rest before the first.
+
+    :param modes: the process.
+    :param changes: when the delayed input changes [s], shape (m,).
+    :param steps: by how much, shape (m,).
+    :param backward: True: the growing modes are followed backward, from zero just after the last
+        change, so that they stay bounded; their true motion differs by a multiple of their own
+        free motion.
+    :return: shape (m, modes.size).
+    """
+    forward = modes.propagators(np.diff(changes))
+    growing = modes.growing
+    backward = backward and bool(np.any(growing))
+    if backward:
+        # What grows is followed the other way below.
+        forward[:, growing, :] = 0.0
+    kicks = steps[:, None] * modes.input_direction
+    z = np.empty((changes.size, modes.size), dtype=np.result_type(forward, kicks))
+    z[0] = kicks[0]
+    for k in range(1, changes.size):
+        z[k] = forward[k - 1] @ z[k - 1] + kicks[k]
+    if backward:
+        back = modes.propagators(-np.diff(changes))
+        z[-1, growing] = 0.0
+        for k in range(changes.size - 1, 0, -1):
+            z[k - 1, growing] = (back[k - 1] @ (z[k] - kicks[k]))[growing]
+    return z

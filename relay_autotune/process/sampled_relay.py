@@ -1,0 +1,77 @@
+"""A relay that acts at its samples only, on a process simulated exactly between them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import ModelError
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
+
+FloatArray = NDArray[np.float64]
+
+
+def simulate_sampled_relay(
+    model: TransferFunction,
+    settings: RelaySettings,
+    *,
+    period: float,
+    noise: FloatArray,
+    relay_sees_noise: bool = True,
+    operating_point: float | None = None,
+) -> Record:
+    """Run a relay that looks at the measurement every ``period`` and holds in between.
+
+    Sample k is taken at ``k period``; the relay answers it at once, and its answer reaches the
+    process after ``settings.extra_delay`` and the process's own dead time. It starts with the
+    level that moves the measurement upwards.
+
+    :param model: the process, at rest before the first sample.
+    :param settings: levels, set-point, hysteresis.
+    :param period: time between samples [s], > 0.
+    :param noise: what is added to each sample [y], shape (n,); it sets the number of samples.
+    :param relay_sees_noise: False: the relay acts on the noise-free output, the record still
+        holds the noisy one.
+    :param operating_point: measurement at rest [y]; default: the set-point.
+    :raises ModelError: if the period is not positive.
+    """
+    if not period > 0.0:
+        raise ModelError(f"the sample period must be > 0 s, found {period:g} s")
+    rest = settings.setpoint if operating_point is None else operating_point
+    delayed = TransferFunction(
+        model.gain,
+        model.zeros,
+        model.time_constants,
+        model.integrators,
+        model.dead_time + settings.extra_delay,
+    )
+    plant = Plant(delayed, initial_command=settings.baseline)
+    direct = not settings.reverse_acting
+    is_high = direct
+    command = settings.baseline
+    times = np.arange(noise.size, dtype=np.float64) * period
+    measurement, commands, starts = np.empty(noise.size), np.empty(noise.size), []
+    for k, time in enumerate(times):
+        y = rest + plant.advance(float(time), command)
+        measurement[k] = y + noise[k]
+        seen = measurement[k] if relay_sees_noise else y
+        was_high, seeks_rise = is_high, is_high == direct
+        if seeks_rise and seen > settings.setpoint + settings.hysteresis:
+            is_high = not direct
+        elif not seeks_rise and seen < settings.setpoint - settings.hysteresis:
+            is_high = direct
+        if is_high and not was_high:
+            starts.append(k)
+        command = settings.high if is_high else settings.low
+        commands[k] = command
+    return Record(
+        time=times,
+        measurement=measurement,
+        command=commands,
+        settings=settings,
+        noise_std=float(np.std(noise)),
+        cycle_start=tuple(starts),
+        outcome=Outcome.COMPLETED,
+    )

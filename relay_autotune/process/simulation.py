@@ -1,0 +1,372 @@
+"""Exact simulation: a process stepped from outside, and relay experiments driven by events."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from relay_autotune.errors import ModelError
+from relay_autotune.process.modes import Coordinates, Modes
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Cycle, Outcome, PiecewiseConstant, Record, RelaySettings
+
+FloatArray = NDArray[np.float64]
+
+_QUADRATURE = np.polynomial.legendre.leggauss(8)
+
+
+class Plant:
+    """A process whose input is held between calls, exact for any real dead time.
+
+    :param model: the process.
+    :param initial_command: the command at which it rests [u].
+    """
+
+    def __init__(self, model: TransferFunction, *, initial_command: float = 0.0) -> None:
+        self.time = 0.0
+        self._dead_time = model.dead_time
+        self._modes = Modes.of(model)
+        self._z = self._modes.rest()
+        self._weights = self._modes.weights(self._z)
+        self._since = 0.0
+        self._command = initial_command
+        self._arrived = initial_command
+        self._on_the_way: deque[tuple[float, float]] = deque()
+
+    def advance(self, time: float, command: float) -> float:
+        """Hold ``command`` from now on, move to ``time`` and return the output there.
+
+        :param time: not before the present time [s].
+        :param command: [u].
+        :return: deviation of the output from rest [y].
+        :raises ModelError: if ``time`` lies in the past.
+        """
+        if time < self.time:
+            raise ModelError(f"the plant is at {self.time:g} s and cannot go back to {time:g} s")
+        if command != self._command:
+            self._on_the_way.append((self.time + self._dead_time, command))
+            self._command = command
+        while self._on_the_way and self._on_the_way[0][0] <= time:
+            self._arrive(*self._on_the_way.popleft())
+        self.time = time
+        return float(self._modes.outputs(self._weights, np.array([time - self._since]))[0, 0])
+
+    def _arrive(self, time: float, command: float) -> None:
+        z = self._modes.move(self._z, time - self._since)
+        self._z = z + (command - self._arrived) * self._modes.input_direction
+        self._weights = self._modes.weights(self._z)
+        self._since, self._arrived = time, command
+
+
+@dataclass(frozen=True)
+class RelayRun:
+    """What an ideal relay experiment gave.
+
+    :param settings: the relay.
+    :param command: the command with its exact switch instants.
+    :param cycles: every whole cycle, with exact times and peaks.
+    :param time: sample times asked for [s], shape (n,).
+    :param measurement: noise-free measurement there [y], shape (n,).
+    """
+
+    settings: RelaySettings
+    command: PiecewiseConstant
+    cycles: tuple[Cycle, ...]
+    time: FloatArray
+    measurement: FloatArray
+
+    def record(self, *, noise_std: float = 0.0, rng: np.random.Generator | None = None) -> Record:
+        """Return the samples as a record, with noise that the relay did not see.
+
+        :param noise_std: standard deviation of white Gaussian noise [y].
+        :param rng: its source; needed where ``noise_std`` > 0.
+        """
+        y = self.measurement
+        if noise_std > 0.0:
+            if rng is None:
+                raise ModelError("noise needs a random generator, found none")
+            y = y + noise_std * rng.standard_normal(y.size)
+        starts = [c.start for c in self.cycles]
+        if self.cycles:
+            starts.append(starts[-1] + self.cycles[-1].period)
+        boundaries = np.unique(np.searchsorted(self.time, starts))
+        return Record(
+            time=self.time,
+            measurement=y,
+            command=self.command(self.time),
+            settings=self.settings,
+            noise_std=noise_std,
+            cycle_start=tuple(int(b) for b in boundaries if b < self.time.size),
+            outcome=Outcome.COMPLETED,
+            held_input=self.command,
+        )
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    ends = function(low), function(high)
+    if ends[0] * ends[1] >= 0.0:
+        # The change of sign that was seen over many points at once was rounding.
+        return low if abs(ends[0]) <= abs(ends[1]) else high
+    # Relative to the cell, since a root may lie at its very beginning, which may be zero.
+    return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15, maxiter=1000))
+
+
+class _Segment:
+    """The motion between two changes of the delayed input."""
+
+    def __init__(self, modes: Modes, z: Coordinates, level: float, corners: FloatArray) -> None:
+        self.modes, self.z, self.level, self._corners = modes, z, level, corners
+        self.weights = modes.weights(z)
+        self.slopes = modes.slope_weights(self.weights)
+        # Below this a difference from a threshold is rounding.
+        size = sum(float(np.abs(w).sum()) for w in self.weights)
+        self.rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
+
+    def output(self, time: ArrayLike) -> FloatArray:
+        at = np.atleast_1d(np.asarray(time, dtype=np.float64))
+        return np.asarray(self.level + self.modes.outputs(self.weights, at)[:, 0])
+
+    def slope(self, time: float) -> float:
+        return float(self.modes.outputs(self.slopes, np.array([time]))[0, 0])
+
+    def grid(self, length: float) -> FloatArray:
+        """Return times dense enough that each cell holds at most one extremum."""
+        fastest, oscillation = self._corners
+        parts = [np.linspace(0.0, length, 33)]
+        if 1e-3 * fastest < length:
+            count = int(12.0 * math.log(length / (1e-3 * fastest))) + 2
+            parts.append(np.geomspace(1e-3 * fastest, length, count))
+        if oscillation > 0.0:
+            parts.append(np.linspace(0.0, length, min(int(length * oscillation * 4) + 2, 100_000)))
+        return np.unique(np.concatenate(parts))
+
+    def turning_points(self, grid: FloatArray) -> FloatArray:
+        """Return the times of the extrema between the grid's ends."""
+        slope = self.modes.outputs(self.slopes, grid)[:, 0]
+        cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
+        return np.array([_root(self.slope, grid[i], grid[i + 1]) for i in cells])
+
+    def first_rise(self, excess: Callable[[FloatArray], FloatArray], grid: FloatArray) -> float:
+        """First time at which ``excess(y)`` passes zero upwards; nan if it does not."""
+        grid = np.unique(np.concatenate((grid, self.turning_points(grid))))
+        f = excess(self.output(grid))
+        cells = np.flatnonzero((f[:-1] <= self.rounding) & (f[1:] > self.rounding))
+        if cells.size == 0:
+            return math.nan
+        i = int(cells[0])
+        if f[i] >= -self.rounding:
+            return float(grid[i])
+
+        def crossing(time: float) -> float:
+            return float(excess(self.output(time))[0])
+
+        return _root(crossing, grid[i], grid[i + 1])
+
+
+@dataclass
+class _HalfCycle:
+    """Running account of the time between two switches."""
+
+    start: float
+    level_is_high: bool
+    end: float = 0.0
+    peak_max: float = -math.inf
+    peak_min: float = math.inf
+    when_max: float = 0.0
+    when_min: float = 0.0
+    area: float = 0.0
+    # The motion with its length, and when each piece of it begins.
+    pieces: list[tuple[_Segment, float, float]] = field(default_factory=list)
+
+    def measure(self) -> None:
+        """Find the peaks and the area."""
+        for segment, length, begin in self.pieces:
+            self._add(segment, segment.grid(length), begin)
+
+    def _add(self, segment: _Segment, grid: FloatArray, begin: float) -> None:
+        at = np.unique(np.concatenate((grid, segment.turning_points(grid))))
+        y = segment.output(at)
+        if y.max() > self.peak_max:
+            self.peak_max, self.when_max = float(y.max()), begin + float(at[np.argmax(y)])
+        if y.min() < self.peak_min:
+            self.peak_min, self.when_min = float(y.min()), begin + float(at[np.argmin(y)])
+        nodes, weights = _QUADRATURE
+        half = np.diff(at)[:, None] / 2.0
+        inner = at[:-1, None] + half * (nodes + 1.0)
+        values = segment.output(inner.ravel()).reshape(inner.shape)
+        self.area += float(np.sum(values * weights * half))
+
+
+def simulate_relay(
+    model: TransferFunction,
+    settings: RelaySettings,
+    *,
+    cycles: int,
+    time: ArrayLike = (),
+    operating_point: float | None = None,
+    kick: float | None = None,
+    told: int | None = None,
+    most_switches: int = 20_000,
+) -> RelayRun:
+    """Run an ideal relay on a process, from switch to switch, without any time step.
+
+    At t = 0 the process rests at its operating point and the relay takes the level that moves
+    the measurement upwards. The relay then switches exactly where the measurement leaves the
+    hysteresis band; each switch instant is solved for to machine precision. The command
+    reaches the process after the model's dead time plus ``settings.extra_delay``.
+
+    :param model: the process.
+    :param settings: levels, set-point, hysteresis.
+    :param cycles: whole cycles to run.
+    :param time: when samples are wanted [s], not decreasing, shape (n,); later ones than the end
+        of the last cycle are left out.
+    :param operating_point: measurement at rest [y]; default: the set-point.
+    :param kick: how far above the set-point the measurement must rise before the first
+        switch [y]; default: the hysteresis.
+    :param told: how many of the cycles are told, the last ones; default: all of them.
+    :param most_switches: more than these are taken for chatter.
+    :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
+    """
+    process = replace(model, dead_time=model.dead_time + settings.extra_delay)
+    modes = Modes.of(process)
+    constants = [abs(t) for t in model.time_constants] or [max(process.dead_time, 1e-9)]
+    oscillation = max((abs((1.0 / t).imag) for t in model.time_constants), default=0.0)
+    corners = np.array([min(constants), oscillation])
+    level = settings.setpoint if operating_point is None else operating_point
+    slowest = max(*constants, process.dead_time, 1e-12)
+    samples = np.asarray(time, dtype=np.float64)
+    measured = np.full(samples.shape, math.nan)
+
+    z, now, arrived = modes.rest(), 0.0, settings.baseline
+    direct = not settings.reverse_acting
+    is_high = direct
+    threshold = settings.setpoint + (settings.hysteresis if kick is None else kick)
+    switches = [(0.0, settings.high if is_high else settings.low)]
+    on_the_way = deque([(process.dead_time, switches[0][1])])
+    half = _HalfCycle(0.0, is_high)
+    halves: list[_HalfCycle] = []
+    segment = _Segment(modes, z, level, corners)
+    # The half that starts from rest and the one after it lead to the first whole cycle.
+    while sum(1 for h in halves[1:] if h.level_is_high != direct) <= cycles:
+        length = on_the_way[0][0] - now if on_the_way else 60.0 * slowest
+        rising = is_high == direct
+
+        def excess(y: FloatArray, rising: bool = rising, at: float = threshold) -> FloatArray:
+            return y - at if rising else at - y
+
+        grid = segment.grid(length) if length > 0.0 else np.zeros(1)
+        crossing = segment.first_rise(excess, grid) if length > 0.0 else math.nan
+        switching = not math.isnan(crossing)
+        if not switching and not on_the_way:
+            raise ModelError(
+                f"the measurement never reaches {threshold:g}, where the relay would switch: "
+                "there is no limit cycle; the amplitude must exceed what the hysteresis and the "
+                "set-point ask for"
+            )
+        step = crossing if switching else length
+        if step > 0.0:
+            half.pieces.append((segment, step, now))
+            inside = (samples >= now) & (samples <= now + step) & np.isnan(measured)
+            measured[inside] = segment.output(samples[inside] - now)
+            z, now = modes.move(z, step), now + step
+        if switching:
+            if now <= switches[-1][0]:
+                raise ModelError(
+                    f"the relay switches twice at t = {now:g} s: without dead time and hysteresis "
+                    "it needs a kick to leave the set-point"
+                )
+            half.end = now
+            halves.append(half)
+            is_high = not is_high
+            half = _HalfCycle(now, is_high)
+            threshold = settings.setpoint + (1 if is_high == direct else -1) * settings.hysteresis
+            switches.append((now, settings.high if is_high else settings.low))
+            on_the_way.append((now + process.dead_time, switches[-1][1]))
+            if len(switches) > most_switches:
+                raise ModelError(
+                    f"{most_switches} switches by t = {now:g} s: the relay chatters on this "
+                    "process; a dead time or a hysteresis is needed for a limit cycle"
+                )
+        while on_the_way and on_the_way[0][0] <= now:
+            _, value = on_the_way.popleft()
+            z = z + (value - arrived) * modes.input_direction
+            arrived = value
+        segment = _Segment(modes, z, level, corners)
+    times, levels = np.array([s[0] for s in switches]), np.array([s[1] for s in switches])
+    command = PiecewiseConstant(times, levels, settings.baseline)
+    known = ~np.isnan(measured)
+    found = _whole_cycles(halves, settings, told)
+    return RelayRun(settings, command, found, samples[known], measured[known])
+
+
+def _whole_cycles(
+    halves: list[_HalfCycle], settings: RelaySettings, told: int | None
+) -> tuple[Cycle, ...]:
+    # The first half starts from rest and belongs to no cycle.
+    usable = halves[1:] if not settings.reverse_acting else halves
+    usable = usable[next((i for i, h in enumerate(usable) if h.level_is_high), 0) :]
+    if usable and usable[0].start == 0.0:
+        usable = usable[2:]
+    cycles = []
+    whole = len(usable) // 2
+    for index in range(0 if told is None else max(whole - told, 0), whole):
+        high, low = usable[2 * index], usable[2 * index + 1]
+        high.measure()
+        low.measure()
+        # Low turns a direct process down, high a reverse one.
+        down, up = (high, low) if settings.reverse_acting else (low, high)
+        t_high, t_low = high.end - high.start, low.end - low.start
+        period = t_high + t_low
+        cycles.append(
+            Cycle(
+                index=index,
+                start=high.start,
+                period=period,
+                period_high=t_high,
+                period_low=t_low,
+                peak_max=down.peak_max,
+                peak_min=up.peak_min,
+                time_to_peak_max=down.when_max - down.start,
+                time_to_peak_min=up.when_min - up.start,
+                mean_measurement=(high.area + low.area) / period,
+                mean_command=(settings.high * t_high + settings.low * t_low) / period,
+            )
+        )
+    return tuple(cycles)
+
+
+def exact_limit_cycle(
+    model: TransferFunction,
+    settings: RelaySettings,
+    *,
+    tolerance: float = 1e-12,
+    most_cycles: int = 2000,
+) -> Cycle:
+    """Return the limit cycle to which an ideal relay experiment converges.
+
+    :param model: the process.
+    :param settings: the relay.
+    :param tolerance: relative change of the half periods from cycle to cycle that counts as
+        converged.
+    :param most_cycles: cycles to wait for it.
+    :raises ModelError: if there is none, or it does not converge.
+    """
+    count = 8
+    while True:
+        run = simulate_relay(model, settings, cycles=count, told=2)
+        a, b = run.cycles[-2], run.cycles[-1]
+        change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
+        if change <= tolerance * b.period:
+            return replace(b, converged=True)
+        if count >= most_cycles:
+            raise ModelError(
+                f"the limit cycle still changes by {change / b.period:g} of its period after "
+                f"{count} cycles"
+            )
+        count = min(4 * count, most_cycles)

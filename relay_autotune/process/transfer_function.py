@@ -1,0 +1,387 @@
+"""Transfer functions: rational functions of s with a dead time."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from relay_autotune.errors import ModelError
+from relay_autotune.exchange.text import process_latex, process_text
+from relay_autotune.process.model_parameters import (
+    at_least_one,
+    exactly,
+    oscillating_pair,
+    positive,
+)
+
+ComplexArray = NDArray[np.complex128]
+
+
+def _conjugate_closed(values: tuple[complex, ...]) -> bool:
+    rest = [v for v in values if v.imag != 0.0]
+    while rest:
+        value = rest.pop()
+        partner = [r for r in rest if abs(r - value.conjugate()) <= 1e-9 * abs(value)]
+        if not partner:
+            return False
+        rest.remove(partner[0])
+    return True
+
+
+def _real_product(constants: Sequence[complex]) -> NDArray[np.float64]:
+    """Coefficients of prod(1 + c s), highest power first."""
+    product = np.ones(1, dtype=np.complex128)
+    for constant in constants:
+        product = np.convolve(product, np.array([constant, 1.0]))
+    return np.ascontiguousarray(product.real)
+
+
+@dataclass(frozen=True)
+class TransferFunction:
+    r"""A process in time-constant form.
+
+    ``G(s) = gain prod(1 + z s) / (s^integrators prod(1 + T s)) exp(-dead_time s)``.
+
+    Right-half-plane zeros and poles have constants with a negative real part; complex ones come
+    in conjugate pairs. An unstable FOPDT ``K exp(-D s)/(tau s - 1)`` is thus held as gain ``-K``
+    and time constant ``-tau``; its constructor takes K and tau.
+
+    :param gain: gain of the form above [y/u, per second for each integrator].
+    :param zeros: time constants z [s].
+    :param time_constants: time constants T [s].
+    :param integrators: poles at s = 0; negative: zeros there.
+    :param dead_time: D >= 0 [s].
+    :param structure: name of the structure, one of ``STRUCTURES``.
+    :raises ModelError: if a value is not finite, the gain is zero, the dead time negative, a
+        complex constant lacks its conjugate, or there are more zeros than poles.
+    """
+
+    gain: float
+    zeros: tuple[complex, ...] = ()
+    time_constants: tuple[complex, ...] = ()
+    integrators: int = 0
+    dead_time: float = 0.0
+    structure: str = "general"
+
+    def __post_init__(self) -> None:
+        zeros = tuple(complex(z) for z in self.zeros if z != 0.0)
+        constants = tuple(complex(t) for t in self.time_constants if t != 0.0)
+        numbers = (self.gain, self.dead_time, *zeros, *constants)
+        if not all(cmath.isfinite(n) for n in numbers):
+            raise ModelError(f"every number of a transfer function must be finite, found {self!r}")
+        if self.gain == 0.0:
+            raise ModelError("the gain of a transfer function must not be zero")
+        if self.dead_time < 0.0:
+            raise ModelError(f"the dead time must be >= 0 s, found {self.dead_time:g} s")
+        if not (_conjugate_closed(zeros) and _conjugate_closed(constants)):
+            raise ModelError("complex zeros and poles must come in conjugate pairs")
+        if len(zeros) > len(constants) + self.integrators:
+            raise ModelError(
+                f"a process has at least as many poles as zeros, found "
+                f"{len(constants) + self.integrators} and {len(zeros)}"
+            )
+        object.__setattr__(self, "gain", float(self.gain))
+        object.__setattr__(self, "dead_time", float(self.dead_time))
+        object.__setattr__(self, "zeros", zeros)
+        object.__setattr__(self, "time_constants", constants)
+
+    def __str__(self) -> str:
+        """Return the transfer function on one line."""
+        return process_text(self)
+
+    def _repr_latex_(self) -> str:
+        """Return the transfer function as notebooks show it."""
+        return f"$\\displaystyle {process_latex(self)}$"
+
+    def __call__(self, s: ArrayLike) -> ComplexArray:
+        """Return G at each complex frequency ``s`` [rad/s], any shape."""
+        s = np.asarray(s, dtype=np.complex128)
+        delay = np.exp(-self.dead_time * s)
+        value: ComplexArray = np.asarray(self.gain * delay)
+        if self.integrators:
+            value = np.asarray(value * s ** float(-self.integrators))
+        for z in self.zeros:
+            value = np.asarray(value * (1.0 + z * s))
+        for t in self.time_constants:
+            value = np.asarray(value / (1.0 + t * s))
+        return value
+
+    def phase(self, frequency: ArrayLike) -> NDArray[np.float64]:
+        """Return the phase of ``process_sign * G(j w)`` without jumps [rad].
+
+        Each factor's angle is continuous from w = 0 on, so no unwrapping is needed however far
+        apart the frequencies lie.
+
+        :param frequency: w > 0 [rad/s], any shape.
+        """
+        w = np.asarray(frequency, dtype=np.float64)
+        start = 0.0 if self.gain * self.process_sign > 0.0 else -math.pi
+        angle = start - self.integrators * math.pi / 2.0 - self.dead_time * w
+        for z in self.zeros:
+            angle = angle + np.angle(1.0 + 1j * w * z)
+        for t in self.time_constants:
+            angle = angle - np.angle(1.0 + 1j * w * t)
+        return np.asarray(angle)
+
+    @property
+    def process_sign(self) -> int:
+        """Sign that the controller's gain must have: +1 for a direct-acting process, else -1.
+
+        The gain's own sign, turned by each real unstable pole (``K/(tau s - 1)`` has a negative
+        static gain and wants a positive controller); right-half-plane zeros do not turn it.
+        """
+        turned = sum(1 for t in self.time_constants if t.real < 0.0 and t.imag == 0.0)
+        return int(math.copysign(1.0, self.gain)) * (-1) ** turned
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return len(self.time_constants) + max(self.integrators, 0)
+
+    @property
+    def is_stable(self) -> bool:
+        """True if every pole lies in the open left half plane."""
+        return self.integrators <= 0 and all(t.real > 0.0 for t in self.time_constants)
+
+    @property
+    def numerator(self) -> tuple[float, ...]:
+        """Coefficients of powers of s, highest first, without the dead time."""
+        coefficients = self.gain * _real_product(self.zeros)
+        return tuple(float(c) for c in coefficients) + (0.0,) * max(-self.integrators, 0)
+
+    @property
+    def denominator(self) -> tuple[float, ...]:
+        """Coefficients of powers of s, highest first; the lowest one that is not zero is 1."""
+        coefficients = _real_product(self.time_constants)
+        return tuple(float(c) for c in coefficients) + (0.0,) * max(self.integrators, 0)
+
+    @classmethod
+    def from_polynomials(
+        cls,
+        numerator: Sequence[float],
+        denominator: Sequence[float],
+        dead_time: float = 0.0,
+        structure: str = "general",
+    ) -> TransferFunction:
+        """Build a transfer function from coefficients of powers of s, highest first.
+
+        :param numerator: shape (m,), not all zero, as the denominator, shape (n,).
+        :param dead_time: D >= 0 [s].
+        :raises ModelError: if a polynomial is empty, zero or not finite, or the function improper.
+        """
+        lows, roots, integrators = [], [], 0
+        for name, given in (("numerator", numerator), ("denominator", denominator)):
+            c = np.trim_zeros(np.atleast_1d(np.asarray(given, dtype=np.float64)), "f")
+            if c.size == 0 or not bool(np.all(np.isfinite(c))):
+                raise ModelError(
+                    f"the {name} needs finite coefficients that are not all zero, "
+                    f"found {list(np.atleast_1d(given))}"
+                )
+            stripped = np.trim_zeros(c, "b")
+            integrators = c.size - stripped.size - integrators
+            lows.append(float(stripped[-1]))
+            # With 1/s as the variable the roots are minus the time constants.
+            try:
+                with np.errstate(over="raise"):
+                    roots.append(tuple(complex(-r) for r in np.roots(stripped[::-1])))
+            except (FloatingPointError, np.linalg.LinAlgError) as error:
+                raise ModelError(
+                    f"the coefficients {list(c)} of the {name} span too many powers of ten; "
+                    "choose another unit of time"
+                ) from error
+        return cls(lows[0] / lows[1], roots[0], roots[1], integrators, dead_time, structure)
+
+    @classmethod
+    def fopdt(cls, gain: float, time_constant: float, dead_time: float) -> TransferFunction:
+        """Return ``K exp(-D s)/(tau s + 1)`` (model 1 of Chang et al., eq 1 of Wang et al.)."""
+        return cls(gain, (), (positive(time_constant),), 0, dead_time, "fopdt")
+
+    @classmethod
+    def lag_n(
+        cls, gain: float, time_constant: float, order: int, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/(tau s + 1)^n`` (models 2 and 3 of Chang et al.)."""
+        return cls(gain, (), (positive(time_constant),) * order, 0, dead_time, "lag_n")
+
+    @classmethod
+    def lag_n_zero(
+        cls, gain: float, time_constant: float, order: int, zero: float, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K (z s + 1) exp(-D s)/(tau s + 1)^n``; z < 0 is an inverse response."""
+        tau = (positive(time_constant),) * order
+        return cls(gain, (zero,), tau, 0, dead_time, "lag_n_zero")
+
+    @classmethod
+    def sopdt(
+        cls, gain: float, time_constants: Sequence[complex], dead_time: float, zero: float = 0.0
+    ) -> TransferFunction:
+        """Return ``K (z s + 1) exp(-D s)/((tau1 s + 1)(tau2 s + 1))`` (model 4 of Chang et al.).
+
+        Underdamped: give the two conjugate time constants, or use :meth:`oscillator`.
+        """
+        name = "sopdt_zero" if zero else "sopdt"
+        return cls(gain, (zero,), exactly(2, time_constants), 0, dead_time, name)
+
+    @classmethod
+    def oscillator(
+        cls,
+        gain: float,
+        natural_frequency: float,
+        damping: float,
+        dead_time: float,
+        zero: float = 0.0,
+    ) -> TransferFunction:
+        """Return ``K (z s + 1) exp(-D s)/(s^2/w0^2 + 2 zeta s/w0 + 1)``, any damping."""
+        pair = oscillating_pair(natural_frequency, damping)
+        return cls.sopdt(gain, pair, dead_time, zero)
+
+    @classmethod
+    def two_equal_one(
+        cls, gain: float, repeated: float, single: float, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/((tau1 s + 1)^2 (tau2 s + 1))`` (model 5 of Chang et al.)."""
+        constants = (positive(repeated), positive(repeated), positive(single))
+        return cls(gain, (), constants, 0, dead_time, "two_equal_one")
+
+    @classmethod
+    def three_lags(
+        cls, gain: float, time_constants: Sequence[float], dead_time: float
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/((tau1 s + 1)(tau2 s + 1)(tau3 s + 1))``."""
+        return cls(gain, (), exactly(3, time_constants), 0, dead_time, "three_lags")
+
+    @classmethod
+    def lag_complex(
+        cls,
+        gain: float,
+        time_constant: float,
+        natural_frequency: float,
+        damping: float,
+        dead_time: float,
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/((tau s + 1)(s^2/w0^2 + 2 zeta s/w0 + 1))``."""
+        constants = (positive(time_constant), *oscillating_pair(natural_frequency, damping))
+        return cls(gain, (), constants, 0, dead_time, "lag_complex")
+
+    @classmethod
+    def ipdt(cls, gain: float, dead_time: float) -> TransferFunction:
+        """Return ``K exp(-D s)/s``."""
+        return cls(gain, (), (), 1, dead_time, "ipdt")
+
+    @classmethod
+    def integrator_lag(
+        cls, gain: float, time_constant: float, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/(s (tau s + 1))``."""
+        return cls(gain, (), (positive(time_constant),), 1, dead_time, "integrator_lag")
+
+    @classmethod
+    def integrator_inverse(
+        cls, gain: float, zero: float, time_constant: float, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K (1 - tau1 s) exp(-D s)/(s (tau2 s + 1))`` (Luyben 2003, eq 1).
+
+        :param zero: tau1 > 0 [s].
+        :param time_constant: tau2 > 0 [s].
+        """
+        tau = (positive(time_constant),)
+        return cls(gain, (-positive(zero),), tau, 1, dead_time, "integrator_inverse")
+
+    @classmethod
+    def unstable_fopdt(
+        cls, gain: float, time_constant: float, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/(tau s - 1)`` with tau > 0 (Thyagarajan and Yu, eq 13)."""
+        return cls(-gain, (), (-positive(time_constant),), 0, dead_time, "unstable_fopdt")
+
+    @classmethod
+    def unstable_sopdt(
+        cls, gain: float, unstable: float, stable: float, dead_time: float
+    ) -> TransferFunction:
+        """Return ``K exp(-D s)/((tau1 s - 1)(tau2 s + 1))`` with tau1, tau2 > 0."""
+        constants = (-positive(unstable), positive(stable))
+        return cls(-gain, (), constants, 0, dead_time, "unstable_sopdt")
+
+    @classmethod
+    def from_structure(
+        cls,
+        structure: str,
+        *,
+        gain: float,
+        time_constants: Sequence[float] = (),
+        zeros: Sequence[float] = (),
+        dead_time: float = 0.0,
+        order: int = 0,
+        natural_frequency: float = 0.0,
+        damping: float = 0.0,
+    ) -> TransferFunction:
+        """Build a named structure from the parameters that plant_node and messages carry.
+
+        :param structure: one of ``STRUCTURES`` but "general".
+        :param gain: K of the structure's constructor.
+        :param time_constants: its tau's, in the constructor's order; one for equal lags; empty
+            with ``natural_frequency`` and ``damping`` where a structure has a complex pair.
+        :param zeros: time constants of ``(1 + z s)`` [s]; of "integrator_inverse": -tau1.
+        :raises ModelError: if the structure is unknown or the number of constants is wrong.
+        """
+        tau, d = tuple(time_constants), dead_time
+
+        def one() -> float:
+            return float(exactly(1, tau)[0].real)
+
+        def zero() -> float:
+            return float(exactly(1, zeros, "zeros")[0].real)
+
+        match structure:
+            case "fopdt":
+                return cls.fopdt(gain, one(), d)
+            case "lag_n":
+                return cls.lag_n(gain, one(), at_least_one(order), d)
+            case "lag_n_zero":
+                return cls.lag_n_zero(gain, one(), at_least_one(order), zero(), d)
+            case "sopdt" | "sopdt_zero":
+                z = zero() if structure == "sopdt_zero" else 0.0
+                pair = tau or oscillating_pair(natural_frequency, damping)
+                return cls.sopdt(gain, pair, d, z)
+            case "two_equal_one":
+                repeated, single = (c.real for c in exactly(2, tau))
+                return cls.two_equal_one(gain, repeated, single, d)
+            case "three_lags":
+                return cls.three_lags(gain, tau, d)
+            case "lag_complex":
+                return cls.lag_complex(gain, one(), natural_frequency, damping, d)
+            case "ipdt":
+                return cls.ipdt(gain, d)
+            case "integrator_lag":
+                return cls.integrator_lag(gain, one(), d)
+            case "integrator_inverse":
+                return cls.integrator_inverse(gain, -zero(), one(), d)
+            case "unstable_fopdt":
+                return cls.unstable_fopdt(gain, one(), d)
+            case "unstable_sopdt":
+                unstable, stable = (c.real for c in exactly(2, tau))
+                return cls.unstable_sopdt(gain, unstable, stable, d)
+        raise ModelError(f"unknown structure {structure!r}; known: {', '.join(STRUCTURES[:-1])}")
+
+
+STRUCTURES = (
+    "fopdt",
+    "lag_n",
+    "lag_n_zero",
+    "sopdt",
+    "sopdt_zero",
+    "two_equal_one",
+    "three_lags",
+    "lag_complex",
+    "ipdt",
+    "integrator_lag",
+    "integrator_inverse",
+    "unstable_fopdt",
+    "unstable_sopdt",
+    "general",
+)

@@ -1,0 +1,196 @@
+"""Stability by the exact phase: ultimate point, and poles of a closed loop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.process.polar import Polar
+from relay_autotune.process.transfer_function import TransferFunction
+
+FloatArray = NDArray[np.float64]
+
+_MOST_STEPS = 100
+_ACCURACY = 2e-16
+_MOST_POINTS = 200_000
+
+
+@dataclass(frozen=True)
+class UltimatePoint:
+    """The proportional gain at which the closed loop oscillates.
+
+    :param gain: K_u, with the sign of the process, so that ``K_u G(j w_u) = -1`` [u/y].
+    :param frequency: w_u [rad/s].
+    """
+
+    gain: float
+    frequency: float
+
+    @property
+    def period(self) -> float:
+        """P_u = 2 pi/w_u [s]."""
+        return 2.0 * math.pi / self.frequency
+
+
+@dataclass(frozen=True)
+class _Crossing:
+    gain: float
+    frequency: float
+    roots_to_the_right: int
+
+
+def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
+    """Return the gain that ends stability, or None where no gain does or none gives it.
+
+    Every frequency at which the phase is an odd multiple of -180 degrees is found from the
+    continuous phase, so that neither a large dead time nor a resonance hides one. Raising the
+    gain through such a point moves a pair of closed-loop poles to the right where the phase
+    falls with frequency, and to the left where it rises. Counting from the poles at zero gain,
+    the ultimate gain is the upper end of the first range in which none is on the right; an
+    unstable process has a lower end as well, which is not returned.
+
+    :param model: the process.
+    """
+    crossings = sorted(_crossings(model), key=lambda c: c.gain)
+    on_the_right = unstable_at_small_gain(model)
+    was_stable = on_the_right == 0
+    for crossing in crossings:
+        on_the_right += crossing.roots_to_the_right
+        if was_stable and on_the_right > 0:
+            if crossing.frequency == 0.0:
+                return None
+            return UltimatePoint(model.process_sign * crossing.gain, crossing.frequency)
+        was_stable = was_stable or on_the_right == 0
+    return None
+
+
+def unstable_at_small_gain(model: TransferFunction) -> int:
+    """Return how many closed-loop poles lie in the right half plane as the gain leaves zero.
+
+    :param model: the process.
+    """
+    unstable = sum(1 for t in model.time_constants if t.real < 0.0)
+    m = model.integrators
+    if m < 1:
+        return unstable
+    # The poles at s = 0 leave along s^m = -K g; one that starts straight up goes left only if
+    # the phase near zero frequency is above its limit.
+    polar = Polar.of(model)
+    start = math.pi if model.gain * model.process_sign > 0.0 else 0.0
+    lead = polar.lead(polar.corners()[0] - 14.0) > 0.0
+    for k in range(m):
+        cosine = math.cos((start + 2.0 * math.pi * k) / m)
+        unstable += cosine > 1e-9 or (abs(cosine) <= 1e-9 and not lead)
+    return unstable
+
+
+def _crossings(model: TransferFunction) -> list[_Crossing]:
+    """Crossings up to the first, and later ones of at least its magnitude."""
+    found = []
+    if model.integrators == 0 and model.gain * model.process_sign < 0.0:
+        slope = (
+            sum(z.real for z in model.zeros)
+            - sum(t.real for t in model.time_constants)
+            - model.dead_time
+        )
+        # Near s = 0 the root is eps/(K G'(0)), and G(0) is negative.
+        found.append(_Crossing(1.0 / abs(model.gain), 0.0, -1 if slope > 0.0 else 1))
+    polar = Polar.of(model)
+    logarithms = _logarithmic(polar)
+    first = _scan(polar, _grid(polar, logarithms, *_first_range(polar, logarithms)))
+    found += first
+    if not first or not polar.delayed:
+        return found
+    # Later turns of the dead time matter only where the magnitude is larger again.
+    least = -math.log(min(c.gain for c in first))
+    last = math.log(first[-1].frequency)
+    beyond = np.append(last, logarithms[logarithms > last])
+    sizes = polar.size(beyond)
+    if bool(np.all(np.diff(sizes) <= 0.0)):
+        return found
+    # Between two points of the grid it may be a little larger than at either.
+    higher = beyond[1:][sizes[1:] > least - 1e-3]
+    if higher.size:
+        found += _scan(polar, _grid(polar, logarithms, last + 1e-9, float(higher[-1]) + 0.1))
+    return found
+
+
+def _logarithmic(polar: Polar) -> FloatArray:
+    """Return logarithms of frequencies, dense enough for everything but the dead time."""
+    corners = polar.corners()
+    low, high = corners[0] - 9.2, corners[-1] + 9.2
+    grid = np.linspace(low, high, int(17.4 * (high - low)))
+    return np.unique(np.concatenate((grid, polar.resonances())))
+
+
+def _first_range(polar: Polar, logarithms: FloatArray) -> tuple[float, float]:
+    if not polar.delayed:
+        return float(logarithms[0]), float(logarithms[-1])
+    # The rational part turns the phase by at most a quarter for each root, so that here the
+    # dead time has passed -180 degrees for certain.
+    turns = polar.roots * math.pi / 2.0 + 4.0 * math.pi
+    return float(logarithms[0]), math.log(turns) - polar.log_delay
+
+
+def _grid(polar: Polar, logarithms: FloatArray, low: float, high: float) -> FloatArray:
+    parts = [np.array([low, high]), logarithms[(logarithms > low) & (logarithms < high)]]
+    if polar.delayed:
+        # In angles of the dead time, which no unit of time makes too large.
+        begin, end = (math.exp(min(edge + polar.log_delay, 700.0)) for edge in (low, high))
+        count = int(min((end - begin) / 0.3 + 2.0, _MOST_POINTS))
+        angles = np.linspace(begin, end, count)
+        parts.append(np.log(angles[1:-1]) - polar.log_delay)
+    return np.unique(np.concatenate(parts))
+
+
+def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
+    """Return the crossings between the points of a grid of log frequencies."""
+    level = np.floor(polar.turns(grid))
+    cells = np.flatnonzero(np.diff(level) != 0.0)
+    if cells.size == 0:
+        return []
+    # Where the phase falls it leaves the level that it had, where it rises it enters the next.
+    target = np.maximum(level[cells], level[cells + 1])
+    falls = level[cells + 1] < level[cells]
+    place = _roots(polar, grid[cells], grid[cells + 1], target)
+    with np.errstate(over="ignore"):
+        frequency, gain = np.exp(place), np.exp(-polar.size(place))
+    usable = np.isfinite(frequency) & np.isfinite(gain) & (frequency > 0.0) & (gain > 0.0)
+    return [
+        _Crossing(float(g), float(w), 2 if fall else -2)
+        for g, w, fall, good in zip(gain, frequency, falls, usable, strict=True)
+        if good
+    ]
+
+
+def _roots(polar: Polar, low: FloatArray, high: FloatArray, target: FloatArray) -> FloatArray:
+    """Return where the phase has a number of turns, all at once by the Illinois method.
+
+    :param low: log frequencies at one side of each root, shape (n,).
+    :param high: at the other, shape (n,).
+    :param target: turns, shape (n,).
+    """
+    at_low, at_high = polar.turns(low, target), polar.turns(high, target)
+    place, moved = low, np.full(low.shape, 2)
+    for _ in range(_MOST_STEPS):
+        before = place
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = (low * at_high - high * at_low) / (at_high - at_low)
+        # Rounding may place it at an end, or a little beyond.
+        place = np.clip(np.where(np.isfinite(place), place, low), low, high)
+        if bool(np.all(np.abs(place - before) <= _ACCURACY * np.maximum(np.abs(place), 1.0))):
+            break
+        value = polar.turns(place, target)
+        below = np.sign(value) == np.sign(at_low)
+        # An end that stays for a second time counts half, so that both close in.
+        again = np.where(below == moved, 0.5, 1.0)
+        at_low, at_high = (
+            np.where(below, value, again * at_low),
+            np.where(below, again * at_high, value),
+        )
+        moved = below
+        low, high = np.where(below, place, low), np.where(below, high, place)
+    return place

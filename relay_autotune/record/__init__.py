@@ -1,0 +1,1 @@
+"""Records of experiments: samples, cycles, relays in recordings of others, excitation."""

@@ -1,0 +1,1 @@
+"""What a closed loop does: margins, stability, noise, responses."""

@@ -1,0 +1,75 @@
+"""A sampled controller on the exact process."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.control.sampled import SampledController, SampledPid
+from relay_autotune.process.simulation import Plant
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.tuning.gains import Controller
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Deviations from the operating point in a closed loop.
+
+    :param time: s, shape (n,).
+    :param measurement: y, shape (n,), without the noise.
+    :param command: u, shape (n,), held from each sample to the next.
+    """
+
+    time: FloatArray
+    measurement: FloatArray
+    command: FloatArray
+
+
+def simulate_closed_loop(
+    controller: Controller | SampledController,
+    model: TransferFunction,
+    *,
+    period: float,
+    duration: float,
+    setpoint: float = 0.0,
+    load: float = 0.0,
+    load_time: float = 0.0,
+    low: float = -math.inf,
+    high: float = math.inf,
+    noise: FloatArray | None = None,
+) -> ClosedLoop:
+    """Run a controller at its sampling period; between samples the process moves exactly.
+
+    :param controller: PI or PID gains, which :class:`SampledPid` then runs, or any other
+        controller of this period, at rest.
+    :param model: the process, at rest, without the half period that a design adds to it.
+    :param period: sampling period [s].
+    :param duration: s.
+    :param setpoint: step of the set-point at t = 0 [y].
+    :param load: step of the load at the process input [u].
+    :param load_time: when it comes [s].
+    :param low: least command [u]; of gains only.
+    :param high: largest command [u]; of gains only.
+    :param noise: added to each sample that the controller sees [y], shape (n,); None: none.
+    :raises TuningError: if period or limits make no sense.
+    """
+    law: SampledController
+    if isinstance(controller, Controller):
+        law = SampledPid(controller, period, low=low, high=high)
+    else:
+        law = controller
+    plant = Plant(model)
+    time = np.arange(int(duration / period) + 1, dtype=np.float64) * period
+    seen = np.zeros(time.size) if noise is None else noise
+    measurement, command = np.empty(time.size), np.empty(time.size)
+    output = 0.0
+    for k, t in enumerate(time):
+        disturbed = output + (load if t > load_time else 0.0)
+        measurement[k] = plant.advance(float(t), disturbed)
+        command[k] = output = law.step(setpoint, float(measurement[k] + seen[k]))
+    return ClosedLoop(time, measurement, command)

@@ -1,0 +1,175 @@
+"""How far a loop is from instability: peaks of sensitivities, margins of gain, phase and delay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.process.transfer_function import TransferFunction
+
+FloatArray = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+Loop = Callable[[ComplexArray], ComplexArray]
+
+# Local maxima that are refined; the largest on the grid need not be the largest.
+_PEAKS = 4
+_ZOOMS, _ZOOM_POINTS = 9, 9
+# Each round narrows a cell to a sixteenth.
+_ROUNDS, _PARTS = 13, 16
+# Below this magnitude a loop is not felt, whatever its phase.
+_FELT = 0.05
+_MOST_TURNS = 800.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a stable loop is from instability.
+
+    :param ms: largest magnitude of ``1/(1 + L)``.
+    :param ms_frequency: where [rad/s].
+    :param mt: largest magnitude of ``L/(1 + L)``.
+    :param gain_margin: factor by which the loop's gain may grow; infinite: any.
+    :param gain_margin_low: factor to which it may fall; 0: any.
+    :param phase_margin: lag that may be added [rad]; pi where the loop's gain is never 1.
+    :param delay_margin: dead time that may be added [s]; infinite: any.
+    """
+
+    ms: float
+    ms_frequency: float
+    mt: float
+    gain_margin: float
+    gain_margin_low: float
+    phase_margin: float
+    delay_margin: float
+
+
+def frequencies(*terms: TransferFunction) -> FloatArray:
+    """Return a grid on which loops change little in magnitude and phase between points.
+
+    :param terms: the loop, or the terms of its characteristic equation.
+    :return: rad/s, increasing.
+    """
+    constants = [c for t in terms for c in (*t.zeros, *t.time_constants)]
+    dead_times = sorted({t.dead_time for t in terms if t.dead_time > 0.0})
+    corners = [1.0 / abs(c) for c in constants] + [1.0 / d for d in dead_times] or [1.0]
+    low, high = min(corners) * 1e-3, max(corners) * 1e2
+    grid = np.geomspace(low, high, 50 * max(int(math.log10(high / low)), 1))
+    parts = [grid]
+    if dead_times:
+        felt = np.max([np.abs(t(1j * grid)) for t in terms], axis=0) > _FELT
+        last = float(grid[felt][-1]) if felt.any() else low
+    for d in dead_times:
+        # Turn by turn, coarser where the loop only passes by again and again.
+        parts.append(np.arange(0.05, 12.0 * math.pi, 0.05) / d)
+        parts.append(np.arange(12.0 * math.pi, min(last * d, _MOST_TURNS), 0.2) / d)
+    for c in constants:
+        if c.imag > 0.0:
+            centre, width = 1.0 / abs(c), abs(c.real) / abs(c)
+            parts.append(np.abs(centre * (1.0 + width * np.linspace(-8.0, 8.0, 65))) + low)
+    return np.unique(np.concatenate(parts))
+
+
+def sensitivity_peaks(loop: Loop, grid: FloatArray) -> tuple[float, float]:
+    """Return (Ms, Mt), the largest magnitudes of ``1/(1 + L)`` and ``L/(1 + L)``.
+
+    :param loop: L as a function of s.
+    :param grid: frequencies near which the peaks are sought [rad/s], increasing.
+    """
+    (ms, _), (mt, _) = peaks(loop, grid)
+    return ms, mt
+
+
+def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the largest magnitudes of both sensitivities, each with its frequency."""
+    values = loop(1j * grid)
+    sensitivity = 1.0 / np.abs(1.0 + values)
+    log_grid = np.log(grid)
+
+    sizes = (sensitivity, sensitivity * np.abs(values))
+    best = [float(size.max()) for size in sizes]
+    where = [float(grid[np.argmax(size)]) for size in sizes]
+    # Both are sought at the same time, the peaks of the one in the rows above those of the other.
+    tops = [_tops(size) for size in sizes]
+    at, first = np.concatenate(tops), tops[0].size
+    low, high = log_grid[np.maximum(at - 1, 0)], log_grid[np.minimum(at + 1, grid.size - 1)]
+    rows = np.arange(at.size)
+    for _ in range(_ZOOMS):
+        x = np.linspace(low, high, _ZOOM_POINTS, axis=1)
+        near = loop(1j * np.exp(x).ravel()).reshape(x.shape)
+        numerator = near.copy()
+        numerator[:first] = 1.0
+        size = np.abs(numerator / (1.0 + near))
+        k = np.argmax(size, axis=1)
+        for which, part in enumerate((slice(first), slice(first, None))):
+            row = part.indices(at.size)[0] + int(np.argmax(size[part].max(axis=1)))
+            if size[row, k[row]] > best[which]:
+                best[which], where[which] = float(size[row, k[row]]), math.exp(x[row, k[row]])
+        low = x[rows, np.maximum(k - 1, 0)]
+        high = x[rows, np.minimum(k + 1, _ZOOM_POINTS - 1)]
+    return (best[0], where[0]), (best[1], where[1])
+
+
+def _tops(values: FloatArray) -> NDArray[np.intp]:
+    """Return where the largest local maxima are, and the largest value."""
+    inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    return np.append(inner[np.argsort(-values[inner])[:_PEAKS]], np.argmax(values))
+
+
+def _changes(values: FloatArray) -> NDArray[np.intp]:
+    """Return the cells between whose ends the sign changes, a zero being positive."""
+    return np.flatnonzero((values[:-1] >= 0.0) != (values[1:] >= 0.0))
+
+
+def _roots(
+    function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Return a root in each cell whose ends differ in sign, by dividing all cells at once."""
+    low, high = np.log(low), np.log(high)
+    if not low.size:
+        return low
+    above, rows = np.sign(function(np.exp(low))), np.arange(low.size)
+    for _ in range(_ROUNDS):
+        ends = np.linspace(low, high, _PARTS + 1, axis=1)
+        signs = np.sign(function(np.exp(ends[:, 1:-1]).ravel())).reshape(low.size, -1)
+        changed = np.column_stack((signs != above[:, None], np.ones(low.size, dtype=bool)))
+        first = np.argmax(changed, axis=1)
+        low, high = ends[rows, first], ends[rows, first + 1]
+    return np.asarray(np.exp(0.5 * (low + high)))
+
+
+def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> Margins:
+    """Return how far a stable loop is from instability.
+
+    :param loop: L as a function of s.
+    :param grid: frequencies on which crossings show [rad/s], increasing.
+    :param at_rest: L(0), where it is finite; None: it is not.
+    """
+    values = loop(1j * grid)
+    cells = _changes(values.imag)
+    cells = cells[(values.real[cells] < 0.0) | (values.real[cells + 1] < 0.0)]
+    crossings = _roots(lambda w: loop(1j * w).imag, grid[cells], grid[cells + 1])
+    real = loop(1j * crossings).real if crossings.size else np.empty(0)
+    gains = -1.0 / real[real < 0.0]
+    if at_rest is not None and at_rest < 0.0:
+        gains = np.append(gains, -1.0 / at_rest)
+    size = np.log(np.abs(values))
+    cells = _changes(size)
+    crossovers = _roots(lambda w: np.log(np.abs(loop(1j * w))), grid[cells], grid[cells + 1])
+    lead = np.angle(-loop(1j * crossovers)) if crossovers.size else np.empty(0)
+    delays = np.mod(lead, 2.0 * math.pi) / crossovers
+    (ms, at), (mt, _) = peaks(loop, grid)
+    return Margins(
+        # For w -> infinity the one tends to 1, for w -> 0 with integral action the other.
+        ms=max(ms, 1.0),
+        ms_frequency=at,
+        mt=max(mt, 1.0) if at_rest is None else mt,
+        gain_margin=float(gains[gains > 1.0].min(initial=math.inf)),
+        gain_margin_low=float(gains[gains < 1.0].max(initial=0.0)),
+        phase_margin=float(np.abs(lead).min(initial=math.pi)),
+        delay_margin=float(delays.min(initial=math.inf)),
+    )

@@ -1,0 +1,254 @@
+r"""Responses of a closed loop to steps of set-point and load, and what they cost.
+
+The transforms are inverted by a fast Fourier transform along ``Re s = sigma`` (Dubner and Abate
+1968); dead times enter exactly. A jump at t = 0, which a transform cut at some frequency cannot
+follow, is taken out before and put back after. Integrals of an error are computed as
+``int |e| = |int e| + 2 int (the part of the other sign)``: the first is the transform at s = 0,
+so that a slow tail costs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import TuningError
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.tuning.loop.control_law import ControlLaw
+
+FloatArray = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+
+_POINTS = 4096
+_MOST_POINTS = 1 << 18
+_DECAY = math.log(1e8)
+_TURNS, _RESETS, _LONGEST = 6.0, 8.0, 64.0
+# The rest of a response is small enough to end the horizon there.
+_SETTLED = 1e-3
+# An error that has come so near to zero has come there.
+_NO_OFFSET = 1e-3
+BAND = 0.02
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """Deviations after a unit step of set-point or load at t = 0.
+
+    :param time: s, shape (n,), equally spaced.
+    :param measurement: y, shape (n,).
+    :param command: u, shape (n,); after a load step without the load itself.
+    """
+
+    time: FloatArray
+    measurement: FloatArray
+    command: FloatArray
+
+
+def abscissae(duration: float, points: int) -> ComplexArray:
+    """Return where :func:`inverted` needs a Laplace transform [rad/s], shape (points + 1,).
+
+    :param duration: s.
+    :param points: instants at which the function is wanted.
+    """
+    return _DECAY / (2.0 * duration) + 1j * np.arange(points + 1) * (math.pi / duration)
+
+
+def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatArray:
+    """Return the function of a Laplace transform at equally spaced times from 0 on.
+
+    :param values: of the transform at :func:`abscissae`, shape (points + 1,); it has no pole
+        right of the imaginary axis.
+    :param duration: s; the last instant is a step before it.
+    :param jump: value just after t = 0.
+    :return: shape (points,).
+    """
+    points = values.size - 1
+    step, decay = duration / points, 20.0 / duration
+    time = np.arange(points) * step
+    if jump:
+        values = values - jump / (abscissae(duration, points) + decay)
+    # Lanczos' factors take away the ringing that the cut at the last frequency leaves.
+    values = values * np.sinc(np.arange(points + 1) / points)
+    found = np.fft.irfft(values)[:points] * np.exp(_DECAY / (2.0 * duration) * time) / step
+    return np.asarray(found + jump * np.exp(-decay * time) if jump else found)
+
+
+@dataclass(frozen=True)
+class ClosedLoopTransforms:
+    """What set-point and load make of measurement and command.
+
+    :param law: the controller.
+    :param model: the process, with all dead time of the loop.
+    """
+
+    law: ControlLaw
+    model: TransferFunction
+
+    def measurement_from_load(self, s: ComplexArray) -> ComplexArray:
+        """Return ``G/(1 + C G)``."""
+        g = self.model(s)
+        return np.asarray(g / (1.0 + self.law(s) * g))
+
+    def measurement_from_setpoint(self, s: ComplexArray) -> ComplexArray:
+        """Return ``G F/(1 + C G)``, F from set-point to command."""
+        return np.asarray(self.measurement_from_load(s) * self.law.from_setpoint(s))
+
+    def first_command(self) -> float:
+        """Return the command just after a unit step of the set-point [u]."""
+        far = np.array([1e9 / self._shortest()], dtype=np.complex128)
+        return float(self.law.from_setpoint(far)[0].real)
+
+    def _shortest(self) -> float:
+        constants = [abs(c) for t in self.law.characteristic(self.model) for c in t.time_constants]
+        return min([c for c in (*constants, self.model.dead_time) if c > 0.0], default=1.0)
+
+
+def integral_gain(law: ControlLaw, frequency: float) -> float:
+    """Return the limit of ``s C(s)`` for s -> 0, 0 without integral action [u/(y s)].
+
+    :param law: the controller.
+    :param frequency: about which the loop is closed [rad/s].
+    """
+    s = frequency * np.array([1e-6, 2e-6], dtype=np.complex128)
+    once, twice = (s * law(s)).real
+    gain = float(2.0 * once - twice)
+    proportional = abs(complex(law(np.array([1j * frequency]))[0]))
+    return gain if abs(gain) > 1e-9 * frequency * proportional else 0.0
+
+
+def _horizon(law: ControlLaw, model: TransferFunction, frequency: float) -> float:
+    """Return a first guess of how long the responses last [s]."""
+    integral = abs(integral_gain(law, frequency))
+    reset = max((abs(t) for t in model.time_constants), default=0.0)
+    if integral > 0.0:
+        reset = abs(complex(law(np.array([1j * frequency]))[0])) / integral
+        if model.is_stable:
+            # With a small gain the integral alone has to bring the process round.
+            reset += 1.0 / (integral * abs(model.gain))
+    return _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
+
+
+def step_responses(
+    law: ControlLaw, model: TransferFunction, duration: float, points: int = _POINTS
+) -> tuple[StepResponse, StepResponse]:
+    """Return the responses to a unit step of the set-point, and to one of the load.
+
+    :param law: the controller, of a stable loop.
+    :param model: the process, with all dead time of the loop.
+    :param duration: s.
+    :param points: instants.
+    """
+    to = ClosedLoopTransforms(law, model)
+    s = abscissae(duration, points)
+    # At the same frequencies all four are made of the same three.
+    g, c, f = model(s), law(s), law.from_setpoint(s)
+    rest = 1.0 + c * g
+    time = np.arange(points) * (duration / points)
+
+    def step(values: ComplexArray, jump: float = 0.0) -> FloatArray:
+        return inverted(values / s, duration, jump)
+
+    return (
+        StepResponse(time, step(g / rest * f), step(f / rest, to.first_command())),
+        StepResponse(time, step(g / rest), step(-c * g / rest)),
+    )
+
+
+@dataclass(frozen=True)
+class StepFigures:
+    """What the responses to unit steps are like.
+
+    :param iae_load: integral of the absolute error after a step of the load [y s/u]; infinite
+        where an error remains.
+    :param iae_setpoint: of the absolute error after a step of the set-point [s].
+    :param overshoot: of the measurement over its final value after a step of the set-point,
+        relative to that.
+    :param settling_time: from which on the measurement stays within 2 % of its final value after
+        a step of the set-point [s].
+    :param effort_setpoint: total variation of the command after a step of the set-point [u/y].
+    :param effort_load: total variation of the command after a step of the load.
+    """
+
+    iae_load: float
+    iae_setpoint: float
+    overshoot: float
+    settling_time: float
+    effort_setpoint: float
+    effort_load: float
+
+
+def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> StepFigures:
+    """Return what the responses to unit steps are like.
+
+    :param law: the controller, of a stable loop.
+    :param model: the process, with all dead time of the loop.
+    :param frequency: about which the loop is closed [rad/s].
+    :raises TuningError: if the responses do not die away in any reasonable time.
+    """
+    to = ClosedLoopTransforms(law, model)
+    rest = np.array([1e-9 * frequency], dtype=np.complex128)
+    integral = integral_gain(law, frequency)
+    final, offset = 1.0, 0.0
+    if integral == 0.0:
+        final = float(to.measurement_from_setpoint(rest)[0].real)
+        offset = float(to.measurement_from_load(rest)[0].real)
+    duration = _horizon(law, model, frequency)
+    # Twenty instants to a turn, as far as that can be had.
+    finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
+    points = max(_POINTS, 1 << finest.bit_length())
+    longest = _LONGEST * duration
+    while True:
+        setpoint, load = step_responses(law, model, duration, points)
+        tails = (setpoint.measurement - final, load.measurement - offset)
+        if all(_has_settled(tail) for tail in tails):
+            break
+        duration, points = 2.0 * duration, min(2 * points, _MOST_POINTS)
+        if duration > longest:
+            raise TuningError(
+                "the responses of the closed loop do not die away in any reasonable time"
+            )
+    error = final - setpoint.measurement
+    step = duration / points
+    iae_load = _iae(1.0 / integral, load.measurement, step) if integral else math.inf
+    iae_setpoint = math.inf
+    if abs(1.0 - final) < _NO_OFFSET:
+        whole = (1.0 - to.measurement_from_setpoint(rest)) / rest
+        iae_setpoint = _iae(float(whole[0].real), error, step)
+    return StepFigures(
+        iae_load=iae_load,
+        iae_setpoint=iae_setpoint,
+        overshoot=max(float(np.max(-error / final)), 0.0),
+        settling_time=_settling_time(setpoint.time, error, BAND * abs(final)),
+        effort_setpoint=abs(to.first_command()) + _variation(setpoint.command),
+        effort_load=_variation(load.command),
+    )
+
+
+def _has_settled(tail: FloatArray) -> bool:
+    late = tail[3 * tail.size // 4 : -tail.size // 16]
+    return float(np.abs(late).max()) <= _SETTLED * float(np.abs(tail).max())
+
+
+def _variation(values: FloatArray) -> float:
+    return float(np.abs(np.diff(values)).sum())
+
+
+def _settling_time(time: FloatArray, error: FloatArray, band: float) -> float:
+    outside = np.flatnonzero(np.abs(error) > band)
+    if not outside.size:
+        return 0.0
+    last = int(outside[-1])
+    if last + 1 >= time.size:
+        return float(time[-1])
+    before, after = abs(error[last]), abs(error[last + 1])
+    return float(time[last] + (before - band) / (before - after) * (time[1] - time[0]))
+
+
+def _iae(whole: float, error: FloatArray, step: float) -> float:
+    """Return the integral of |error|, from that of the error itself and the smaller part."""
+    other = np.maximum(-math.copysign(1.0, whole) * error, 0.0)
+    return abs(whole) + 2.0 * float(other.sum()) * step

@@ -1,0 +1,241 @@
+r"""Poles of a closed loop in the right half plane, by an argument principle that cannot miss one.
+
+The characteristic equation is ``1 + sum L_k(s) = 0``, each L_k rational with a dead time of its
+own. Where they have n poles at s = 0, all is multiplied by ``(a s/(1 + a s))^n``; the function H
+that this leaves has no pole on the imaginary axis, and the same limit for s -> infinity. Its
+zeros in the right half plane are those of the closed loop, and
+
+    zeros = poles - (turning of H from w = 0 to infinity)/pi.
+
+How far H turns is not read off a grid: the axis is divided until, on every piece, a bound on
+``|H'|`` times the length of the piece is smaller than ``|H|`` at its beginning, so that H cannot
+have passed round the origin unseen. From the frequency on at which H can no longer be as far
+from its limit as zero is, it cannot turn any more. A loop of neutral type, whose L_k with dead
+time do not vanish at infinity, is stable only if their magnitudes there have a sum below that of
+the rest (Bellman and Cooke 1963).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import TuningError
+from relay_autotune.process.transfer_function import TransferFunction
+
+FloatArray = NDArray[np.floating[Any]]
+IntArray = NDArray[np.integer[Any]]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+
+_PIECES = 128
+_PARTS = 4
+# Where pieces become this short H passes through zero, or so close that nobody could tell.
+_SHORTEST = 1e-12
+_MOST_PIECES = 1_000_000
+_SURE = 0.9
+# Tangent of a step of the phase that can only have gone the short way round.
+_CLEAR = math.tan(1.0)
+_COMPLEX_FACTOR = math.sqrt(0.75)
+
+
+def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
+    """Return how many zeros ``1 + sum L_k(s)`` has in the right half plane.
+
+    :param terms: the L_k. Poles that several have in common count once.
+    :return: a whole number; infinite where there is no end of them, or one lies on the axis.
+    :raises TuningError: if a term has poles on the imaginary axis other than at s = 0.
+    """
+    if any(t.real == 0.0 for term in terms for t in term.time_constants):
+        raise TuningError("a process with undamped poles other than at s = 0 is not supported")
+    limits = [at_infinity(t) for t in terms]
+    at_once = sum(g for g, t in zip(limits, terms, strict=True) if t.dead_time == 0.0)
+    later = sum(abs(g) for g, t in zip(limits, terms, strict=True) if t.dead_time > 0.0)
+    if not later < abs(1.0 + at_once):
+        return math.inf
+    poles = sum(1 for t in _in_common(terms) if t.real < 0.0)
+    turns = _turning(terms, 1.0 + at_once, 0.5 * (later + abs(1.0 + at_once)))
+    return math.inf if turns is None else poles - round(turns / math.pi)
+
+
+def winding(
+    values: ComplexArray, w: FloatArray, poles: IntArray, integrators: IntArray, limits: FloatArray
+) -> FloatArray:
+    """Return the same count for many loops from values on a grid, NaN where they leave it open.
+
+    Much faster than :func:`closed_loop_unstable_poles`, for loops that are known to be far from
+    zero on a grid that is known to be fine, such as those of models like one another.
+
+    :param values: ``1 + L``, shape (n, m).
+    :param w: rad/s, shape (n,), increasing, from where all but integrators has come to rest to
+        where the loops have vanished.
+    :param poles: how many each L has in the right half plane, shape (m,).
+    :param integrators: of each L, shape (m,).
+    :param limits: of each L for s -> infinity; 0 where there is a dead time, shape (m,).
+    :return: shape (m,).
+    """
+    s = 1j * w / math.sqrt(w[1] * w[-1])
+    risen = s / (1.0 + s)
+    bounded = np.empty((w.size + 1, poles.size), dtype=np.complex128)
+    bounded[-1] = 1.0 + limits
+    for n in np.unique(integrators):
+        of = integrators == n
+        bounded[:-1, of] = values[:, of] * (risen**n)[:, None]
+    steps = bounded[1:] * bounded[:-1].conj()
+    clear = np.all(np.abs(steps.imag) < _CLEAR * steps.real, axis=0)
+    # With steps so short a turn is a passage of the negative real axis from above.
+    above, left = bounded.imag >= 0.0, bounded.real < 0.0
+    falls = np.sum(left[1:] & above[:-1] & ~above[1:], axis=0)
+    rises = np.sum(left[1:] & ~above[:-1] & above[1:], axis=0)
+    begins, ends = (np.arctan2(v.imag + 0.0, v.real) for v in (bounded[0], bounded[-1]))
+    turns = np.rint((ends - begins) / math.pi + 2.0 * (falls - rises))
+    return np.where(clear, poles - turns, math.nan)
+
+
+def at_infinity(term: TransferFunction) -> float:
+    """Return the limit for s -> infinity, of the magnitude where there is a dead time."""
+    excess = len(term.zeros) - len(term.time_constants) - term.integrators
+    if excess < 0:
+        return 0.0
+    if excess > 0:
+        return math.inf
+    return float((term.gain * np.prod(term.zeros) / np.prod(term.time_constants)).real)
+
+
+def _in_common(terms: Sequence[TransferFunction]) -> list[complex]:
+    """Return the time constants of the least common denominator."""
+    found: list[complex] = []
+    for term in terms:
+        left = list(found)
+        for t in term.time_constants:
+            same = [f for f in left if abs(f - t) <= 1e-12 * abs(t)]
+            if same:
+                left.remove(same[0])
+            else:
+                found.append(t)
+    return found
+
+
+@dataclass(frozen=True)
+class _Factors:
+    """``gain prod(b + c s)/prod(1 + d s) exp(-D s)``, each b being 0 or 1."""
+
+    gain: float
+    b: FloatArray
+    c: ComplexArray
+    d: ComplexArray
+    dead_time: float
+
+    @classmethod
+    def of(cls, term: TransferFunction, integrators: int, a: float) -> _Factors:
+        """Return ``L (a s/(1 + a s))^n`` for n = ``integrators``."""
+        left = integrators - term.integrators
+        b = np.array([1.0] * len(term.zeros) + [0.0] * left)
+        c = np.array([*term.zeros, *[a] * left], dtype=np.complex128)
+        d = np.array([*term.time_constants, *[a] * integrators], dtype=np.complex128)
+        return cls(term.gain * a**term.integrators, b, c, d, term.dead_time)
+
+    def __call__(self, w: FloatArray) -> ComplexArray:
+        s = 1j * w[:, None]
+        ratio = np.prod(self.b + self.c * s, axis=1) / np.prod(1.0 + self.d * s, axis=1)
+        return np.asarray(self.gain * ratio * np.exp(-1j * self.dead_time * w))
+
+    def steepest(self, low: FloatArray, high: FloatArray) -> FloatArray:
+        """Return a bound on the derivative's magnitude between frequencies, shape (n,)."""
+        _, top = _extent(self.b, self.c, low, high)
+        bottom, _ = _extent(np.ones(self.d.size), self.d, low, high)
+        below = abs(self.gain) / np.prod(bottom, axis=1)
+        by_poles = (np.abs(self.d) / bottom).sum(axis=1) + self.dead_time
+        slope = np.prod(top, axis=1) * by_poles
+        for k in range(self.c.size):
+            slope += abs(self.c[k]) * np.prod(np.delete(top, k, axis=1), axis=1)
+        return np.asarray(slope * below)
+
+    def largest_beyond(self, w: float) -> float:
+        """Return a magnitude not exceeded at any frequency from w on, twice all resonances."""
+        zeros = sorted(zip(np.abs(self.c), self.b, strict=True), reverse=True)
+        bound = abs(self.gain)
+        for k, pole in enumerate(sorted(self.d, key=abs, reverse=True)):
+            c, b = zeros[k] if k < len(zeros) else (0.0, 1.0)
+            top = math.hypot(b, w * c)
+            if pole.imag != 0.0:
+                bound *= top / (_COMPLEX_FACTOR * w * abs(pole))
+            else:
+                bound *= max(top / math.hypot(1.0, w * pole.real), c / abs(pole))
+        return float(bound)
+
+    def change_beyond(self, w: float) -> float:
+        """Return how far from its limit it is at most, from w on, relative to that limit."""
+        bound = 1.0
+        for b, c in zip(self.b, np.abs(self.c), strict=True):
+            bound *= 1.0 + b / (w * c)
+        for d in np.abs(self.d):
+            bound /= max(1.0 - 1.0 / (w * d), 1e-9)
+        return bound - 1.0
+
+
+def _extent(
+    b: FloatArray, c: ComplexArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the largest |b + j w c| between frequencies, shape (n, factors)."""
+    ends = [np.abs(b + 1j * w[:, None] * c) for w in (low, high)]
+    # The square of the magnitude is a parabola in w.
+    turn = np.clip(b * c.imag / np.abs(c) ** 2, low[:, None], high[:, None])
+    return np.abs(b + 1j * turn * c), np.maximum(*ends)
+
+
+def _turning(terms: Sequence[TransferFunction], limit: float, near: float) -> float | None:
+    """Return by how much the phase of H grows from w = 0 to infinity; None: H has a zero there.
+
+    :param terms: the L_k.
+    :param limit: of the part of H without dead time, for w -> infinity.
+    :param near: distance from there, less than that of zero, which H need not leave any more.
+    """
+    n = max(term.integrators for term in terms)
+    sizes = [abs(c) for t in terms for c in (*t.zeros, *t.time_constants)]
+    sizes += [t.dead_time for t in terms if t.dead_time > 0.0]
+    a = math.exp(float(np.mean(np.log(sizes)))) if sizes else 1.0
+    one = _Factors.of(TransferFunction(1.0), n, a)
+    parts = [one, *(_Factors.of(t, n, a) for t in terms)]
+    end = _end(parts, near, sizes)
+
+    def value(w: FloatArray) -> ComplexArray:
+        return np.asarray(sum(p(w) for p in parts))
+
+    edges = np.concatenate(([0.0], np.geomspace(1e-9 * min(1.0 / max(sizes), end), end, _PIECES)))
+    low, high = edges[:-1], edges[1:]
+    total = 0.0
+    while low.size:
+        begin = value(low)
+        moved = sum(p.steepest(low, high) for p in parts) * (high - low)
+        sure = moved < _SURE * np.abs(begin)
+        total += float(np.angle(value(high[sure]) / begin[sure]).sum())
+        low, high = low[~sure], high[~sure]
+        if np.any(high - low < _SHORTEST * high) or low.size > _MOST_PIECES:
+            return None
+        steps = np.linspace(low, high, _PARTS + 1)
+        low, high = steps[:-1].ravel(), steps[1:].ravel()
+    last = complex(value(np.array([end]))[0])
+    return total - float(np.angle(last / limit))
+
+
+def _end(parts: Sequence[_Factors], near: float, sizes: Sequence[float]) -> float:
+    """Return a frequency from which on H stays as near to its limit as is asked."""
+    resonances = [1.0 / abs(d) for p in parts for d in p.d if d.imag != 0.0]
+    w = 2.0 * max([*resonances, 0.5 / max(sizes, default=1.0)])
+    while True:
+        away = 0.0
+        for part in parts:
+            instant = part.dead_time == 0.0 and part.c.size == part.d.size
+            if instant:
+                at_infinity = part.gain * np.prod(part.c) / np.prod(part.d) if part.d.size else 1.0
+                away += abs(at_infinity) * part.change_beyond(w)
+            else:
+                away += part.largest_beyond(w)
+        if away < near:
+            return w
+        w *= 1.2
