@@ -9,26 +9,77 @@ with the integral advanced by the backward rule and drawn back by what the limit
 (back-calculation, Astrom and Hagglund 1995, section 3.5). Whatever is changed while it runs (the
 gains, the limits, from manual to automatic), the integral takes up the difference, so that the
 command goes on from where it was.
+
+Numbers are bounded: gains by :class:`GainBounds`, measurement, set-point and command by
+`LARGEST_VALUE`, so that no product of them leaves the range of floating-point numbers.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from relay_autotune.control.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
+from relay_autotune.errors import TuningError
 from relay_autotune.process.simulation import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import FloatArray
 from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.loop.closed_loop import ClosedLoop
 
+# A measurement, set-point or command of a larger magnitude is the fault of whoever sent it [y, u].
+LARGEST_VALUE = 1e12
+# No controller needs a larger gain [u/y] or a longer time [s].
+LARGEST_GAIN = 1e12
+LONGEST_TIME = 1e9
+
 # A sample interval within this part of the nominal one uses the filter of that one.
 _JITTER = 0.2
 # An interval longer than so many nominal ones is a gap: the integral does not run on through it.
 _LONGEST_INTERVAL = 5.0
+
+
+@dataclass(frozen=True)
+class GainBounds:
+    """What gains may be put in force.
+
+    :param kc_max: largest magnitude of the proportional gain [u/y].
+    :param ti_min: shortest integral time [s]; no integral action (0) is always allowed.
+    """
+
+    kc_max: float = LARGEST_GAIN
+    ti_min: float = 0.0
+
+    def require(self, gains: Controller) -> None:
+        """Refuse gains that are outside.
+
+        :param gains: the controller.
+        :raises TuningError: if a gain is outside its bounds.
+        """
+        largest = min(self.kc_max, LARGEST_GAIN)
+        longest = max(gains.ti, gains.td, gains.tf)
+        if abs(gains.kc) > largest:
+            problem = f"kc is {gains.kc:g}, expected at most {largest:g} either way"
+        elif 0.0 < gains.ti < self.ti_min:
+            problem = f"ti is {gains.ti:g} s, expected at least {self.ti_min:g} s"
+        elif longest > LONGEST_TIME:
+            problem = f"a time is {longest:g} s, expected at most {LONGEST_TIME:g} s"
+        elif not 0.0 <= gains.b <= 1.0:
+            problem = f"b is {gains.b:g}, expected 0 to 1"
+        else:
+            return
+        raise TuningError(f"gains out of bounds: {problem}")
+
+
+def is_usable(value: float) -> bool:
+    """Return True if a measurement, set-point or command is a number that can be [y, u].
+
+    :param value: the number.
+    """
+    # NaN compares as false.
+    return abs(value) <= LARGEST_VALUE
 
 
 class PidController:
@@ -99,18 +150,23 @@ class PidController:
         self._align = True
 
     def track(self, command: float) -> None:
-        """Take over what somebody else commands, to go on from there [u]."""
-        self._command = self._limits.clip(command)
-        self._align = True
+        """Take over what somebody else commands, to go on from there [u].
+
+        :param command: one that is not finite, or beyond `LARGEST_VALUE`, is passed over.
+        """
+        if is_usable(command):
+            self._command = self._limits.clip(command)
+            self._align = True
 
     def step(self, time: float, setpoint: float, measurement: float) -> float:
         """Take a sample and return the command [u].
 
         :param time: of the sample [s], not decreasing.
         :param setpoint: [y].
-        :param measurement: [y]; one that is not finite is passed over, as is a set-point.
+        :param measurement: [y]; one that is not finite, or beyond `LARGEST_VALUE`, is passed
+            over, as is a set-point.
         """
-        if not (math.isfinite(measurement) and math.isfinite(setpoint)):
+        if not (is_usable(measurement) and is_usable(setpoint)):
             return self._command
         interval = 0.0 if math.isnan(self._time) else max(time - self._time, 0.0)
         self._time = time
@@ -125,7 +181,12 @@ class PidController:
             return self._command
         if not math.isnan(self._nominal):
             interval = min(interval, _LONGEST_INTERVAL * max(self._nominal, self._usual))
-        self._command = law.command(gains, setpoint, interval, self._limits)
+        command = law.command(gains, setpoint, interval, self._limits)
+        if is_usable(command):
+            self._command = command
+        else:
+            # Nothing that the law has in memory can be trusted: it begins anew at this command.
+            self._law, self._align = None, True
         return self._command
 
     def _heard(self, gains: Controller, interval: float, measurement: float) -> PidLaw:

@@ -3,7 +3,9 @@ r"""The controller as it runs: at a sampling period, within the limits of its ac
 The filter is advanced exactly for a measurement that runs straight from one sample to the next,
 so that it has the same lag at every sampling period, and without a filter the derivative is the
 difference quotient. The integral is advanced by the backward rule, and drawn back by what the
-limits cut off (Astrom and Hagglund's back-calculation), so that it does not wind up.
+limits cut off (Astrom and Hagglund's back-calculation), so that it does not wind up. At a limit it
+moves no further than the range of the limits lets it, so that one wild sample leaves it where it
+was.
 """
 
 from __future__ import annotations
@@ -135,12 +137,22 @@ class PidLaw:
         :param interval: since the sample before [s].
         :param limits: range of the command.
         """
+        before = self.integral
         self.integral += float(c.i * interval * (setpoint - self._filter[0]))
-        wanted = self.proportional(c, setpoint) + self.integral
+        part = self.proportional(c, setpoint)
+        wanted = part + self.integral
         given = limits.clip(wanted)
         tracking = math.sqrt(c.ti * c.td) or c.ti
-        if tracking > 0.0:
-            self.integral += min(1.0, interval / tracking) * (given - wanted)
+        if given != wanted and tracking > 0.0:
+            pull = min(1.0, interval / tracking)
+            drawn = self.integral + pull * (given - wanted)
+            # One sample moves the integral by no more than the limits' range would in its time,
+            room = pull * (limits.high - limits.low)
+            drawn = min(max(drawn, before - room), before + room)
+            # and it asks for no command beyond the limits, neither now nor at the set-point.
+            rest = c.kc * (c.b - 1.0) * setpoint
+            low, high = limits.low - max(rest, part), limits.high - min(rest, part)
+            self.integral = min(max(drawn, low), high)
         return given
 
 

@@ -10,7 +10,7 @@ import pytest
 from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
-from relay_autotune.control.controller import PidController, run_loop
+from relay_autotune.control.controller import GainBounds, PidController, run_loop
 from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step, compare, describe, plan
 from relay_autotune.errors import TuningError
@@ -183,3 +183,78 @@ def test_a_step_is_described_as_it_is():
 def test_gains_that_are_unstable_on_the_model_are_not_tried():
     with pytest.raises(TuningError, match="unstable loop"):
         plan(Controller(kc=20.0, ti=1.0), PROCESS, Step(setpoint=1.0), 0.05)
+
+
+# Samples that cannot be true.
+
+
+@pytest.mark.parametrize("wild", [65535.0, -65535.0, 1e9, 1e12, 1e20, -1e20, 1.7e308])
+@pytest.mark.parametrize(
+    "gains",
+    [
+        GAINS,
+        Controller(kc=1.2, ti=2.0, td=0.3),
+        Controller(kc=1.2, ti=2.0, td=0.3, tf=0.03, b=0.2),
+        Controller(kc=1.2, ti=0.0),
+    ],
+)
+def test_one_wild_sample_is_forgotten(gains, wild):
+    """The loop is back within a few time constants of the process, whatever the sample was."""
+    limits = Limits(-1.0, 2.0)
+    calm, shaken = (PidController(gains, 0.5, limits=limits) for _ in range(2))
+    plants = [FopdtPlant(1.5, 2.0, 0.4) for _ in range(2)]
+    ends = [closed_loop(c, p, 0.05, 600)[0][-1] for c, p in zip((calm, shaken), plants)]
+    assert ends[0] == ends[1]
+    assert limits.low <= shaken.step(600 * 0.05, 1.0, wild) <= limits.high
+    y, u = closed_loop(shaken, plants[1], 0.05, 400, start=601)
+    assert np.isfinite(u).all()
+    assert np.abs(y[-100:] - ends[0]).max() < 0.02
+    # The filter of 0.03 s has to forget it, too; no limit is stayed at for long.
+    assert np.count_nonzero((u == limits.low) | (u == limits.high)) < 40
+
+
+@pytest.mark.parametrize("limits", [Limits(), Limits(-1.0, 2.0), Limits(low=0.0)])
+@pytest.mark.parametrize("wild", [1.7e308, -1.7e308, 1e20])
+def test_no_command_is_ever_anything_but_a_number(limits, wild):
+    gains = Controller(kc=1e12, ti=1e-9, td=1e9)
+    controller = PidController(gains, 0.0, limits=limits)
+    samples = [0.0, 1e12, -1e12, wild, 1.0, math.inf, 0.0, wild, wild, -1e12]
+    for k, y in enumerate(samples * 3):
+        assert math.isfinite(controller.step(1e-6 * k, (-1.0) ** k * abs(y), y))
+    controller.track(wild)
+    assert abs(controller.command) <= 1e12
+
+
+def test_at_a_limit_the_law_is_that_of_back_calculation():
+    """A PI at its limit, long out of reach: the integral is what the limit leaves of the rest."""
+    limits, gains = Limits(-0.2, 0.4), Controller(kc=1.2, ti=2.0, b=0.3)
+    controller = PidController(gains, 0.0, limits=limits)
+    integral, u = 0.0, 0.0
+    for k in range(200):
+        y = 0.6 * (1.0 - math.exp(-0.02 * k))
+        given = controller.step(0.05 * k, 1.0, y)
+        if k == 0:
+            integral = -gains.kc * (gains.b - y)
+            continue
+        integral += gains.i * 0.05 * (1.0 - y)
+        wanted = gains.kc * (gains.b - y) + integral
+        u = min(max(wanted, -0.2), 0.4)
+        integral += 0.05 / gains.ti * (u - wanted)
+        assert given == pytest.approx(u, abs=1e-12)
+    assert u == 0.4
+
+
+@pytest.mark.parametrize(
+    ("gains", "problem"),
+    [
+        (Controller(kc=-1e300, ti=1.0), "kc is -1e\\+300"),
+        (Controller(kc=3.0, ti=1.0), "kc is 3, expected at most 2 either way"),
+        (Controller(kc=1.0, ti=0.2), "ti is 0.2 s, expected at least 0.5 s"),
+        (Controller(kc=1.0, ti=1e200), "a time is 1e\\+200 s"),
+        (Controller(kc=1.0, ti=1.0, b=-1e300), "b is -1e\\+300"),
+    ],
+)
+def test_gains_out_of_bounds_are_refused(gains, problem):
+    with pytest.raises(TuningError, match=problem):
+        GainBounds(kc_max=2.0, ti_min=0.5).require(gains)
+    GainBounds(kc_max=2.0, ti_min=0.5).require(Controller(kc=-2.0, ti=0.0))
