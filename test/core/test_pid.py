@@ -203,7 +203,9 @@ def test_one_wild_sample_is_forgotten(gains, wild):
     limits = Limits(-1.0, 2.0)
     calm, shaken = (PidController(gains, 0.5, limits=limits) for _ in range(2))
     plants = [FopdtPlant(1.5, 2.0, 0.4) for _ in range(2)]
-    ends = [closed_loop(c, p, 0.05, 600)[0][-1] for c, p in zip((calm, shaken), plants)]
+    ends = [
+        closed_loop(c, p, 0.05, 600)[0][-1] for c, p in zip((calm, shaken), plants, strict=True)
+    ]
     assert ends[0] == ends[1]
     assert limits.low <= shaken.step(600 * 0.05, 1.0, wild) <= limits.high
     y, u = closed_loop(shaken, plants[1], 0.05, 400, start=601)

@@ -1,0 +1,313 @@
+"""Which gains are in force, which were before, and which of them were proven or failed.
+
+A :class:`GainsHistory` is immutable: each event returns the next one, or is refused. What holds
+whatever happens:
+
+- gains that failed a verification are never in force again;
+- going back leads to a whole set that was in force, never to half of a change;
+- after an interruption the newest gains are in force that can be trusted: those that were proven,
+  or given by the configuration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from relay_autotune.errors import TuningError
+
+# So many sets before the present one are kept, and so many failed ones are known.
+_KEPT = 20
+_KNOWN = 1000
+# Numbers that differ by less, relatively, are the same.
+_EQUAL = 1e-9
+
+
+class HistoryError(TuningError):
+    """A change of the gains that is refused."""
+
+
+class Standing(Enum):
+    """What is known of gains."""
+
+    GIVEN = "given"
+    """The configuration gives them, or the other node had them by itself."""
+    EDITED = "edited"
+    """Set by hand, one number after the other: perhaps half of a change."""
+    APPLIED = "applied"
+    """A whole set that was not proven."""
+    PROVEN = "proven"
+    """They passed a verification."""
+
+
+class Work(Enum):
+    """What is being done with the gains."""
+
+    NOTHING = "nothing"
+    APPLY = "apply"
+    VERIFY = "verify"
+
+
+@dataclass(frozen=True)
+class GainSet:
+    """All numbers of a controller by their names.
+
+    :param values: pairs of name and value, in the order of the names.
+    :raises TuningError: if one is not finite.
+    """
+
+    values: tuple[tuple[str, float], ...]
+
+    def __post_init__(self) -> None:
+        for name, value in self.values:
+            if not math.isfinite(value):
+                raise TuningError(f"the gain {name} is {value:g}, expected a finite number")
+
+    @classmethod
+    def of(cls, values: Mapping[str, float]) -> GainSet:
+        """Return a set of gains.
+
+        :param values: the numbers by name.
+        :raises TuningError: if one is not finite.
+        """
+        return cls(tuple(sorted((name, float(value)) for name, value in values.items())))
+
+    def by_name(self) -> dict[str, float]:
+        """Return the numbers by their names."""
+        return dict(self.values)
+
+    def is_near(self, other: GainSet) -> bool:
+        """Return True if another set has the same numbers, but for rounding."""
+        theirs = other.by_name()
+        return theirs.keys() == self.by_name().keys() and all(
+            math.isclose(value, theirs[name], rel_tol=_EQUAL) for name, value in self.values
+        )
+
+    def is_mixture(self, one: GainSet, other: GainSet) -> bool:
+        """Return True if each number is that of one of two sets."""
+        first, second = one.by_name(), other.by_name()
+        return all(
+            any(
+                math.isclose(value, s.get(name, math.nan), rel_tol=_EQUAL) for s in (first, second)
+            )
+            for name, value in self.values
+        )
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value:.6g}" for name, value in self.values)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Gains, and what is known of them."""
+
+    gains: GainSet
+    standing: Standing
+
+    @property
+    def is_trusted(self) -> bool:
+        """True if a node may start with them."""
+        return self.standing in (Standing.GIVEN, Standing.PROVEN)
+
+    def whole(self) -> Entry:
+        """Return the entry once something else follows, so that the change by hand is over."""
+        return Entry(self.gains, Standing.APPLIED) if self.standing is Standing.EDITED else self
+
+
+@dataclass(frozen=True)
+class GainsHistory:
+    """The gains of one controller.
+
+    :param given: gains of the configuration; None: it gives none.
+    :param in_force: the present ones; None: the command is held.
+    :param before: those that were in force before, the newest last; none of them failed.
+    :param failed: those that failed a verification.
+    :param doubtful: those whose verification was cut short with the process.
+    :param work: what is being done.
+    """
+
+    given: GainSet | None = None
+    in_force: Entry | None = None
+    before: tuple[Entry, ...] = ()
+    failed: tuple[GainSet, ...] = ()
+    doubtful: tuple[GainSet, ...] = ()
+    work: Work = Work.NOTHING
+
+    @classmethod
+    def begun(cls, given: GainSet | None) -> GainsHistory:
+        """Return the history of a controller that starts for the first time.
+
+        :param given: gains of its configuration.
+        """
+        return cls(given, Entry(given, Standing.GIVEN) if given else None)
+
+    @property
+    def gains(self) -> GainSet | None:
+        """The gains in force; None: the command is held."""
+        return self.in_force.gains if self.in_force else None
+
+    # New gains.
+
+    def require_not_failed(self, gains: GainSet) -> None:
+        """Refuse gains that failed a verification.
+
+        :raises HistoryError: if they did.
+        """
+        if gains in self.failed:
+            raise HistoryError(f"these gains failed their verification: {gains}; tune again")
+
+    def apply(self, gains: GainSet) -> GainsHistory:
+        """Begin to put a whole set in force; :meth:`settled` ends it.
+
+        :raises HistoryError: if it failed a verification, or something else is being done.
+        """
+        self._require_rest()
+        self.require_not_failed(gains)
+        if self.in_force is not None and gains == self.in_force.gains:
+            return replace(self, in_force=self.in_force.whole(), work=Work.APPLY)
+        return replace(self._with(Entry(gains, Standing.APPLIED)), work=Work.APPLY)
+
+    def edit(self, gains: GainSet | None) -> GainsHistory:
+        """Take what was set by hand, which may be half of a change.
+
+        :param gains: None: no gains, the command is held.
+        :raises HistoryError: as :meth:`apply`.
+        """
+        self._require_rest()
+        if gains == self.gains:
+            return self
+        if gains is None:
+            return self._with(None)
+        self.require_not_failed(gains)
+        return self._with(Entry(gains, Standing.EDITED))
+
+    def observe(self, gains: GainSet) -> GainsHistory:
+        """Take what another node turns out to have in force, by itself or by another's hand."""
+        if self.in_force is not None and gains.is_near(self.in_force.gains):
+            return self
+        standing = Standing.APPLIED if gains in self.failed else Standing.GIVEN
+        return self._with(Entry(gains, standing))
+
+    def settled(self) -> GainsHistory:
+        """Return the history once what was being done has ended without a verdict."""
+        return replace(self, work=Work.NOTHING)
+
+    # Going back.
+
+    def revert(self) -> GainsHistory:
+        """Go back to the whole set that was in force before the present gains.
+
+        :raises HistoryError: if there is none, or something else is being done.
+        """
+        self._require_rest()
+        state = self._back()
+        if state.in_force is None:
+            raise HistoryError("there are no gains before these to go back to")
+        return state
+
+    # Proof.
+
+    def verify(self) -> GainsHistory:
+        """Begin to verify the gains in force.
+
+        :raises HistoryError: if there are none, or something else is being done.
+        """
+        self._require_rest()
+        if self.in_force is None:
+            raise HistoryError("there are no gains to verify")
+        return replace(self, in_force=self.in_force.whole(), work=Work.VERIFY)
+
+    def passed(self) -> GainsHistory:
+        """Return the history once the gains in force have passed."""
+        assert self.in_force is not None
+        gains = self.in_force.gains
+        return replace(
+            self,
+            in_force=Entry(gains, Standing.PROVEN),
+            doubtful=tuple(g for g in self.doubtful if g != gains),
+            work=Work.NOTHING,
+        )
+
+    def fail(self) -> GainsHistory:
+        """Return the history once the gains in force have failed: those before are, or none."""
+        assert self.in_force is not None
+        gains = self.in_force.gains
+        state = replace(
+            self,
+            before=tuple(entry for entry in self.before if entry.gains != gains),
+            failed=(*(g for g in self.failed if g != gains), gains)[-_KNOWN:],
+        )
+        return state._back().settled()
+
+    # After an interruption.
+
+    def is_open_to(self, gains: GainSet) -> bool:
+        """Return True if gains may be put in force without anybody asking for it."""
+        return gains not in self.failed and gains not in self.doubtful
+
+    def after_interruption(self) -> GainsHistory:
+        """Return the history after the process ended, while the gains stayed where they were.
+
+        What had been done to the end stays; what was being done is undone.
+        """
+        if self.work is Work.NOTHING:
+            return self
+        state, entry = self, self.in_force
+        if self.work is Work.VERIFY and entry is not None and not entry.is_trusted:
+            known = (*(g for g in self.doubtful if g != entry.gains), entry.gains)[-_KNOWN:]
+            state = replace(self, doubtful=known)
+        return state._trusted().settled()
+
+    def after_restart(self, given: GainSet | None) -> GainsHistory:
+        """Return the history of a controller that starts again and has nothing in force yet.
+
+        :param given: gains of its configuration; those of a changed configuration count more than
+            what was proven before, unless they failed.
+        """
+        state = self.after_interruption()._trusted()
+        if given == self.given:
+            return state
+        state = replace(state, given=given)
+        if given is None:
+            return state._with(None)
+        return state if given in self.failed else state._with(Entry(given, Standing.GIVEN))
+
+    # Within.
+
+    def _require_rest(self) -> None:
+        if self.work is Work.VERIFY:
+            raise HistoryError("a verification is running; wait for its end")
+        if self.work is Work.APPLY:
+            raise HistoryError("gains are being put in force; wait for the end of that")
+
+    def _with(self, entry: Entry | None) -> GainsHistory:
+        """Put other gains in force, and keep the present ones if they are a whole set."""
+        old = self.in_force
+        edited = entry is not None and entry.standing is Standing.EDITED
+        half = old is not None and old.standing is Standing.EDITED and (edited or entry is None)
+        before = self.before
+        if old is not None and not half and old.gains not in self.failed:
+            before = (*before, old.whole())
+        if len(before) > _KEPT:
+            # The oldest goes, but the newest that can be trusted stays.
+            trusted = max((k for k, e in enumerate(before) if e.is_trusted), default=-1)
+            drop = 1 if trusted == 0 else 0
+            before = before[:drop] + before[drop + 1 :]
+        return replace(self, in_force=entry, before=before)
+
+    def _back(self) -> GainsHistory:
+        """Put the newest other set before the present one in force."""
+        for k in range(len(self.before) - 1, -1, -1):
+            if self.before[k].gains != self.gains:
+                return replace(self, in_force=self.before[k], before=self.before[:k])
+        return replace(self, in_force=None, before=())
+
+    def _trusted(self) -> GainsHistory:
+        """Put the newest set in force that can be trusted, or none."""
+        chain = (*self.before, *((self.in_force,) if self.in_force else ()))
+        for k in range(len(chain) - 1, -1, -1):
+            if chain[k].is_trusted and chain[k].gains not in self.failed:
+                return replace(self, in_force=chain[k], before=chain[:k])
+        return replace(self, in_force=None, before=())

@@ -1,0 +1,168 @@
+"""The history of a controller's gains on disk, so that it outlives a kill and a loss of power.
+
+Each state replaces the one before as a whole: a temporary file is written and forced to the disk,
+renamed over the old one, and the folder is forced to the disk, too. One process at a time has it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import threading
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.gains_history import Entry, GainSet, GainsHistory, Standing, Work
+
+_VERSION = 1
+
+
+class JournalError(RelayAutotuneError):
+    """A journal that cannot be read, written or had."""
+
+
+class GainsJournal:
+    """The file of one controller's gains.
+
+    :param folder: where it lies; made where it is not there.
+    :param node: fully qualified name of the node, which names the file.
+    :param domain: the ROS domain, in which names are unique.
+    :param loop: what the node controls, such as its measurement; the file of another loop is
+        refused.
+    :raises JournalError: if another process has it.
+    """
+
+    def __init__(self, folder: Path, node: str, domain: int, loop: str) -> None:
+        within = f".domain{domain}" if domain else ""
+        # No name of a node has a dot.
+        self.path = folder / f"gains{node.replace('/', '.')}{within}.json"
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._newest = 0
+        self._held: int | None = None
+        # Where nothing can be written, `save` says so; some file systems have no locks.
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._held = os.open(
+                self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644
+            )
+        try:
+            if self._held is not None:
+                fcntl.flock(self._held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise JournalError(
+                f"another process has {self.path}: a second {node} runs on this machine; end it, "
+                "or give this one another record_directory"
+            ) from None
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        """Leave the file to other processes."""
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
+
+    def load(self) -> GainsHistory | None:
+        """Return what was saved last, None if nothing was.
+
+        :raises JournalError: if the file is not a journal of this loop.
+        """
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            raise self._unreadable(str(error)) from error
+        try:
+            found = json.loads(text)
+            version, loop = found["version"], found["loop"]
+            history = _history_of(found)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise self._unreadable(f"{type(error).__name__}: {error}") from error
+        if version != _VERSION:
+            raise self._unreadable(f"it is of version {version!r}, expected {_VERSION}")
+        if loop != self._loop:
+            raise JournalError(
+                f"{self.path} is of the loop {loop!r}, found {self._loop!r}: give another "
+                "record_directory, or remove the file"
+            )
+        return history
+
+    def ticket(self) -> int:
+        """Return the number of the next state to save."""
+        self._newest += 1
+        return self._newest
+
+    def save(self, history: GainsHistory, ticket: int) -> None:
+        """Write a state and wait until the disk has it; may be called by any thread.
+
+        :param history: the state.
+        :param ticket: its number; once a later one is asked for, an earlier one is left out.
+        :raises JournalError: if it is not on the disk; then the state before is.
+        """
+        document = {"version": _VERSION, "loop": self._loop, **_values_of(history)}
+        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+        new = self.path.with_suffix(".tmp")
+        with self._lock:
+            if ticket != self._newest:
+                return
+            try:
+                with new.open("w", encoding="utf-8") as file:
+                    file.write(text)
+                    file.flush()
+                    os.fsync(file.fileno())
+                new.replace(self.path)
+                folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+                try:
+                    os.fsync(folder)
+                finally:
+                    os.close(folder)
+            except OSError as error:
+                with contextlib.suppress(OSError):
+                    new.unlink(missing_ok=True)
+                raise JournalError(
+                    f"the gains cannot be kept in {self.path}: {error.strerror or error}; make "
+                    "the folder writable, or give another record_directory"
+                ) from error
+
+    def _unreadable(self, why: str) -> JournalError:
+        return JournalError(
+            f"{self.path} is no journal of gains ({why}): remove it to start with the gains of "
+            "the parameters"
+        )
+
+
+def _values_of(value: Any) -> Any:
+    """Return a history, or a part of it, as JSON has it."""
+    if isinstance(value, GainSet):
+        return value.by_name()
+    if isinstance(value, (Standing, Work)):
+        return value.value
+    if isinstance(value, tuple):
+        return [_values_of(each) for each in value]
+    if value is None:
+        return None
+    return {field.name: _values_of(getattr(value, field.name)) for field in fields(value)}
+
+
+def _history_of(found: dict[str, Any]) -> GainsHistory:
+    def entry(value: dict[str, Any]) -> Entry:
+        return Entry(GainSet.of(value["gains"]), Standing(value["standing"]))
+
+    def optional(value: Any, made: Any) -> Any:
+        return None if value is None else made(value)
+
+    return GainsHistory(
+        given=optional(found["given"], GainSet.of),
+        in_force=optional(found["in_force"], entry),
+        before=tuple(entry(each) for each in found["before"]),
+        failed=tuple(GainSet.of(each) for each in found["failed"]),
+        doubtful=tuple(GainSet.of(each) for each in found["doubtful"]),
+        work=Work(found["work"]),
+    )

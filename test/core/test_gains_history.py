@@ -1,0 +1,219 @@
+"""Which gains are in force: what always holds, and the cases that came up."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from relay_autotune.errors import TuningError
+from relay_autotune.gains_history import GainSet, GainsHistory, HistoryError, Standing, Work
+
+
+def gains(kc: float, ti: float = 1.0) -> GainSet:
+    return GainSet.of({"kc": kc, "ti": ti})
+
+
+G, A, B = gains(0.3), gains(0.5), gains(0.9)
+
+
+def applied(history: GainsHistory, wanted: GainSet) -> GainsHistory:
+    return history.apply(wanted).settled()
+
+
+def test_before_any_apply_there_is_nothing_to_go_back_to():
+    for given in (None, G):
+        with pytest.raises(HistoryError, match="no gains before"):
+            GainsHistory.begun(given).revert()
+
+
+def test_after_two_changes_by_hand_the_whole_set_before_them_comes_back():
+    history = GainsHistory.begun(gains(0.3, 20.0)).edit(gains(0.5, 20.0)).edit(gains(0.5, 8.0))
+    assert history.gains == gains(0.5, 8.0)
+    assert history.revert().gains == gains(0.3, 20.0)
+
+
+def test_what_was_set_by_hand_and_left_is_whole():
+    history = applied(GainsHistory.begun(G).edit(A), B)
+    assert history.revert().gains == A
+    # Further changes by hand do not lose it.
+    assert history.revert().edit(gains(7.0)).revert().gains == A
+
+
+def test_the_first_gains_ever_do_not_stay_after_a_fail():
+    history = applied(GainsHistory.begun(None), A).verify().fail()
+    assert history.gains is None
+    with pytest.raises(HistoryError, match="failed their verification"):
+        history.apply(A)
+    with pytest.raises(HistoryError, match="failed their verification"):
+        history.edit(A)
+    with pytest.raises(HistoryError, match="no gains before"):
+        history.revert()
+
+
+def test_a_second_fail_does_not_bring_the_first_failed_set_back():
+    history = applied(GainsHistory.begun(G), A).verify().fail()
+    assert history.gains == G
+    history = history.verify().fail()
+    assert history.gains is None
+    history = applied(applied(GainsHistory.begun(G), A).verify().passed(), B).verify().fail()
+    assert history.gains == A
+    assert history.verify().fail().gains == G
+
+
+def test_a_restart_begins_with_what_was_proven():
+    proven = applied(GainsHistory.begun(G), A).verify().passed()
+    tried = applied(proven, B)
+    for state in (proven, proven.apply(B), tried, tried.verify(), tried.edit(gains(3.0))):
+        assert state.after_restart(G).gains == A
+    # What is set anew in the configuration counts more.
+    assert proven.after_restart(gains(0.1)).gains == gains(0.1)
+    assert proven.after_restart(gains(0.1)).revert().gains == A
+    assert proven.after_restart(None).gains is None
+    failed = proven.verify().fail()
+    assert failed.after_restart(G).gains == G
+    assert failed.after_restart(A).gains == G
+
+
+def test_gains_whose_verification_was_cut_short_come_by_hand_alone():
+    history = applied(GainsHistory.begun(None), A).verify().after_restart(None)
+    assert history.gains is None
+    assert not history.is_open_to(A)
+    assert history.is_open_to(B)
+    assert applied(history, A).verify().passed().is_open_to(A)
+
+
+def test_where_the_gains_outlive_the_process_an_apply_that_was_finished_stays():
+    begun = GainsHistory().observe(G)
+    assert applied(begun, A).after_interruption().gains == A
+    assert begun.apply(A).after_interruption().gains == G
+    assert applied(begun, A).verify().after_interruption().gains == G
+
+
+def test_many_sets_do_not_push_out_the_last_that_can_be_trusted():
+    history = GainsHistory.begun(G)
+    for k in range(100):
+        history = applied(history, gains(1.0 + k))
+    assert len(history.before) <= 20
+    assert history.revert().gains == gains(99.0)
+    assert history.after_restart(G).gains == G
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_gains_are_numbers(value):
+    with pytest.raises(TuningError, match="expected a finite number"):
+        gains(value)
+
+
+def test_a_mixture_is_told_from_gains_of_another_hand():
+    one, other = gains(1.0, 2.0), gains(3.0, 4.0)
+    assert gains(1.0, 4.0).is_mixture(one, other)
+    assert not gains(1.0, 5.0).is_mixture(one, other)
+    assert gains(1.0 + 1e-12, 2.0).is_near(one)
+    assert not gains(1.001, 2.0).is_near(one)
+
+
+SETS = st.builds(gains, st.sampled_from([0.1, 0.2, 0.3]), st.sampled_from([1.0, 2.0]))
+
+
+class Controllers(RuleBasedStateMachine):
+    """Any events in any order, beside plain sets of what has happened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.given: GainSet | None = gains(0.1)
+        self.history = GainsHistory.begun(self.given)
+        self.failed: set[GainSet] = set()
+        self.trusted: set[GainSet] = {gains(0.1)}
+        # Sets that nobody was in the midst of changing by hand.
+        self.whole: set[GainSet] = {gains(0.1)}
+        self.by_hand = False
+
+    def leave(self) -> None:
+        """Leave what was set by hand as it is."""
+        if self.history.gains is not None:
+            self.whole.add(self.history.gains)
+        self.by_hand = False
+
+    def attempt(self, event: str, wanted: GainSet | None) -> bool:
+        try:
+            state = getattr(self.history, event)(wanted)
+        except HistoryError:
+            assert self.history.work is not Work.NOTHING or wanted in self.failed
+            return False
+        if event == "apply":
+            self.leave()
+        self.history = state
+        assert self.history.gains == wanted
+        return True
+
+    @rule(wanted=SETS)
+    def apply(self, wanted: GainSet) -> None:
+        if self.attempt("apply", wanted):
+            self.whole.add(wanted)
+
+    @precondition(lambda self: self.history.work is Work.APPLY)
+    @rule()
+    def applied(self) -> None:
+        self.history = self.history.settled()
+
+    @rule(wanted=st.none() | SETS)
+    def edit(self, wanted: GainSet | None) -> None:
+        self.attempt("edit", wanted)
+
+    @rule()
+    def revert(self) -> None:
+        left = self.history.gains
+        try:
+            self.history = self.history.revert()
+        except HistoryError:
+            return
+        assert self.history.gains != left
+        assert self.history.gains in self.whole - self.failed
+
+    @precondition(lambda self: self.history.work is Work.NOTHING and self.history.gains)
+    @rule()
+    def verify(self) -> None:
+        self.leave()
+        self.history = self.history.verify()
+
+    @precondition(lambda self: self.history.work is Work.VERIFY)
+    @rule(passed=st.none() | st.booleans())
+    def judge(self, passed: bool | None) -> None:
+        tried = self.history.gains
+        assert tried is not None
+        if passed is None:
+            self.history = self.history.settled()
+        elif passed:
+            self.history = self.history.passed()
+            self.trusted.add(tried)
+        else:
+            self.history = self.history.fail()
+            self.failed.add(tried)
+            assert self.history.gains in {None, *self.whole} - self.failed
+
+    @rule(given=st.none() | SETS, changed=st.booleans())
+    def restart(self, given: GainSet | None, changed: bool) -> None:
+        if not changed:
+            given = self.given
+        elif given is not None:
+            self.trusted.add(given)
+            self.whole.add(given)
+        self.given = given
+        self.history = self.history.after_restart(given)
+        assert self.history.gains in {None, *self.trusted} - self.failed
+        assert self.history.work is Work.NOTHING
+
+    @invariant()
+    def nothing_that_failed_is_in_force(self) -> None:
+        assert self.history.gains not in self.failed
+        assert not {entry.gains for entry in self.history.before} & self.failed
+        assert {entry.gains for entry in self.history.before} <= self.whole
+        assert Standing.EDITED not in {entry.standing for entry in self.history.before}
+
+
+TestControllers = Controllers.TestCase
+TestControllers.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
