@@ -15,8 +15,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from relay_autotune.control.gains_history import Entry, GainSet, GainsHistory, Standing, Work
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.gains_history import Entry, GainSet, GainsHistory, Standing, Work
 
 _VERSION = 1
 

@@ -9,8 +9,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from relay_autotune.control.gains_history import (
+    GainSet,
+    GainsHistory,
+    HistoryError,
+    Standing,
+    Work,
+)
 from relay_autotune.errors import TuningError
-from relay_autotune.gains_history import GainSet, GainsHistory, HistoryError, Standing, Work
 
 
 def gains(kc: float, ti: float = 1.0) -> GainSet:

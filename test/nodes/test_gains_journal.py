@@ -11,7 +11,7 @@ from random import Random
 
 import pytest
 
-from relay_autotune.gains_history import GainSet, GainsHistory, Work
+from relay_autotune.control.gains_history import GainSet, GainsHistory, Work
 from relay_autotune.nodes.gains_journal import GainsJournal, JournalError
 
 GIVEN = GainSet.of({"kc": 0.1 + 0.2, "ti": 1e-9, "b": 1.0})
@@ -23,7 +23,7 @@ HISTORY = (
 WRITER = """
 import sys
 from pathlib import Path
-from relay_autotune.gains_history import GainSet, GainsHistory
+from relay_autotune.control.gains_history import GainSet, GainsHistory
 from relay_autotune.nodes.gains_journal import GainsJournal
 journal = GainsJournal(Path(sys.argv[1]), "/c", 0, "y")
 print("ready", flush=True)
