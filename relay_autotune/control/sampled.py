@@ -12,13 +12,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
-from relay_autotune.tuning.gains import Controller
+
+if TYPE_CHECKING:
+    # The judgement of gains needs this module's filter.
+    from relay_autotune.tuning.gains import Controller
 
 FloatArray = NDArray[np.float64]
 Motion = tuple[FloatArray, FloatArray, FloatArray]
