@@ -171,6 +171,8 @@ def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
 
 def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
     result, cancelled = client.result, client.cancelled
+    for refused in sorted(client.refused):
+        say(PROGRAM, refused)
     if not result.experiment.experiment_id:
         return _nothing_started(client, options)
     if not options.json:

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from relay_autotune.errors import RecordError
+from relay_autotune.errors import ModelError, RecordError, RelayAutotuneError, TuningError
 from relay_autotune.experiment.early_end import Finding
-from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
+from relay_autotune.record.record import LARGEST, Cycle, FloatArray, Outcome, Record, RelaySettings
 
 if TYPE_CHECKING:
     from relay_autotune.identification import Identification
@@ -25,6 +25,23 @@ if TYPE_CHECKING:
 
 NANOSECONDS = 1_000_000_000
 _PREDICTED = ("ms", "ms_low", "ms_high")
+# The numbers of a relay's settings; an experiment that ends while it settles lacks some.
+_OF_EITHER_SIGN = ("setpoint", "baseline", "bias")
+_NOT_NEGATIVE = ("amplitude", "hysteresis", "extra_delay", "sample_period")
+_KNOWN_LATER = ("setpoint", "hysteresis")
+# Arrays of a model, by the one whose length they have.
+_SHAPES = {
+    "parameters": ("std", "covariance", "ci95_low", "ci95_high"),
+    "point_frequency": ("point_real", "point_imaginary", "point_std"),
+    "combinations": (
+        "combination_units",
+        *(f"combination_{name}" for name in ("value", "std", "ci95_low", "ci95_high")),
+    ),
+}
+# The roots of more take long, and no structure has as many.
+_MOST_COEFFICIENTS = 50
+# How far p, i and d may be from what kc, ti and td make, by rounding.
+_SAME = 1e-9
 
 
 def float64_array(values: ArrayLike) -> array.array[float]:
@@ -89,9 +106,20 @@ def fill_settings(message: Any, settings: RelaySettings | None) -> None:
 
 
 def settings_from_message(message: Any) -> RelaySettings | None:
-    """Read a `RelaySettings` message; None if its amplitude says that no relay acted."""
+    """Read a `RelaySettings` message; None if its amplitude says that no relay acted.
+
+    :raises RecordError: if a number cannot be.
+    """
     if float(message.amplitude) == 0.0:
         return None
+    for name in (*_OF_EITHER_SIGN, *_NOT_NEGATIVE):
+        value = float(getattr(message, name))
+        unknown = math.isnan(value) and name in _KNOWN_LATER
+        if not unknown and not (-LARGEST if name in _OF_EITHER_SIGN else 0.0) <= value <= LARGEST:
+            least = f"{-LARGEST:g}" if name in _OF_EITHER_SIGN else "0"
+            raise RecordError(
+                f"the relay's {name} is {value:g}, expected a number from {least} to {LARGEST:g}"
+            )
     return RelaySettings(
         setpoint=float(message.setpoint),
         baseline=float(message.baseline),
@@ -220,6 +248,8 @@ def record_from_cycles(messages: Iterable[Any]) -> Record:
     while first - 1 in by_index:
         first -= 1
     run = [by_index[i] for i in range(first, newest + 1)]
+    for message in run:
+        _check_cycle(message)
     start = stamp_nanoseconds(run[0].header.stamp)
     columns: dict[str, list[FloatArray]] = {"time": [], "measurement": [], "command": []}
     starts: list[int] = []
@@ -244,6 +274,19 @@ def record_from_cycles(messages: Iterable[Any]) -> Record:
         experiment_id=str(run[-1].experiment_id),
         start=start_seconds(start),
     )
+
+
+def _check_cycle(message: Any) -> None:
+    lengths = {len(message.time), len(message.measurement), len(message.command)}
+    length = min(lengths)
+    # The cycle's own samples, and the one that begins the next.
+    if len(lengths) > 1 or not 0 <= int(message.lead_in) < length - 1:
+        raise RecordError(
+            f"cycle {int(message.index)} has {len(message.time)} times, "
+            f"{len(message.measurement)} measurements and {len(message.command)} commands, "
+            f"{int(message.lead_in)} of them before the cycle; expected as many of each, and at "
+            f"least two of the cycle"
+        )
 
 
 def fill_transfer_function(
@@ -324,11 +367,12 @@ def finding_from_message(message: Any) -> Finding:
     """Read what a `TransferFunction` message says of a running experiment.
 
     :param message: the message.
+    :raises ParameterError: if its numbers cannot be.
     """
     return Finding(
-        message.ultimate_gain,
-        message.ultimate_gain_std,
-        **{name: getattr(message, name) for name in _PREDICTED},
+        float(message.ultimate_gain),
+        float(message.ultimate_gain_std),
+        **{name: float(getattr(message, name)) for name in _PREDICTED},
     )
 
 
@@ -336,16 +380,63 @@ def transfer_function_from_message(message: Any) -> TransferFunction:
     """Read the model in a `TransferFunction` message.
 
     :param message: the message, of rclpy or decoded from a bag.
-    :raises ModelError: if its coefficients are no transfer function.
+    :raises ModelError: if its coefficients are no transfer function, or the arrays that tell how
+        sure it is do not go with its parameters.
     """
     from relay_autotune.process.transfer_function import TransferFunction
 
+    for of, names in _SHAPES.items():
+        count = len(getattr(message, of))
+        for name in names:
+            found = len(getattr(message, name))
+            expected = count * count if name == "covariance" else count
+            if found != expected:
+                raise ModelError(
+                    f"{name} of the model has {found} numbers, expected {expected}: one for each "
+                    f"of {of}"
+                )
+    for name in ("std", "point_std", "combination_std"):
+        if any(value < 0.0 for value in getattr(message, name)):
+            raise ModelError(f"{name} of the model has a negative number, expected >= 0 or NaN")
+    if max(len(message.numerator), len(message.denominator)) > _MOST_COEFFICIENTS:
+        raise ModelError(
+            f"the model has {len(message.numerator)} and {len(message.denominator)} "
+            f"coefficients, expected {_MOST_COEFFICIENTS} at most"
+        )
     return TransferFunction.from_polynomials(
         tuple(float(c) for c in message.numerator),
         tuple(float(c) for c in message.denominator),
         dead_time=float(message.dead_time),
         structure=str(message.structure) or "general",
     )
+
+
+def gains_from_message(message: Any) -> Gains:
+    """Read the gains in a `PidGains` message.
+
+    :param message: the message, of rclpy or decoded from a bag.
+    :raises TuningError: if they cannot be, or its two forms contradict each other.
+    """
+    from relay_autotune.control.gains import NUMBERS, Gains
+
+    parallel = ("p", "i", "d")
+    numbers = {name: float(getattr(message, name)) for name in NUMBERS}
+    gains = Gains(
+        **{name: value for name, value in numbers.items() if name not in parallel},
+        rule=str(message.rule),
+        form=str(message.form),
+        reason=str(message.reason),
+        warnings=tuple(str(text) for text in message.warnings),
+    )
+    for name in parallel:
+        told, follows = numbers[name], getattr(gains, name)
+        # Who writes gains by hand may leave the other form out.
+        if any(numbers[n] for n in parallel) and not abs(told - follows) <= _SAME * abs(follows):
+            raise TuningError(
+                f"{name} of the gains is {told:g}, but kc, ti and td make it {follows:g}: the two "
+                f"forms contradict each other"
+            )
+    return gains
 
 
 def fill_gains(
@@ -365,7 +456,7 @@ def fill_gains(
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
     """
     # A relay_node, which has no gains, need not load what computes them.
-    from relay_autotune.tuning.gains import NUMBERS
+    from relay_autotune.control.gains import NUMBERS
 
     set_stamp(message.header.stamp, stamp_ns)
     message.experiment_id = experiment_id
@@ -376,6 +467,28 @@ def fill_gains(
     message.warnings = [str(text) for text in gains.warnings]
     for name in NUMBERS:
         setattr(message, name, float(getattr(gains, name)))
+
+
+def without_impossible(message: Any) -> list[str]:
+    """Empty the model and the gains of a result or feedback of `Tune` where they cannot be.
+
+    :param message: of the action; changed in place.
+    :returns: a sentence for each part that was emptied.
+    """
+    said = []
+    for name, read in (
+        ("transfer_function", transfer_function_from_message),
+        ("gains", gains_from_message),
+    ):
+        part = getattr(message, name, None)
+        if part is None or not part.experiment_id:
+            continue
+        try:
+            read(part)
+        except RelayAutotuneError as error:
+            setattr(message, name, type(part)())
+            said.append(f"{name} refused: {error}")
+    return said
 
 
 def _column(values: Any) -> FloatArray:

@@ -11,8 +11,8 @@ from relay_autotune.exchange.text import digits, process_mathml
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
+    from relay_autotune.control.gains import Gains
     from relay_autotune.identification import Identification
-    from relay_autotune.tuning.gains import Gains
 
 
 def analysis_html(analysis: Analysis) -> str:

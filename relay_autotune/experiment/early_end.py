@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from relay_autotune.confidence import NORMAL_95
+from relay_autotune.errors import ParameterError
 
 ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)
 _NAMES = {ULTIMATE_GAIN: "K_u", MS: "the predicted Ms"}
 
+# No loop has a smaller Ms than 1; what is below by rounding is not refused.
+_LEAST_MS = 1.0 - 1e-6
 # Nothing is concluded before the first half cycle.
 _LEAST_SWITCHES = 2
 # From one look to the next, the time since the kick grows by no less and no more. In between,
@@ -51,7 +54,8 @@ class Finding:
     :param ultimate_gain_std: its standard deviation [u/y].
     :param ms: Ms that the gains designed on the model would have.
     :param ms_low: lower end of its 95 % interval.
-    :param ms_high: upper end.
+    :param ms_high: upper end; inf: some of the loops would be unstable.
+    :raises ParameterError: if a number cannot be what it says.
     """
 
     ultimate_gain: float = math.nan
@@ -59,6 +63,22 @@ class Finding:
     ms: float = math.nan
     ms_low: float = math.nan
     ms_high: float = math.nan
+
+    def __post_init__(self) -> None:
+        problem = ""
+        if math.isinf(self.ultimate_gain):
+            problem = f"K_u is {self.ultimate_gain:g}, expected a finite number"
+        elif self.ultimate_gain_std < 0.0:
+            problem = f"the standard deviation of K_u is {self.ultimate_gain_std:g}, expected >= 0"
+        elif self.ms < _LEAST_MS or math.isinf(self.ms):
+            problem = f"the predicted Ms is {self.ms:g}, expected a finite number of at least 1"
+        elif self.ms_low > self.ms_high or self.ms_low < _LEAST_MS:
+            problem = (
+                f"the predicted Ms is between {self.ms_low:g} and {self.ms_high:g}, expected two "
+                "numbers of at least 1, the lower one first"
+            )
+        if problem:
+            raise ParameterError(f"{problem}: nothing is concluded from it")
 
     def width(self, sought: str) -> float:
         """Return half the width of a 95 % interval over the value; NaN: not estimated.

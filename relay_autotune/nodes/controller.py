@@ -13,10 +13,10 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
 from relay_autotune.control.controller import PidController
+from relay_autotune.control.gains import Controller, Gains
 from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step
-from relay_autotune.errors import ParameterError, RelayAutotuneError
-from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.errors import ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -24,12 +24,13 @@ from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop
+from relay_autotune.nodes.results import Results
 from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Controller
+from relay_autotune.tuning.loop.analysis import is_stable
 from relay_autotune_msgs.action import Verify
-from relay_autotune_msgs.msg import PidGains
+from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 
@@ -47,7 +48,10 @@ class ControllerNode(ServedNode):
         values = values_of(self, (*GAINS, *OTHERS, *FIXED))
         require_own_time(values["sample_period"], values["repeat_period"])
         self._gains = gains_from(values)
-        self._pending: Any = None
+        self._results = Results(self, is_stable)
+        # The experiment that gains are of, and the gains.
+        self._pending: tuple[str, Gains] | None = None
+        self._applying = False
         self._previous: Controller | None = None
         self._model: TransferFunction | None = None
         self._limits = limits_from(values)
@@ -100,6 +104,9 @@ class ControllerNode(ServedNode):
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
         self.create_subscription(Bool, "hold_request", self._on_hold, quality.RESULT)
+        self.create_subscription(
+            RelayExperiment, "relay_experiment", self._on_experiment, quality.RESULT
+        )
         self.create_subscription(PidGains, "pi_gains", self._on_gains, quality.RESULT)
         self.create_subscription(ModelMessage, "transfer_function", self._on_model, quality.RESULT)
         self.create_service(Trigger, "~/apply", self._on_apply)
@@ -185,29 +192,46 @@ class ControllerNode(ServedNode):
     def _on_gains(self, message: Any) -> None:
         if not message.final:
             return
-        try:
-            controller_from(message)
-        except RelayAutotuneError as error:
-            self.get_logger().error(f"gains that cannot be: {error}")
+        gains = self._results.gains(message)
+        if gains is None:
             return
-        self._pending = message
-        if self.get_parameter("auto_apply").value:
-            self.executor.create_task(self._apply_and_tell)
-        else:
+        self._pending = (message.experiment_id, gains)
+        if not self.get_parameter("auto_apply").value:
             self.get_logger().info(
-                f"gains of {message.experiment_id} wait: {said(controller_from(message))}; call "
+                f"gains of {message.experiment_id} wait: {said(gains)}; call "
                 f"{self.get_fully_qualified_name()}/apply or /discard"
             )
+        self._apply_by_itself()
 
     def _on_model(self, message: Any) -> None:
-        if message.final:
-            try:
-                self._model = transfer_function_from_message(message)
-            except RelayAutotuneError as error:
-                self.get_logger().error(f"a model that cannot be: {error}")
+        if not message.final:
+            return
+        model = self._results.model(message)
+        if model is not None:
+            self._model = model
+            self._apply_by_itself()
+
+    def _on_experiment(self, message: Any) -> None:
+        self._results.experiment(message)
+        self._apply_by_itself()
+
+    def _apply_by_itself(self) -> None:
+        """Apply gains where that is wanted, once record and model of their experiment are here."""
+        if self._pending is None or not self.get_parameter("auto_apply").value:
+            return
+        name, gains = self._pending
+        doubt = self._results.doubt(name, gains)
+        if doubt:
+            self._results.refusals.say("to apply gains by itself", name, TuningError(doubt))
+        elif not self._applying:
+            self._applying = True
+            self.executor.create_task(self._apply_and_tell)
 
     async def _apply_and_tell(self) -> None:
-        done, reason = await self._apply()
+        try:
+            done, reason = await self._apply()
+        finally:
+            self._applying = False
         # A line of code has one severity; with another one the logger raises.
         if done:
             self.get_logger().info(reason)
@@ -215,21 +239,26 @@ class ControllerNode(ServedNode):
             self.get_logger().error(reason)
 
     async def _apply(self) -> tuple[bool, str]:
-        message = self._pending
-        if message is None:
+        if self._pending is None:
             return False, "no gains wait to be applied"
+        name, gains = self._pending
         if self._verifier.is_running:
             return False, "a verification is running; wait for its end"
+        try:
+            # The record may have come after the gains.
+            self._results.check(name, gains)
+        except RelayAutotuneError as error:
+            return False, f"the gains of {name} are refused: {error}"
         if self._remote is not None:
             try:
-                await self._remote.apply(message)
+                await self._remote.apply(gains)
             except RelayAutotuneError as error:
                 return False, str(error)
             self._pending = None
-            return True, f"{self._remote.target} has the gains of {message.experiment_id}"
+            return True, f"{self._remote.target} has the gains of {name}"
         self._previous = self._gains
         self._pending = None
-        self._use(controller_from(message))
+        self._use(gains)
         return True, f"{said(self._gains)} in force; the gains before are kept for ~/revert"
 
     async def _on_apply(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -357,17 +386,6 @@ def gains_from(values: dict[str, Any]) -> Controller | None:
     if values["kc"] == 0.0:
         return None
     return Controller(**{name: values[name] for name in ("kc", "ti", "td", "tf", "b")})
-
-
-def controller_from(message: Any) -> Controller:
-    """Return the gains of a message.
-
-    :param message: the `PidGains`.
-    :raises RelayAutotuneError: if they cannot be.
-    """
-    return Controller(
-        **{name: float(getattr(message, name)) for name in ("kc", "ti", "td", "tf", "b")}
-    )
 
 
 def limits_from(values: dict[str, Any]) -> Limits:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 
 from relay_autotune.analysis import Analysis, analyse, analyse_jointly, check_names
 from relay_autotune.errors import RelayAutotuneError
@@ -27,6 +30,7 @@ from relay_autotune.nodes.design_parameters import DESIGN_PARAMETERS, options_fr
 from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
+from relay_autotune.nodes.results import Refusals
 from relay_autotune.nodes.signs_of_life import SignsOfLife
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.tuning import DEFAULT_RULE, RULES
@@ -52,11 +56,29 @@ PARAMETERS = (
 CYCLE_DEPTH = 1000
 
 
+# Requests of ~/identify that may wait; each takes seconds.
+_MOST_WAITING = 10
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Something to compute beside the callbacks, and who takes what came of it.
+
+    :param work: computes it, in another thread; it must not touch the node.
+    :param taken: takes what it returned or raised, as a callback of the node.
+    """
+
+    work: Callable[[], Analysis]
+    taken: Callable[[Any], None]
+
+
 class IdentifierNode(ServedNode):
     """Fits a model at each cycle, and model and gains at the end of an experiment.
 
-    A message only notes what is to be done. The fit follows once no message waits any more, so
-    that of several cycles that came during a fit only the newest one leads to another.
+    A message only notes what is to be done. Fits are computed beside the callbacks, one at a time:
+    first those of whole records, in the order in which they came, then that of the experiment that
+    runs, once no message waits any more, so that of several cycles that came during a fit only the
+    newest one leads to another.
     """
 
     def __init__(self) -> None:
@@ -67,9 +89,12 @@ class IdentifierNode(ServedNode):
         self._ended = ""
         # The method li takes the last two experiments together.
         self._earlier: Record | None = None
-        self._fit_asked_for = False
+        self._waiting: deque[_Fit] = deque()
+        self._is_fitting = self._is_asked = False
+        self._cycles_are_new = False
         self._progress: Any = None
         self._running, self._running_fit = "", RunningFit()
+        self._refusals = Refusals(self)
         self._signs = SignsOfLife(self)
         self._models = self.create_publisher(TransferFunction, "transfer_function", quality.RESULT)
         self._gains = self.create_publisher(PidGains, "pi_gains", quality.RESULT)
@@ -89,6 +114,8 @@ class IdentifierNode(ServedNode):
             f"go to {self._models.topic_name} and {self._gains.topic_name}"
         )
 
+    # What comes.
+
     def _on_cycle(self, message: Any) -> None:
         if message.experiment_id in (self._ended, self._running):
             # It has ended, or its progress tells more than its cycles.
@@ -97,9 +124,10 @@ class IdentifierNode(ServedNode):
             self._cycles_of = message.experiment_id
             self._cycles.clear()
         self._cycles[int(message.index)] = message
-        if not self._fit_asked_for:
-            self._fit_asked_for = True
-            self.defer_until_idle(self._fit_cycles)
+        while len(self._cycles) > CYCLE_DEPTH:
+            self._cycles.pop(next(iter(self._cycles)))
+        self._cycles_are_new = True
+        self._look()
 
     def _on_progress(self, message: Any) -> None:
         """Take an experiment that is under way, to be fitted once nothing else waits."""
@@ -107,87 +135,45 @@ class IdentifierNode(ServedNode):
             return
         if message.experiment_id != self._running:
             self._running, self._running_fit = message.experiment_id, RunningFit()
-        waiting, self._progress = self._progress, message
-        if waiting is None:
-            self.defer_until_idle(self._fit_progress)
-
-    def _fit_progress(self) -> None:
-        message, self._progress = self._progress, None
-        if message is None or message.experiment_id == self._ended:
-            return
-        try:
-            record = record_from_message(message)
-        except RelayAutotuneError as error:
-            self.get_logger().warning(f"progress of {message.experiment_id}: {error}")
-            return
-        analysis = self._guarded(
-            record,
-            partial(self._running_fit.fit, record, self._task(), *_sought(message)),
-        )
-        if analysis is not None and analysis.model is not None:
-            self._publish_model(analysis, final=False)
-
-    def _fit_cycles(self) -> None:
-        self._fit_asked_for = False
-        if not self._cycles:
-            return
-        try:
-            record = record_from_cycles(self._cycles.values())
-        except RelayAutotuneError as error:
-            self.get_logger().warning(f"cycles of {self._cycles_of} cannot be used: {error}")
-            return
-        analysis = self._analyse(record, final=False)
-        if analysis is not None and analysis.model is not None:
-            self._publish_model(analysis, final=False)
+        self._progress = message
+        self._look()
 
     def _on_experiment(self, message: Any) -> None:
-        self._ended = message.experiment_id
+        name = self._ended = message.experiment_id
         self._cycles.clear()
-        with self._signs.working_on(self._ended):
-            lacking = self._identify_whole(message)
-        self._signs.done(self._ended, lacking)
-
-    def _identify_whole(self, message: Any) -> str:
-        """Publish model and gains of an experiment; return why one of them does not come."""
         try:
             record = record_from_message(message)
         except RelayAutotuneError as error:
-            self.get_logger().error(f"experiment {self._ended} cannot be used: {error}")
-            return f"the experiment cannot be used: {error}"
-        analysis = self._analyse(record, final=True)
-        if analysis is None:
-            return "the experiment could not be analysed; the log of identifier_node says why"
-        if analysis.model is not None:
-            self._publish_model(analysis, final=True)
-        gains = analysis.best_gains
-        if gains is None:
-            self.get_logger().warning(f"experiment {self._ended}: {analysis.reason}")
-            return analysis.reason
-        message = PidGains()
-        fill_gains(
-            message, gains, experiment_id=record.experiment_id, stamp_ns=_last_stamp(record)
-        )
-        self._gains.publish(message)
-        self.get_logger().info(
-            f"experiment {self._ended}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
-            f"ti {gains.ti:.6g} s, td {gains.td:.6g} s"
-        )
-        return ""
+            self._refusals.say("the record", name, error)
+            self._signs.done(name, f"the experiment cannot be used: {error}")
+            return
+        self._signs.work_on(name)
+        self._wait_for(_Fit(self._whole(record), partial(self._identified, name)))
 
-    def _on_identify(self, request: Any, response: Any) -> Any:
+    async def _on_identify(self, request: Any, response: Any) -> Any:
         """Answer with every method's model and every rule's gains for a record."""
         values = values_of(self, PARAMETERS)
+        if len(self._waiting) >= _MOST_WAITING:
+            response.reason = f"{_MOST_WAITING} other records wait: ask again later"
+            return response
         try:
             record = record_from_message(request.experiment)
-            found = analyse(
+            work = partial(
+                analyse,
                 record,
                 method=request.method or values["method"],
                 rule=request.rule or values["rule"],
                 known=known_from(values),
                 options=options_from(values),
             )
-        except Exception as error:  # noqa: BLE001  one bad record must not end the node
-            response.reason = str(error) or type(error).__name__
+        except RelayAutotuneError as error:
+            response.reason = str(error)
+            return response
+        done: Future = Future(executor=self.executor)
+        self._wait_for(_Fit(work, done.set_result))
+        found = await done
+        if isinstance(found, Exception):
+            response.reason = str(found) or type(found).__name__
             return response
         name, stamp = record.experiment_id, _last_stamp(record)
         response.success, response.reason = found.model is not None, found.reason
@@ -205,28 +191,105 @@ class IdentifierNode(ServedNode):
         response.recommended = found.recommended or 0
         return response
 
+    # One fit at a time.
+
+    def _wait_for(self, fit: _Fit) -> None:
+        self._waiting.append(fit)
+        self._look()
+
+    def _look(self) -> None:
+        """Begin a fit once no message waits any more, unless one is being computed."""
+        if not (self._is_fitting or self._is_asked):
+            self._is_asked = True
+            self.defer_until_idle(self._begin)
+
+    def _begin(self) -> None:
+        self._is_asked = False
+        fit = self._waiting.popleft() if self._waiting else self._of_running()
+        if fit is None:
+            return
+        self._is_fitting = True
+
+        def taken(found: Any) -> None:
+            self._is_fitting = False
+            try:
+                fit.taken(found)
+            finally:
+                self._look()
+
+        self.compute(fit.work, taken)
+
+    def _of_running(self) -> _Fit | None:
+        """Return the fit of the experiment that runs, None if there is nothing new."""
+        progress, self._progress = self._progress, None
+        try:
+            if progress is not None and progress.experiment_id != self._ended:
+                record = record_from_message(progress)
+                fit = self._running_fit.fit
+                work = partial(fit, record, self._task(), *_sought(progress))
+                return _Fit(work, partial(self._fitted, record.experiment_id))
+            new, self._cycles_are_new = self._cycles_are_new, False
+            if new and self._cycles:
+                record = record_from_cycles(self._cycles.values())
+                work = partial(analyse, record, final=False, **vars(self._task()))
+                return _Fit(work, partial(self._fitted, record.experiment_id))
+        except RelayAutotuneError as error:
+            what = "the cycles" if progress is None else "the progress"
+            name = self._cycles_of if progress is None else progress.experiment_id
+            self._refusals.say(what, name, error)
+        return None
+
+    def _whole(self, record: Record) -> Callable[[], Analysis]:
+        """Return what analyses the record of an experiment that has ended."""
+        earlier, asked = self._earlier, vars(self._task())
+        if record.outcome == Outcome.COMPLETED:
+            self._earlier = record
+        if asked["method"] in ONLY_JOINT and earlier is not None:
+            return partial(analyse_jointly, (record, earlier), **asked)
+        return partial(analyse, record, final=True, **asked)
+
+    # What came of it.
+
+    def _fitted(self, name: str, found: Any) -> None:
+        """Publish the model of an experiment that runs, unless it has ended meanwhile."""
+        analysis = self._analysis(name, found)
+        if name != self._ended and analysis is not None and analysis.model is not None:
+            self._publish_model(analysis, final=False)
+
+    def _identified(self, name: str, found: Any) -> None:
+        """Publish model and gains of an experiment, and why one of them does not come."""
+        self._signs.done(name, self._published(name, self._analysis(name, found)))
+
+    def _published(self, name: str, analysis: Analysis | None) -> str:
+        if analysis is None:
+            return "the experiment could not be analysed; the log of identifier_node says why"
+        if analysis.model is not None:
+            self._publish_model(analysis, final=True)
+        gains, record = analysis.best_gains, analysis.record
+        if gains is None:
+            self.get_logger().warning(f"experiment {name}: {analysis.reason}")
+            return analysis.reason
+        message = PidGains()
+        fill_gains(message, gains, experiment_id=name, stamp_ns=_last_stamp(record))
+        self._gains.publish(message)
+        self.get_logger().info(
+            f"experiment {name}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
+            f"ti {gains.ti:.6g} s, td {gains.td:.6g} s"
+        )
+        return ""
+
+    def _analysis(self, name: str, found: Any) -> Analysis | None:
+        # One bad record must not end the node.
+        if isinstance(found, Analysis):
+            return found
+        self.get_logger().error(
+            f"experiment {name} could not be analysed: {type(found).__name__}: {found}"
+        )
+        return None
+
     def _task(self) -> Task:
         values = values_of(self, PARAMETERS)
         return Task(values["method"], values["rule"], known_from(values), options_from(values))
-
-    def _analyse(self, record: Record, *, final: bool) -> Analysis | None:
-        earlier = self._earlier
-        if final and record.outcome == Outcome.COMPLETED:
-            self._earlier = record
-        asked = vars(self._task())
-        if final and asked["method"] in ONLY_JOINT and earlier is not None:
-            return self._guarded(record, partial(analyse_jointly, (record, earlier), **asked))
-        return self._guarded(record, partial(analyse, record, final=final, **asked))
-
-    def _guarded(self, record: Record, analysis: Callable[[], Analysis]) -> Analysis | None:
-        try:
-            return analysis()
-        except Exception as error:  # noqa: BLE001  one bad record must not end the node
-            self.get_logger().error(
-                f"experiment {record.experiment_id} could not be analysed: "
-                f"{type(error).__name__}: {error}"
-            )
-            return None
 
     def _publish_model(self, analysis: Analysis, *, final: bool) -> None:
         identification = analysis.model
@@ -243,7 +306,7 @@ class IdentifierNode(ServedNode):
         self._models.publish(message)
         if final:
             self.get_logger().info(
-                f"experiment {self._ended}: {identification.structure} by "
+                f"experiment {analysis.record.experiment_id}: {identification.structure} by "
                 f"{identification.method}, gain {identification.model.gain:.6g}, "
                 f"dead time {identification.model.dead_time:.6g} s"
             )

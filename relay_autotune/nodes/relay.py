@@ -17,7 +17,6 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.exchange.messages import finding_from_message
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, SafePolicy
 from relay_autotune.experiment.parameters import ExperimentParameters
@@ -44,6 +43,7 @@ from relay_autotune.nodes.reports import (
     experiment_message,
     state_values,
 )
+from relay_autotune.nodes.results import OwnResults
 from relay_autotune.nodes.session import Session
 from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
 from relay_autotune.nodes.signs_of_life import said_by
@@ -108,6 +108,7 @@ class RelayNode(ServedNode):
             # With /clock, the time of a sample comes by another callback.
             self.favoured = self._ends.measurement
         self._recordings = Recordings(self, self._ends.recorded())
+        self._results = OwnResults(self)
         self.create_service(StartTune, "~/start_tune", self._on_start)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self._action = TuneAction(self, self._request, partial(self._stop_now, "cancelled"))
@@ -293,15 +294,21 @@ class RelayNode(ServedNode):
 
     def _on_result(self, name: str, message: Any) -> None:
         session = self._session
-        self._action.note(name, message)
+        running = session is not None and message.experiment_id == session.id
         now = int(self.get_clock().now().nanoseconds)
-        self._recordings.message(message.experiment_id, name, now, message)
-        if session is None or name != "transfer_function" or message.experiment_id != session.id:
+        taken = self._results.take(name, message, running)
+        for topic, found in taken:
+            self._action.note(topic, found)
+            self._recordings.message(found.experiment_id, topic, now, found)
+        if session is None or not running or not taken:
+            return
+        finding = self._results.finding(message, session.experiment, self._on_setpoint)
+        if finding is None:
             return
         self._action.tell(session.experiment)
         if session.early is None:
             return
-        if reason := session.early.judge(session.experiment, finding_from_message(message)):
+        if reason := session.early.judge(session.experiment, finding):
             self._send_safe(command := session.experiment.conclude(reason))
             self._leave(session, command)
 
@@ -344,6 +351,8 @@ class RelayNode(ServedNode):
         self._alarm = "" if completed else self._summary
         self.get_logger().info(f"tune {session.id} {outcome}: {experiment.reason}")
         self._publish_diagnostics()
+        if session.sample_count:
+            self._results.experiment(message)
         self._recordings.message(session.id, "relay_experiment", session.now_ns(), message)
         self._action.tell(experiment)
 

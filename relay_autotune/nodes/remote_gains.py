@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import ParameterError, RelayAutotuneError
-from relay_autotune.tuning.gains import Controller
 
 # What may be sent, by the names of the gains in both forms.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
@@ -113,10 +112,10 @@ class RemoteGains:
         values = await self.read()
         return controller_of({name: values[target] for name, target in self._mapping.items()})
 
-    async def write(self, gains: Any) -> dict[str, float]:
+    async def write(self, gains: Controller) -> dict[str, float]:
         """Set the parameters, read them back, and undo all if one is not as it was set.
 
-        :param gains: what has the attributes of `NAMES`.
+        :param gains: the gains.
         :return: the values before, by parameter name.
         :raises RemoteError: if the gains are not in force; then the ones before are.
         """

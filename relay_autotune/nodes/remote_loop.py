@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.remote_gains import RemoteGains
 from relay_autotune.nodes.verifier import NotVerifiable
-from relay_autotune.tuning.gains import Controller
 
 
 class RemoteLoop:
@@ -53,13 +52,13 @@ class RemoteLoop:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
 
-    async def apply(self, message: Any) -> None:
+    async def apply(self, gains: Controller) -> None:
         """Set gains, all or none, and keep those before.
 
-        :param message: what has the attributes of `NAMES`.
+        :param gains: the gains.
         :raises RelayAutotuneError: if they are not in force.
         """
-        self._before = await self._gains.write(message)
+        self._before = await self._gains.write(gains)
 
     async def revert(self) -> tuple[bool, str]:
         """Bring back the gains before; return whether they are, and a sentence."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 
@@ -22,7 +21,7 @@ _WORKING, _DONE = "working", "done"
 
 
 class SignsOfLife:
-    """Publish which experiment is worked on, from a thread, since a fit keeps the node busy.
+    """Publish which experiments are worked on.
 
     :param node: identifier_node.
     """
@@ -35,27 +34,23 @@ class SignsOfLife:
             quality.RESULT,
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
         )
+        self._working: list[str] = []
+        self._timer = node.create_timer(
+            EVERY, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
+        )
 
-    @contextmanager
-    def working_on(self, experiment_id: str) -> Iterator[None]:
+    def work_on(self, experiment_id: str) -> None:
         """Give signs of life until the work is done.
 
         :param experiment_id: what is worked on.
         """
-        done = threading.Event()
-
-        def tell() -> None:
-            while not done.wait(EVERY):
-                self._publish(experiment_id, _WORKING, "")
-
+        self._working.append(experiment_id)
         self._publish(experiment_id, _WORKING, "")
-        thread = threading.Thread(target=tell, name="signs of life", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
+        self._timer.reset()
+
+    def _tell(self) -> None:
+        for experiment_id in self._working:
+            self._publish(experiment_id, _WORKING, "")
 
     def done(self, experiment_id: str, lacking: str) -> None:
         """Tell that no more will come of an experiment.
@@ -63,6 +58,10 @@ class SignsOfLife:
         :param experiment_id: its id.
         :param lacking: why there is no model or are no gains; empty: both have been published.
         """
+        if experiment_id in self._working:
+            self._working.remove(experiment_id)
+        if not self._working:
+            self._timer.cancel()
         self._publish(experiment_id, _DONE, lacking)
 
     def _publish(self, experiment_id: str, state: str, reason: str) -> None:

@@ -21,7 +21,7 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import LoopError, ParameterError
-from relay_autotune.exchange.messages import record_from_message
+from relay_autotune.exchange.messages import record_from_message, without_impossible
 from relay_autotune.nodes import quality
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
@@ -66,6 +66,8 @@ class TuneClient:
         self._goal: Any = None
         self._answer: Any = None
         self._seen = time.monotonic()
+        self.refused: set[str] = set()
+        """What came and could not be, each a sentence."""
 
     def __enter__(self) -> TuneClient:
         return self
@@ -142,7 +144,9 @@ class TuneClient:
     def news(self) -> list[Any]:
         """Return the feedback that has come since the last call."""
         news, self._feedback[:] = list(self._feedback), []
-        return news
+        for feedback in news:
+            self.refused.update(without_impossible(feedback))
+        return [feedback for feedback in news if feedback.state <= Tune.Feedback.STATE_FAILED]
 
     def cancel(self) -> None:
         """Ask for the end of the tune."""
@@ -154,8 +158,11 @@ class TuneClient:
 
     @property
     def result(self) -> Any:
-        """The `Tune.Result`."""
-        return self._answer.result().result
+        """The `Tune.Result`, without a model or gains that cannot be."""
+        result = self._answer.result().result
+        self.refused.update(without_impossible(result))
+        result.outcome = min(result.outcome, Tune.Result.FAILED)
+        return result
 
     @property
     def succeeded(self) -> bool:

@@ -16,6 +16,8 @@ FloatArray = NDArray[np.float64]
 # Slopes that differ by less, as a share of the steepest, are rounding.
 _STRAIGHT = 1e-12
 IntArray = NDArray[np.int64]
+# No quantity of a process is larger, and the squares of smaller ones can be added.
+LARGEST = 1e152
 
 
 class Outcome(enum.IntEnum):
@@ -234,7 +236,8 @@ class Record:
         ``command`` and ``command_time`` say.
     :param continuous_command: True: the command moved along straight lines from one of its
         instants to the next, as an analogue controller's does; False: it was held.
-    :raises RecordError: if shapes differ, a value is not finite, or the time goes backwards.
+    :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
+        goes backwards, or the noise is negative.
     """
 
     time: FloatArray
@@ -268,9 +271,11 @@ class Record:
             "command_time": _as_column("command_time", sent, n),
         }
         for name, column in columns.items():
-            if not bool(np.all(np.isfinite(column))):
-                where = int(np.flatnonzero(~np.isfinite(column))[0])
-                raise RecordError(f"{name}[{where}] of the record is {column[where]}, not finite")
+            wrong = np.flatnonzero(~(np.abs(column) <= LARGEST))
+            if wrong.size:
+                where, value = int(wrong[0]), float(column[wrong[0]])
+                what = f"beyond {LARGEST:g}" if math.isfinite(value) else "not finite"
+                raise RecordError(f"{name}[{where}] of the record is {value}, {what}")
             object.__setattr__(self, name, column)
         if bool(np.any(np.diff(time) < 0.0)):
             where = int(np.flatnonzero(np.diff(time) < 0.0)[0])
@@ -286,6 +291,11 @@ class Record:
                 f"cycle_start must hold increasing sample numbers below {n}, found {starts}"
             )
         object.__setattr__(self, "cycle_start", starts)
+        if self.noise_std < 0.0 or self.noise_std > LARGEST:
+            raise RecordError(
+                f"noise_std of the record is {self.noise_std:g}, expected a number from 0 to "
+                f"{LARGEST:g}, or NaN where it was not measured"
+            )
 
     def __len__(self) -> int:
         return int(self.time.size)

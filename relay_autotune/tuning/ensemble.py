@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification, is_logarithmic
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.loop.margins import frequencies
 from relay_autotune.tuning.loop.stability import (
     at_infinity,

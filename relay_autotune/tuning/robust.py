@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
 from relay_autotune.tuning.candidates import NoiseLimit, Optimum
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.setpoint import with_setpoint_weight
 from relay_autotune.tuning.task import MS_RANGE, DesignOptions, DesignTask

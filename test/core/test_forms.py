@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
 from relay_autotune.tuning.forms import ParallelForm, SeriesForm, parallel_form, series_form
-from relay_autotune.tuning.gains import Controller
 
 S = 1j * np.geomspace(1e-3, 1e3, 25)
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from relay_autotune.control.gains import NUMBERS
 from relay_autotune.errors import RecordError
 from relay_autotune.exchange.messages import (
     fill_cycle,
@@ -30,7 +31,6 @@ from relay_autotune.identification.result import FitReport
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
-from relay_autotune.tuning.gains import NUMBERS
 
 SETTINGS = RelaySettings(
     setpoint=5.0,

@@ -8,10 +8,10 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 
 from relay_autotune.analysis import Analysis
+from relay_autotune.control.gains import Gains
 from relay_autotune.identification.result import with_uncertainty
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
-from relay_autotune.tuning.gains import Gains
 
 RECORD = Record(time=[0.0, 1.0], measurement=[0.0, 1.0], command=[0.0, 1.0])
 GAINS = Gains(

@@ -11,11 +11,11 @@ from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
 from relay_autotune.control.controller import GainBounds, PidController, run_loop
+from relay_autotune.control.gains import Controller
 from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step, compare, describe, plan
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Controller
 
 GAINS = Controller(kc=1.2, ti=2.0)
 PROCESS = TransferFunction.from_structure("fopdt", gain=1.5, time_constants=[2.0], dead_time=0.4)

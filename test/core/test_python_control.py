@@ -7,10 +7,10 @@ import sys
 import numpy as np
 import pytest
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import MissingPackageError, ModelError
 from relay_autotune.exchange.python_control import to_control
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Controller
 
 MODELS = [
     TransferFunction.fopdt(1.65, 20.0, 10.0),

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from action_msgs.msg import GoalStatus
 from loop_rig import LATCHED, RELIABLE, Rig
+from made_experiments import experiment_of
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
@@ -14,6 +15,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
 from relay_autotune.bag.reader import read_experiments
+from relay_autotune.process.transfer_function import TransferFunction as Process
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
@@ -29,6 +31,7 @@ PLANT = {
     "noise_std": 0.002,
     "seed": 5,
 }
+PROCESS = Process.fopdt(2.0, 0.8, 0.4)
 CONTROLLER = {
     "use_sim_time": True,
     "kc": 0.3,
@@ -137,11 +140,13 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
         verify_step=0.3,
         auto_apply=True,
     )
+    experiments = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
     gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
-    models.publish(
-        TransferFunction(final=True, numerator=[0.9], denominator=[0.8, 1.0], dead_time=0.4)
-    )
+    experiments.publish(experiment_of(PROCESS, "wrong"))
+    model = TransferFunction(final=True, numerator=[0.9], denominator=[0.8, 1.0], dead_time=0.4)
+    model.experiment_id = "wrong"
+    models.publish(model)
     gains.publish(PidGains(final=True, kc=0.9, ti=0.8, b=1.0, experiment_id="wrong"))
     rig.until(lambda: len(commands) > 400, "a closed loop")
     status, result = verify(rig)
@@ -182,7 +187,9 @@ rclpy.spin(node)
         return [v.double_value for v in answer.values]
 
     assert values() == [1.0, 1.0, 1.0]
-    gains.publish(PidGains(final=True, kc=2.0, ti=4.0, p=2.0, i=0.5, d=0.25, experiment_id="one"))
+    gains.publish(
+        PidGains(final=True, kc=2.0, ti=4.0, td=0.125, p=2.0, i=0.5, d=0.25, experiment_id="one")
+    )
     rig.until(lambda: "gains of one wait" in controller.log, "the gains")
     applied = rig.until(
         lambda: ((a := trigger(rig, "apply")).success and a) or None, "the other node"

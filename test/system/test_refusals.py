@@ -352,7 +352,7 @@ def test_the_identifier_survives_messages_that_make_no_sense(rig: Rig) -> None:
     backwards.measurement = backwards.command = [1.0, 1.0, 1.0]
     for message in (empty, nowhere, torn, backwards):
         publisher.publish(message)
-        said = f"experiment {message.experiment_id} cannot be used"
+        said = f"the record of {message.experiment_id} refused"
         rig.until(lambda said=said: said in identifier.log, said)
     assert identifier.running
     assert not models

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from relay_autotune.control.gains import Performance
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Performance
 from relay_autotune.tuning.loop.control_law import ControlLaw
 from relay_autotune.tuning.loop.margins import frequencies, margins, sensitivity_peaks
 from relay_autotune.tuning.loop.noise import noise_gain

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.control.sampled import filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.loop.control_law import ControlLaw
 from relay_autotune.tuning.loop.margins import frequencies
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
-from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.task import DesignTask
 
 

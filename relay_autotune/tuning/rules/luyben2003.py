@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.forms import SeriesForm
-from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.rules.applicability import named, process_of, wants_pid
 from relay_autotune.tuning.rules.resonance import resonant_gain
 from relay_autotune.tuning.task import DesignTask

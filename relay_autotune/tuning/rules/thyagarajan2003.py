@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from scipy.optimize import brentq
 
+from relay_autotune.control.gains import Controller
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.identification.methods.thyagarajan2003 import (
     dead_time_ratio,
@@ -23,7 +24,6 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
 )
 from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.gains import Controller
 from relay_autotune.tuning.rules.applicability import (
     fopdt_of,
     is_first_order,

@@ -145,6 +145,7 @@ class Performance:
     :param effort_load: total variation of the command after a unit step of the load.
     :param noise_gain: standard deviation of the command over that of white noise in the samples
         of the measurement; without a sampling period the largest gain at any frequency [u/y].
+    :raises TuningError: if a number is negative, or one that is always computed is NaN.
     """
 
     ms: float
@@ -161,7 +162,18 @@ class Performance:
     effort_load: float = math.nan
     noise_gain: float = math.nan
 
+    def __post_init__(self) -> None:
+        for name in _PREDICTED:
+            value = getattr(self, name)
+            if value < 0.0 or (math.isnan(value) and name in _ALWAYS):
+                raise TuningError(f"{name} of the gains is {value:g}, expected a number >= 0")
 
+
+_ALWAYS = ("ms", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load")
+_PREDICTED = (
+    *(*_ALWAYS, "gain_margin_low", "iae_setpoint", "overshoot", "settling_time"),
+    *("effort_setpoint", "effort_load", "noise_gain"),
+)
 # The numbers of gains, as messages, documents and files have them.
 NUMBERS = (
     *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
@@ -188,6 +200,10 @@ class Gains(Controller, Performance):
     reason: str
     form: str = "isa"
     warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        Controller.__post_init__(self)
+        Performance.__post_init__(self)
 
     @classmethod
     def of(

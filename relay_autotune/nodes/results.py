@@ -1,0 +1,241 @@
+"""What nodes take from the topics of results: checked, or refused with a reason.
+
+Any node of the network can publish a record, a model or gains. Here each becomes a checked object
+of the core and is compared with what is known of its experiment, before it ends, applies or stores
+anything.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+
+from relay_autotune.control.gains import Gains
+from relay_autotune.errors import ModelError, RelayAutotuneError, TuningError
+from relay_autotune.exchange.evidence import Evidence, check_finding
+from relay_autotune.exchange.messages import (
+    finding_from_message,
+    gains_from_message,
+    record_from_message,
+    transfer_function_from_message,
+)
+from relay_autotune.experiment.early_end import Finding
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
+
+# Experiments that are remembered, and reasons that are logged; somebody may send any number.
+_MOST = 8
+_MOST_REASONS = 50
+_TOO_SOON = "the experiment still runs, so that nothing final can be said of it"
+_NUMBER = re.compile(r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|\binf\b|\bnan\b)", re.IGNORECASE)
+
+
+class Refusals:
+    """Log why something is refused, once for each cause.
+
+    :param node: whose log is used.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._said: set[str] = set()
+
+    def say(self, what: str, experiment_id: str, error: RelayAutotuneError) -> None:
+        """Log a refusal, unless this cause was logged before.
+
+        :param what: is refused, such as ``gains``.
+        :param experiment_id: that it claims to be of.
+        :param error: why.
+        """
+        # The same fault with other numbers is the same cause.
+        cause = f"{what}: {_NUMBER.sub('#', str(error))}"
+        if cause in self._said or len(self._said) > _MOST_REASONS:
+            return
+        self._said.add(cause)
+        last = "" if len(self._said) <= _MOST_REASONS else "; further reasons are not logged"
+        self._node.get_logger().error(
+            f"{what} of {experiment_id or 'an experiment without id'} refused: {error} (others "
+            f"refused for the same reason are not logged){last}"
+        )
+
+
+class Results:
+    """Judge models and gains by the records of their experiments.
+
+    :param node: whose log tells refusals.
+    :param is_stable: tells whether gains make a stable loop with a model; None: it is not asked,
+        since what tells it takes long to load.
+    """
+
+    def __init__(
+        self, node: Node, is_stable: Callable[[Gains, TransferFunction], bool] | None = None
+    ) -> None:
+        self.refusals = Refusals(node)
+        self._is_stable = is_stable
+        self._evidence: dict[str, Evidence] = {}
+        self._models: dict[str, TransferFunction] = {}
+
+    def know(self, experiment: Record) -> None:
+        """Remember what a record tells; what comes later under its id changes nothing.
+
+        :param experiment: its record.
+        """
+        if experiment.experiment_id not in self._evidence:
+            _keep(self._evidence, experiment.experiment_id, Evidence.of(experiment))
+
+    def experiment(self, message: Any) -> None:
+        """Remember what the record of an experiment tells, if it is one.
+
+        :param message: the `RelayExperiment`.
+        """
+        try:
+            self.know(record_from_message(message))
+        except RelayAutotuneError as error:
+            self.refusals.say("the record", message.experiment_id, error)
+
+    def model(self, message: Any) -> TransferFunction | None:
+        """Return the model of a message, None if it is refused.
+
+        :param message: the `TransferFunction`.
+        """
+        name = message.experiment_id
+        try:
+            model = transfer_function_from_message(message)
+            if name in self._evidence:
+                self._evidence[name].check_model(model)
+        except RelayAutotuneError as error:
+            self.refusals.say("the model", name, error)
+            return None
+        if message.final:
+            _keep(self._models, name, model)
+        return model
+
+    def gains(self, message: Any) -> Gains | None:
+        """Return the gains of a message, None if they are refused.
+
+        Gains of an experiment that is not known, and of which no model has come, are taken: who
+        applies them by hand may know better. :meth:`doubt` tells of them.
+
+        :param message: the `PidGains`.
+        """
+        name = message.experiment_id
+        try:
+            gains = gains_from_message(message)
+            self.check(name, gains)
+        except RelayAutotuneError as error:
+            self.refusals.say("gains", name, error)
+            return None
+        return gains
+
+    def doubt(self, experiment_id: str, gains: Gains) -> str:
+        """Say why gains must not be applied by themselves; "" if they may.
+
+        :param experiment_id: that they are said to be of.
+        :param gains: as :meth:`gains` returned them.
+        """
+        if experiment_id not in self._evidence:
+            return "no record of their experiment has come"
+        if experiment_id not in self._models:
+            return "no model of their experiment has come"
+        try:
+            self.check(experiment_id, gains)
+        except RelayAutotuneError as error:
+            return str(error)
+        return ""
+
+    def check(self, experiment_id: str, gains: Gains) -> None:
+        """Refuse gains that contradict what is known of their experiment.
+
+        :param experiment_id: that they are said to be of.
+        :param gains: the gains.
+        :raises TuningError: if they do, or the experiment was not completed.
+        """
+        evidence = self._evidence.get(experiment_id)
+        if evidence is None:
+            return
+        evidence.require_completed()
+        model = self._models.get(experiment_id)
+        if model is None:
+            return
+        try:
+            # The model may have come before the record did.
+            evidence.check_model(model)
+        except ModelError as error:
+            raise TuningError(f"their model is refused: {error}") from error
+        evidence.check_gains(gains, model)
+        if self._is_stable is not None and not self._is_stable(gains, model):
+            raise TuningError(f"{gains} makes an unstable loop with the model of the experiment")
+
+
+class OwnResults(Results):
+    """Take results of the experiments of this node alone.
+
+    :param node: relay_node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(node)
+        # Gains that came before their model.
+        self._early: Any = None
+
+    def take(self, name: str, message: Any, running: bool) -> list[tuple[str, Any]]:
+        """Return the messages that may be stored, each with the name of its topic.
+
+        :param name: of the message's topic, ``transfer_function`` or ``pi_gains``.
+        :param message: the message.
+        :param running: True if its experiment still runs.
+        """
+        told = message.experiment_id
+        if name == "transfer_function":
+            if running and message.final:
+                self.refusals.say("the model", told, ModelError(_TOO_SOON))
+            elif self.model(message) is not None:
+                early, self._early = self._early, None
+                found = [(name, message)]
+                if early is not None and message.final:
+                    found += self.take("pi_gains", early, running)
+                return found
+        elif running:
+            self.refusals.say("gains", told, TuningError(_TOO_SOON))
+        elif message.final and told in self._evidence and told not in self._models:
+            self._early = message
+        elif self.gains(message) is not None:
+            return [(name, message)]
+        return []
+
+    def finding(
+        self, message: Any, experiment: RelayExperiment, on_setpoint: bool
+    ) -> Finding | None:
+        """Return what a model says of a running experiment, None if it is refused.
+
+        :param message: the `TransferFunction`.
+        :param experiment: that runs.
+        :param on_setpoint: True if its relay moves a set-point, so that its levels and its sign
+            are not those of the command.
+        """
+        sign, amplitude, relay = experiment.process_gain_sign, math.nan, math.nan
+        cycles, settings = experiment.cycles, experiment.settings
+        if on_setpoint:
+            sign = 0
+        elif cycles and settings is not None:
+            amplitude = 0.5 * (cycles[-1].peak_max - cycles[-1].peak_min)
+            relay = settings.amplitude
+        try:
+            found = finding_from_message(message)
+            check_finding(found, sign=sign, amplitude=amplitude, relay=relay)
+        except RelayAutotuneError as error:
+            self.refusals.say("the model", message.experiment_id, error)
+            return None
+        return found
+
+
+def _keep(known: dict[str, Any], name: str, value: Any) -> None:
+    known.pop(name, None)
+    known[name] = value
+    while len(known) > _MOST:
+        known.pop(next(iter(known)))

@@ -1,0 +1,39 @@
+"""Experiments as relay_node tells them, of a process that is simulated exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from relay_autotune.exchange.messages import fill_experiment
+from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
+from relay_autotune_msgs.msg import RelayExperiment
+
+
+def record_of(
+    process: TransferFunction,
+    experiment_id: str,
+    *,
+    outcome: Outcome = Outcome.COMPLETED,
+    bias: float = 0.0,
+    extra_delay: float = 0.0,
+    cycles: int = 6,
+) -> Record:
+    """Return the record of a relay experiment without noise."""
+    relay = RelaySettings(
+        5.0, 1.0, 0.5, bias, 0.05, extra_delay, reverse_acting=process.process_sign < 0
+    )
+    end = simulate_relay(process, relay, cycles=cycles).command.times[-1]
+    run = simulate_relay(process, relay, cycles=cycles, time=np.linspace(0.0, end, 300 * cycles))
+    return replace(run.record(), experiment_id=experiment_id, outcome=outcome)
+
+
+def experiment_of(process: TransferFunction, experiment_id: str, **options: Any) -> Any:
+    """Return the message of such an experiment."""
+    message = RelayExperiment()
+    fill_experiment(message, record_of(process, experiment_id, **options))
+    return message
