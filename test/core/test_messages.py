@@ -12,18 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.control.gains import NUMBERS
-from relay_autotune.errors import RecordError
+from relay_autotune.control.gains import NUMBERS, Gains
+from relay_autotune.errors import ModelError, RecordError, TuningError
 from relay_autotune.exchange.messages import (
     fill_cycle,
     fill_experiment,
     fill_gains,
     fill_transfer_function,
+    gains_from_message,
     record_from_cycles,
     record_from_message,
     start_nanoseconds,
     start_seconds,
     transfer_function_from_message,
+    without_impossible,
 )
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import Validation
@@ -234,3 +236,131 @@ def test_gains_are_written_field_by_field() -> None:
     fill_gains(message, gains, experiment_id="one")
     assert {name: getattr(message, name) for name in numbers} == numbers
     assert (message.rule, message.form, message.final) == ("itae", "isa", True)
+
+
+MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
+
+
+def model_message(**changes: Any) -> SimpleNamespace:
+    message = SimpleNamespace(header=header())
+    fill_transfer_function(message, identification(MODEL), experiment_id="one")
+    return SimpleNamespace(**(vars(message) | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"numerator": [math.nan]}, "finite"),
+        ({"denominator": []}, "finite coefficients"),
+        ({"denominator": [1.0] * 200}, "50 at most"),
+        ({"dead_time": -1.0}, "dead time"),
+        ({"dead_time": math.inf}, "finite"),
+        ({"std": [0.1]}, "std of the model has 1 numbers, expected 2"),
+        ({"covariance": [0.1] * 3}, "has 3 numbers, expected 4"),
+        ({"ci95_low": []}, "expected 2"),
+        ({"std": [0.1, -0.1]}, "negative"),
+        ({"point_real": [1.0, 2.0]}, "point_frequency"),
+        ({"combination_value": []}, "combinations"),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused(changes: dict[str, Any], said: str) -> None:
+    assert str(transfer_function_from_message(model_message())) == str(MODEL)
+    with pytest.raises(ModelError, match=said):
+        transfer_function_from_message(model_message(**changes))
+
+
+GAINS = Gains(
+    kc=0.6, ti=15.0, td=4.0, tf=0.4, b=0.5, ms=1.4, mt=1.1, gain_margin=3.6, phase_margin=0.9,
+    delay_margin=5.0, iae_load=20.0, rule="robust", ms_95=math.nan, reason="why",
+)  # fmt: skip
+
+
+def gains_message(**changes: Any) -> SimpleNamespace:
+    message = SimpleNamespace(header=header())
+    fill_gains(message, GAINS, experiment_id="one")
+    return SimpleNamespace(**(vars(message) | changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"kc": math.nan},
+        {"kc": 1e308},
+        {"kc": 0.0},
+        {"ti": math.inf},
+        {"ti": -1.0},
+        {"tf": -1e-9},
+        # Another node's controller gets these.
+        {"p": 1e308},
+        {"i": -1.0},
+        {"d": math.nan},
+        {"ms": math.nan},
+        {"gain_margin": -1.0},
+    ],
+)
+def test_gains_that_cannot_be_are_refused(changes: dict[str, Any]) -> None:
+    assert repr(gains_from_message(gains_message())) == repr(GAINS)
+    with pytest.raises(TuningError):
+        gains_from_message(gains_message(**changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("amplitude", -1.0),
+        ("amplitude", math.nan),
+        ("amplitude", 1e308),
+        ("hysteresis", -0.1),
+        ("extra_delay", math.inf),
+        ("sample_period", -1.0),
+        ("baseline", math.nan),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
+    message = empty_message()
+    fill_experiment(message, record())
+    setattr(message.settings, name, value)
+    with pytest.raises(RecordError, match=f"the relay's {name} is"):
+        record_from_message(message)
+
+
+@pytest.mark.parametrize("name", ["time", "measurement", "command", "receive_time"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e308])
+def test_samples_that_cannot_be_are_refused(name: str, value: float) -> None:
+    message = empty_message()
+    fill_experiment(message, record())
+    getattr(message, name)[3] = value
+    with pytest.raises(RecordError, match=rf"{name}\[3\]"):
+        record_from_message(message)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"lead_in": 2**32 - 1},
+        {"time": array.array("d", [0.0])},
+        {"command": array.array("d")},
+    ],
+)
+def test_a_cycle_whose_arrays_do_not_match_is_refused(change: dict[str, Any]) -> None:
+    messages = cycle_messages(record(), 0)
+    vars(messages[1]).update(change)
+    with pytest.raises(RecordError, match="cycle 1 has"):
+        record_from_cycles(messages)
+
+
+def test_what_cannot_be_is_taken_out_of_a_result() -> None:
+    good = SimpleNamespace(transfer_function=model_message(), gains=gains_message())
+    assert without_impossible(good) == []
+
+    class Empty(SimpleNamespace):
+        experiment_id = ""
+
+    bad = SimpleNamespace(
+        transfer_function=Empty(**vars(model_message(std=[]))),
+        gains=Empty(**vars(gains_message(kc=math.inf))),
+    )
+    said = without_impossible(bad)
+    assert [s.partition(" refused")[0] for s in said] == ["transfer_function", "gains"]
+    assert not vars(bad.transfer_function)
+    assert not vars(bad.gains)
