@@ -10,6 +10,7 @@ from collections.abc import Callable
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 
 # The guard looks so often [s], and at the graph every so many looks.
 LOOK_EVERY = 0.05
@@ -117,14 +118,58 @@ def second_publisher(node: Node, topic: str) -> str:
     """
     if node.count_publishers(topic) <= 1:
         return ""
-    me = (node.get_namespace(), node.get_name())
-    others = {
-        f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+    who = _publishers(node, topic)
+    mine = node.get_fully_qualified_name()
+    if mine in who:
+        who.remove(mine)
+    return f"{topic} is also published by {_named(who)}: two of them would fight for the actuator"
+
+
+def second_source(node: Node, subscription: Subscription) -> str:
+    """Return a sentence if a subscription hears several publishers, else "".
+
+    One of a type or a quality of service that does not fit is not heard.
+
+    :param node: the node.
+    :param subscription: one of its own.
+    """
+    count = subscription.get_publisher_count()
+    if count <= 1:
+        return ""
+    topic = subscription.topic_name
+    return (
+        f"{topic} is published by {count} publishers, {_named(_publishers(node, topic))}, "
+        f"expected one: the relay would act on a mixture; end what is left over (what was killed "
+        f"is forgotten after 20 s)"
+    )
+
+
+def namesake(node: Node) -> str:
+    """Return a sentence if another node has the node's own full name, else ""."""
+    mine = (node.get_name(), node.get_namespace())
+    count = node.get_node_names_and_namespaces().count(mine)
+    if count <= 1:
+        return ""
+    return (
+        f"{count} nodes have the name {node.get_fully_qualified_name()}, expected one: a "
+        f"call reaches any of them; end what is left over (what was killed is forgotten after "
+        f"20 s), or give it another name"
+    )
+
+
+def _publishers(node: Node, topic: str) -> list[str]:
+    """Return the full names of the nodes that publish a topic, each as often as it does."""
+    return [
+        # The node of an end is heard of a little later than the end.
+        "a node not known yet"
+        if _UNKNOWN in end.node_name
+        else f"{end.node_namespace.rstrip('/')}/{end.node_name}"
         for end in node.get_publishers_info_by_topic(topic)
-        if (end.node_namespace, end.node_name) != me and _UNKNOWN not in end.node_name
-    }
-    who = ", ".join(sorted(others)) or "another node"
-    return f"{topic} is also published by {who}: two of them would fight for the actuator"
+    ]
+
+
+def _named(names: list[str]) -> str:
+    return " and ".join(sorted(names)) or "another node"
 
 
 class Silence:

@@ -16,7 +16,14 @@ from std_msgs.msg import Bool, Float64
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.ends import Ends
-from relay_autotune.nodes.guard import FollowWatch, Guard, Silence, second_publisher
+from relay_autotune.nodes.guard import (
+    FollowWatch,
+    Guard,
+    Silence,
+    namesake,
+    second_publisher,
+    second_source,
+)
 from relay_autotune.nodes.handover import Handover
 from relay_autotune.nodes.readiness import NotReadyError
 
@@ -109,10 +116,12 @@ class LoopEnds:
         return self._silent
 
     def require_alone(self) -> None:
-        """Refuse a start while somebody else commands the actuator.
+        """Refuse a start while somebody else commands the actuator, or measures, or is called so.
 
         :raises NotReadyError: with who does; or with what a relay on the set-point lacks.
         """
+        if several := self._several():
+            raise NotReadyError(several)
         if self._ends.setpoint is not None and not self.is_connected:
             raise NotReadyError(
                 "relay_on is setpoint, but no controller_command comes: connect the controller of "
@@ -132,6 +141,13 @@ class LoopEnds:
                 "takeover"
             )
 
+    def _several(self) -> str:
+        """Return a sentence if there are two of what there may be one of, else ""."""
+        several = second_source(self._node, self._ends.measurement)
+        if not several and not self._takeover:
+            several = second_source(self._node, self._controller)
+        return several or namesake(self._node)
+
     def take(self, experiment: RelayExperiment, *, gives_back: bool) -> None:
         """Take the command for a tune.
 
@@ -143,7 +159,7 @@ class LoopEnds:
         self.commanded = math.nan
         if self._ends.setpoint is None:
             self.handover.take_over()
-        checks: list[Callable[[], str]] = []
+        checks = [self._guard.every_look_at_the_graph(self._several)]
         if not self._takeover:
             checks.append(
                 self._guard.every_look_at_the_graph(

@@ -80,7 +80,6 @@ class RelayNode(ServedNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._counter = Counter()
-        self._counted = False
         self._ahead = 0
         self._summary = "no tune yet"
         self._alarm = ""
@@ -246,8 +245,6 @@ class RelayNode(ServedNode):
         if not converged:
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
-        # Numbers of several publishers cannot be told apart.
-        self._counted = self._ends.measurement.get_publisher_count() == 1
         self._counter.begin()
         self._alarm = ""
         self._session = session
@@ -336,7 +333,7 @@ class RelayNode(ServedNode):
         if not self._on_setpoint:
             self._held, self._after = command, session.experiment.after_end
         self._session = None
-        session.lost_samples = self._counter.lost if self._counted else 0
+        session.lost_samples = self._lost()
         self._sensor.rest()
         self._loop.give_back(session.experiment, command)
         self.defer(partial(self._complete, session))
@@ -382,6 +379,11 @@ class RelayNode(ServedNode):
 
     # Telling.
 
+    def _lost(self) -> int:
+        # Numbers of several publishers cannot be told apart.
+        alone = self._ends.measurement.get_publisher_count() <= 1
+        return self._counter.lost if alone else 0
+
     def hold(self, command: float) -> None:
         """Answer each measurement with a command from now on."""
         self._held, self._after = command, None
@@ -396,7 +398,7 @@ class RelayNode(ServedNode):
         problems += filter(None, (self._recordings.problem(), self._loop.problem()))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
         running = "" if session is None else session.id
-        values = state_values(self._counter, session, idle=idle, counted=self._counted)
+        values = state_values(self._counter, session, idle=idle, lost=self._lost())
         summary = f"tune {running} is running" if running else self._summary
         now = int(self.get_clock().now().nanoseconds)
         message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)

@@ -101,14 +101,14 @@ class Counter:
 
 
 def state_values(
-    counter: Counter, session: Session | None, *, idle: str, counted: bool
+    counter: Counter, session: Session | None, *, idle: str, lost: int
 ) -> dict[str, object]:
     """Return the facts of relay_node for /diagnostics.
 
     :param counter: of the measurements.
     :param session: the tune that runs; None: none does.
     :param idle: what the node does while none runs.
-    :param counted: True if the publisher's numbers tell what was lost.
+    :param lost: samples that the middleware has lost during this tune.
     """
     values: dict[str, object] = {
         "state": idle,
@@ -124,6 +124,6 @@ def state_values(
         "cycles": experiment.cycle_count,
         "noise standard deviation": experiment.noise_std,
         "samples": session.sample_count,
-        "lost samples": counter.lost if counted else 0,
+        "lost samples": lost,
         "clock drift [s]": session.clocks.drift,
     }

@@ -1,16 +1,18 @@
-"""An actuator that tells its position, and when it counts as one that does not follow."""
+"""What is watched in a tune: an actuator that does not follow, and two where one may be."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
-from relay_autotune.nodes.guard import FollowWatch
+from relay_autotune.nodes.guard import FollowWatch, namesake, second_publisher, second_source
 
 LOW, HIGH = 0.5, 1.5
 TIMEOUT = 0.4
 EVERY = 0.01
+UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 
 def noticed(
@@ -74,3 +76,68 @@ def test_while_an_amplitude_is_found_no_distance_counts():
 
     at = noticed(position, stay, lambda: float("inf") if told[-1] < found else 0.25)
     assert found < at < found + 2.0 * TIMEOUT
+
+
+class Graph:
+    """What a node sees of the graph, in its place.
+
+    :param publishers: of a topic, each as namespace and name.
+    :param nodes: each as name and namespace.
+    """
+
+    topic_name = "/tank/level"
+
+    def __init__(self, publishers=(), nodes=(("relay_node", "/tank"),)) -> None:
+        self.publishers, self.nodes = publishers, nodes
+
+    def get_publisher_count(self) -> int:
+        return len(self.publishers)
+
+    def count_publishers(self, _: str) -> int:
+        return len(self.publishers)
+
+    def get_publishers_info_by_topic(self, topic: str):
+        assert topic == self.topic_name
+        return [SimpleNamespace(node_namespace=s, node_name=n) for s, n in self.publishers]
+
+    def get_node_names_and_namespaces(self):
+        return list(self.nodes)
+
+    def get_name(self) -> str:
+        return "relay_node"
+
+    def get_namespace(self) -> str:
+        return "/tank"
+
+    def get_fully_qualified_name(self) -> str:
+        return "/tank/relay_node"
+
+
+def test_two_sources_are_told_with_their_names():
+    assert second_source(Graph(), Graph()) == ""
+    assert second_source(one := Graph([("/tank", "sensor")]), one) == ""
+    both = Graph([("/tank", "sensor"), ("/", "old_sensor")])
+    assert "by 2 publishers, /old_sensor and /tank/sensor, expected one" in second_source(
+        both, both
+    )
+    same = Graph([("/tank", "sensor"), ("/tank", "sensor")])
+    assert "/tank/sensor and /tank/sensor" in second_source(same, same)
+    new = Graph([("/tank", "sensor"), (UNKNOWN, UNKNOWN)])
+    assert "/tank/sensor and a node not known yet" in second_source(new, new)
+
+
+def test_a_second_publisher_of_the_own_name_is_told_too():
+    mine = ("/tank", "relay_node")
+    assert second_publisher(Graph([mine]), "/tank/level") == ""
+    told = second_publisher(Graph([mine, ("/", "other")]), "/tank/level")
+    assert told.startswith("/tank/level is also published by /other: ")
+    told = second_publisher(Graph([mine, mine]), "/tank/level")
+    assert "also published by /tank/relay_node: " in told
+
+
+def test_a_namesake_has_the_name_and_the_namespace():
+    mine = ("relay_node", "/tank")
+    assert namesake(Graph(nodes=[mine, ("relay_node", "/kiln"), ("plant", "/tank")])) == ""
+    assert namesake(Graph(nodes=[mine, mine])).startswith(
+        "2 nodes have the name /tank/relay_node, expected one: "
+    )

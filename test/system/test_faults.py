@@ -14,6 +14,7 @@ import pytest
 from faults import FAULTS, abort, have_relay
 from faulty_loop import BASELINE, DEFAULTS, Loop
 from loop_rig import RELIABLE, Rig
+from rclpy.node import Node
 from ros_domain import free_domain
 from std_msgs.msg import Float64
 
@@ -57,15 +58,35 @@ def test_a_fault_ends_in_the_safe_command(loop_of: Callable[[str], Loop], name: 
         FAULTS[name].course(loop, Random(f"{name} {seed}"))
 
 
-def test_a_second_publisher_refuses_the_next_tune(loop: Loop) -> None:
+@pytest.mark.parametrize(
+    ("topic", "said"),
+    [
+        ("command", "/command is also published by /onlooker"),
+        ("measurement", "/measurement is published by 2 publishers, /left_over and /onlooker"),
+        ("controller_command", "/controller_command is published by 2 publishers"),
+        ("", "2 nodes have the name /relay_node"),
+    ],
+)
+def test_what_there_are_two_of_refuses_the_next_tune(loop: Loop, topic: str, said: str) -> None:
     loop.rig.until(lambda: loop.rig.ask_for_tune(dry_run=True).accepted, "a loop that is ready")
-    other = loop.rig.node.create_publisher(Float64, "command", 10)
-    loop.rig.until(
-        lambda: not (answer := loop.rig.ask_for_tune(dry_run=True)).accepted and answer.reason,
-        "the refusal",
-    )
-    assert "is also published by /onlooker" in loop.rig.ask_for_tune().reason
-    loop.rig.node.destroy_publisher(other)
+    name = "left_over" if topic else "relay_node"
+    left_over = Node(name, context=loop.rig.context, start_parameter_services=False)
+    own = loop.rig.node.create_publisher(Float64, topic, 10) if "command" in topic else None
+    if topic in ("measurement", "controller_command"):
+        left_over.create_publisher(Float64, topic, 10)
+
+    def is_refused() -> bool:
+        answer = loop.rig.ask_for_tune(dry_run=True)
+        return not answer.accepted and said in answer.reason
+
+    try:
+        loop.rig.until(is_refused, "the refusal")
+        assert not loop.rig.ask_for_tune().accepted
+    finally:
+        left_over.destroy_node()
+        if own is not None:
+            loop.rig.node.destroy_publisher(own)
+    loop.rig.until(lambda: loop.rig.ask_for_tune(dry_run=True).accepted, "a loop that is ready")
 
 
 @pytest.mark.parametrize("seed", range(RUNS))
