@@ -1,6 +1,7 @@
 """tune_loop: start a tune on a running relay_node, show it, and print what came of it.
 
-Ctrl-C cancels the tune; the plant is then left at the safe command, and what was recorded is kept.
+Ctrl-C, or closing the terminal, cancels the tune; the plant is then left at the safe command, and
+what was recorded is kept.
 On a terminal the progress is shown in place and in colour (NO_COLOR turns that off), else a line
 for each cycle goes to standard error. The result goes to standard output.
 
@@ -19,6 +20,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
@@ -112,6 +114,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     # An exception could be lost in an import or in a callback of rclpy.
     heed(signal.SIGINT)
     # What a command needs is imported when it is needed: --help waits for no rclpy.
+    from relay_autotune.nodes.signals import ending_signals, never_wait_for
     from relay_autotune.nodes.tune_client import TuneClient
 
     if options.report:
@@ -131,23 +134,37 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             leave=lambda: bool(interrupted),
         )
         # Until here there is nothing that could be left half done.
-        heed(signal.SIGTERM)
+        heeded = ending_signals()
+        for number in heeded:
+            heed(number)
         if interrupted:
             raise KeyboardInterrupt
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
-        while True:
-            client.ask(options.amplitude, options.dry_run)
-            _follow(client, shown, interrupted)
-            if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
-                break
-            time.sleep(_TICK)
-        shown.clear()
+        # A signal has to be heeded while nobody reads what is shown, too.
+        wait_again = never_wait_for(sys.stderr.fileno())
+        try:
+            while True:
+                client.ask(options.amplitude, options.dry_run)
+                _follow(client, shown, interrupted)
+                if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
+                    break
+                time.sleep(_TICK)
+            shown.clear()
+        finally:
+            wait_again()
         # Nothing moves any more: whoever does not want to wait for the rest may leave.
+        for number in heeded:
+            signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        return _conclude(client, options)
+        try:
+            return _conclude(client, options)
+        except OSError:
+            # The terminal is closed.
+            if signal.SIGHUP in interrupted:
+                return NOTHING_FOUND
+            raise
 
 
 def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
@@ -162,7 +179,8 @@ def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
             asked = 1
             client.cancel()
             shown.say("cancelling: the safe command goes out, then the recording is closed")
-        elif len(interrupted) > 1:
+        elif any(number != signal.SIGHUP for number in interrupted[1:]):
+            # A shell that ends with its terminal says so once more.
             raise LoopError(
                 f"left before the end was seen; {client.name} goes on to the safe command, and "
                 f"its log says how the tune ended"
@@ -259,7 +277,7 @@ class Shown:
     def take(self, feedback: Any) -> None:
         """Show a feedback."""
         if not self._live and is_news(self._last, feedback):
-            print(log_line(feedback), file=self._stream, flush=True)
+            self._write(f"{log_line(feedback)}\n")
         self._last, self._came = feedback, time.monotonic()
 
     def tick(self) -> None:
@@ -269,21 +287,25 @@ class Shown:
         since = time.monotonic() - self._came
         lines = live_lines(self._last, self._paint, since, self._width)
         self.clear()
-        self._stream.write("\n".join(lines) + "\n")
-        self._stream.flush()
+        self._write("\n".join(lines) + "\n")
         self._lines = len(lines)
 
     def say(self, text: str) -> None:
         """Write a line that stays."""
         self.clear()
-        print(text, file=self._stream, flush=True)
+        self._write(f"{text}\n")
 
     def clear(self) -> None:
         """Take away what is shown in place."""
         if self._lines:
-            self._stream.write(f"\x1b[{self._lines}A\x1b[J")
-            self._stream.flush()
+            self._write(f"\x1b[{self._lines}A\x1b[J")
             self._lines = 0
+
+    def _write(self, text: str) -> None:
+        # The tune goes on where nobody reads of it, or can.
+        with suppress(OSError):
+            self._stream.write(text)
+            self._stream.flush()
 
 
 if __name__ == "__main__":

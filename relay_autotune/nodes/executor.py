@@ -17,12 +17,16 @@ from rclpy.executors import (
     TimeoutException,
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 # Messages further apart than this take the ordinary way [s].
 CLOSE = 0.002
 # While they follow closely, everything else is looked at this often [s].
 LOOK_AROUND = 0.005
+# Where nothing comes for so long, nothing that was begun is left; it gives the last message time
+# to leave, too.
+_NOTHING_MORE = 0.02
 
 
 class Executor(SingleThreadedExecutor):
@@ -61,6 +65,16 @@ class Executor(SingleThreadedExecutor):
             self._flowing = False
         return self._any(timeout_sec)
 
+    def finish(self, within: float) -> None:
+        """Do what was begun, such as to answer a goal that has ended; hear nothing new.
+
+        :param within: how long it may take [s].
+        """
+        deadline = time.monotonic() + within
+        # Without a wait, what one task begins would not be looked for.
+        while time.monotonic() < deadline and self._any(_NOTHING_MORE, []):
+            pass
+
     def _take_favoured(self, timeout_sec: float) -> bool:
         subscription = self._favoured
         assert subscription is not None
@@ -77,9 +91,9 @@ class Executor(SingleThreadedExecutor):
         subscription.callback(*taken)
         return True
 
-    def _any(self, timeout_sec: float | None) -> bool:
+    def _any(self, timeout_sec: float | None, nodes: list[Node] | None = None) -> bool:
         try:
-            handler, entity, _ = self.wait_for_ready_callbacks(timeout_sec)
+            handler, entity, _ = self.wait_for_ready_callbacks(timeout_sec, nodes)
         except (ConditionReachedException, ShutdownException, TimeoutException):
             return False
         handler()

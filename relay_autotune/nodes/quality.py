@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    LivelinessPolicy,
     QoSCompatibility,
     QoSProfile,
     ReliabilityPolicy,
@@ -41,6 +43,18 @@ def latched(depth: int) -> QoSProfile:
 
 
 RESULT = latched(1)
+
+# A process that is killed stays in the graph for some 20 s. Its middleware says at shorter
+# intervals that it lives; who asks for that hears of its end after this time [s].
+_ALIVE_WITHIN = 1.0
+STATUS = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    liveliness=LivelinessPolicy.AUTOMATIC,
+    liveliness_lease_duration=Duration(seconds=_ALIVE_WITHIN),
+)
+"""Of what tells whether a tune runs, and whether relay_node lives."""
 
 
 def for_bag(profile: QoSProfile) -> Qos:

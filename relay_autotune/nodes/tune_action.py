@@ -11,6 +11,7 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.node import Node
 
 from relay_autotune.experiment.experiment import RelayExperiment, State
+from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import conclude
 from relay_autotune_msgs.action import Tune
 
@@ -70,6 +71,7 @@ class TuneAction:
             self._set_state,
             handle_accepted_callback=self._accept,
             cancel_callback=self._on_cancel,
+            status_pub_qos_profile=quality.STATUS,
         )
 
     def _accept(self, goal: Any) -> None:

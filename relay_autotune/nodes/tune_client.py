@@ -8,10 +8,11 @@ from types import TracebackType
 from typing import Any
 
 import rclpy
-from action_msgs.msg import GoalStatus
+from action_msgs.msg import GoalStatus, GoalStatusArray
 from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -27,8 +28,11 @@ from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayExperiment
 
-# A relay_node that is not seen for so long during a tune is taken for gone [s].
-_GONE = 3.0
+# A relay_node of which nothing is heard for so long during a tune is taken for gone [s]; that is
+# beside the time after which the middleware misses it.
+_GONE = 1.0
+# How a goal has ended: the safe command was out by then.
+_ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 # How reasons begin that nodes which have just started give, until they have found each other.
 _NOT_YET = (
     "no measurement has come yet",
@@ -59,6 +63,16 @@ class TuneClient:
         )
         self._node = Node("tune_loop", namespace=namespace or None, context=self._context)
         self._client = ActionClient(self._node, Tune, f"{node}/tune")
+        self._alive = True
+        self._node.create_subscription(
+            GoalStatusArray,
+            f"{node}/tune/_action/status",
+            lambda _: None,
+            quality.STATUS,
+            event_callbacks=SubscriptionEventCallbacks(
+                liveliness=self._on_liveliness, use_default_callbacks=False
+            ),
+        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.name = self._node.resolve_service_name(node)
@@ -133,13 +147,23 @@ class TuneClient:
         :raises LoopError: if the node has gone.
         """
         self._wait(self._answer.done, time.monotonic() + seconds)
-        if self._client.server_is_ready() or self._answer.done():
+        if self._answer.done() or (self._alive and self._client.server_is_ready()):
             self._seen = time.monotonic()
-        elif time.monotonic() - self._seen > _GONE:
+        elif time.monotonic() - self._seen <= _GONE:
+            return
+        elif self._goal.status in _ENDED:
             raise LoopError(
-                f"{self.name} has gone during the tune: nobody publishes the command any more, "
-                f"and the last one stays in force; see to the plant"
+                f"{self.name} has ended, and the tune before it: the safe command is out; the log "
+                f"and the recording say how the tune ended"
             )
+        else:
+            raise LoopError(
+                f"{self.name} has gone during the tune, or cannot be heard any more: nobody "
+                f"publishes the command, and the last one stays in force; see to the plant"
+            )
+
+    def _on_liveliness(self, info: Any) -> None:
+        self._alive = info.alive_count > 0
 
     def news(self) -> list[Any]:
         """Return the feedback that has come since the last call."""

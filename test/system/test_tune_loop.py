@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import re
 import shutil
 import signal
@@ -13,6 +15,8 @@ from pathlib import Path
 
 from loop_rig import RELIABLE, Rig
 from std_msgs.msg import Float64
+
+from relay_autotune_msgs.msg import RelayExperiment
 
 LOOP = {
     "sample_period": 0.1,
@@ -83,25 +87,89 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
     assert kc in page.read_text()
 
 
+class Watched:
+    """A tune by tune_loop of a slow process, whose relay has made its first step.
+
+    :param rig: where it runs.
+    :param output: a terminal for tune_loop; None: two pipes.
+    """
+
+    def __init__(self, rig: Rig, output: int | None = None) -> None:
+        self.rig = rig
+        self.commands = rig.listen("tank/command", Float64, RELIABLE)
+        self.experiments = rig.listen("tank/relay_experiment", RelayExperiment)
+        slow = LOOP | {"time_constants": [50.0], "sample_period": 0.02}
+        rig.start("plant_node", *NAMED, **slow)
+        self.relay = rig.start(
+            "relay_node", *NAMED, amplitude=0.5, baseline=1.0, settle_time=0.4,
+            record_directory=str(rig.records), measurement_timeout=10.0,
+        )  # fmt: skip
+        ready(rig)
+        words = ("--namespace", "/tank", "--record-only")
+        if output is None:
+            self.process = command(rig, *words, "--json")
+        else:
+            self.shown = rig.start_command("tune_loop", *words, output=output)
+        rig.until(self.is_moving, "a step")
+
+    def is_moving(self) -> bool:
+        return any(m.data != 1.0 for m in self.commands)
+
+    def until_safe(self) -> None:
+        self.rig.until(lambda: self.commands[-1].data == 1.0, "the safe command")
+
+    def end(self) -> tuple[str, str]:
+        """Return what tune_loop has said once it has ended."""
+        output, said = self.process.communicate(timeout=15.0)
+        assert self.process.returncode == 1
+        assert "Traceback" not in said
+        assert "never awaited" not in said + self.relay.log
+        return output, said
+
+
 def test_ctrl_c_cancels_and_says_that_the_safe_command_is_out(rig: Rig) -> None:
-    commands = rig.listen("tank/command", Float64, RELIABLE)
-    rig.start("plant_node", *NAMED, **(LOOP | {"time_constants": [50.0], "sample_period": 0.02}))
-    rig.start(
-        "relay_node", *NAMED, amplitude=0.5, baseline=1.0, settle_time=0.4,
-        record_directory=str(rig.records),
-    )  # fmt: skip
-    ready(rig)
-    process = command(rig, "--namespace", "tank", "--record-only", "--json")
-    rig.until(lambda: any(m.data != 1.0 for m in commands), "a step")
-    process.send_signal(signal.SIGINT)
-    output, said = process.communicate(timeout=30.0)
-    assert process.returncode == 1
+    tune = Watched(rig)
+    tune.process.send_signal(signal.SIGINT)
+    output, said = tune.end()
     assert "cancelling: the safe command goes out" in said
     found = json.loads(output)
     assert (found["node"], found["outcome"]) == ("/tank/relay_node", "cancelled")
     assert found["gains"] is None
     assert Path(found["bag"]).is_dir()
-    rig.until(lambda: commands[-1].data == 1.0, "the safe command")
+    tune.until_safe()
+
+
+def test_a_terminal_that_is_closed_cancels(rig: Rig) -> None:
+    window, inside = pty.openpty()
+    tune = Watched(rig, inside)
+    os.close(inside)
+    os.close(window)
+    ended = rig.until(lambda: tune.experiments, "the record")[-1]
+    tune.until_safe()
+    assert "cancelled" in ended.reason
+    assert tune.shown.wait() == 1
+
+
+def test_the_end_of_relay_node_is_told_with_its_reason(rig: Rig) -> None:
+    tune = Watched(rig)
+    tune.relay.signal(signal.SIGTERM)
+    output, said = tune.end()
+    found = json.loads(output)
+    assert found["outcome"] == "aborted"
+    assert "was stopped by SIGTERM" in found["reason"]
+    assert "see to the plant" not in said
+    tune.until_safe()
+
+
+def test_a_relay_node_that_is_killed_is_missed_soon(rig: Rig) -> None:
+    """Its entries in the graph stay for 20 s; nobody shall wait that long."""
+    tune = Watched(rig)
+    tune.relay.signal(signal.SIGKILL)
+    output, said = tune.end()
+    assert output == ""
+    assert "/tank/relay_node has gone during the tune" in said
+    assert "see to the plant" in said
+    assert tune.commands[-1].data != 1.0
 
 
 def test_without_a_relay_node_it_says_so_in_one_line(rig: Rig) -> None:
