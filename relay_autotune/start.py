@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import atexit
 import gc
+import os
 import signal
+import sys
 from functools import partial
 from importlib import import_module
 
@@ -22,6 +24,13 @@ def start(module: str) -> int:
     :param module: name of one with a function main.
     :return: the exit status.
     """
+    # The next file that is opened would take the number of an output that was closed, and with it
+    # all that is said there.
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
     # One that was started with SIGINT ignored, as by nohup, goes on ignoring it.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # One that comes in between waits: noted for a handler that is gone, it would be lost.

@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
@@ -32,6 +33,9 @@ from relay_autotune.tuning.loop.analysis import is_stable
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
+
+# How long the end waits for its last message to be acknowledged.
+ACKNOWLEDGE = Duration(seconds=0.2)
 
 
 class ControllerNode(ServedNode):
@@ -72,6 +76,7 @@ class ControllerNode(ServedNode):
         # True while the parameters follow the gains, not the gains the parameters.
         self._following = False
         self._message = Float64()
+        self._commanded = False
         self._verifier = Verifier(
             self,
             ready=self._ready_to_verify,
@@ -155,6 +160,7 @@ class ControllerNode(ServedNode):
             command = self._pid.step(at, self._setpoint + self._offset, value)
             self._message.data = self._limits.clip(command + self._load)
             self._commands.publish(self._message)
+            self._commanded = True
         if math.isfinite(value) and math.isfinite(command):
             self._verifier.sample(at, value, command)
 
@@ -348,6 +354,23 @@ class ControllerNode(ServedNode):
             reason = f"{reason}; {(await self._revert())[1]}"
         self.get_logger().info(f"verification {'passed' if passed else 'failed'}: {reason}")
         return reason
+
+    # The end.
+
+    def end(self, reason: str) -> None:
+        """Take back what a verification moves, and leave a command that may stay."""
+        rested = self._verifier.rested_at
+        self._verifier.interrupt(reason)
+        if self._remote is not None:
+            self._remote.wait_for_setpoint(ACKNOWLEDGE)
+        elif self._commanded and not self._held:
+            given = self.get_parameter("safe_command").value
+            last = self._pid.command if math.isnan(rested) else rested
+            safe = self._limits.clip(last if math.isnan(given) else given)
+            self._message.data = safe
+            self._commands.publish(self._message)
+            self._commands.wait_for_all_acked(ACKNOWLEDGE)
+            self.get_logger().info(f"{reason}; the command is left at {safe:g}")
 
     # Parameters.
 

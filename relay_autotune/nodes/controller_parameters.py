@@ -23,6 +23,13 @@ OTHERS = (
     NodeParameter("command_min", -math.inf, "u", "Lowest command."),
     NodeParameter("command_max", math.inf, "u", "Highest command."),
     NodeParameter(
+        "safe_command",
+        math.nan,
+        "u",
+        "Command that is left when the node ends; NaN: the last one, and where a verification was "
+        "running, the one at which the loop rested before.",
+    ),
+    NodeParameter(
         "auto_apply",
         False,
         "",

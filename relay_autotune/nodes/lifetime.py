@@ -29,9 +29,12 @@ from rclpy.subscription import Subscription
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.executor import Executor
 from relay_autotune.nodes.parameters import Entry, unknown_parameters
+from relay_autotune.nodes.signals import ending_signals, never_wait_for, signal_name
 
 # How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
+# What the end of a node has begun, such as the answer to a goal, may take so long [s].
+_FINISH_WITHIN = 0.2
 # What the pipe of signals says at the end.
 _NO_SIGNAL = 0
 
@@ -102,7 +105,7 @@ def run(
     args: Sequence[str] | None = None,
     parameters: Sequence[Entry] = (),
 ) -> int:
-    """Run a node until SIGINT or SIGTERM, or until a callback raises.
+    """Run a node until a signal ends it, or until a callback raises.
 
     :param create: makes the node.
     :param name: name of the executable, for messages on standard error.
@@ -119,31 +122,29 @@ def run(
         return 0
     if own:
         # ROS would pass over them without a word, and over the limits that they may be.
-        print(
-            f"{name}: {' '.join(own)} has no effect outside of --ros-args; expected such as "
+        return _refuse(
+            name,
+            f"{' '.join(own)} has no effect outside of --ros-args; expected such as "
             f"{name} --ros-args -p NAME:=VALUE; --help lists the names",
-            file=sys.stderr,
         )
-        return 2
     for unknown in unknown_parameters(_typed_parameters(words), parameters):
-        print(f"{name}: {unknown}", file=sys.stderr)
-        return 2
+        return _refuse(name, unknown)
     signals = _Signals()
+    for output in (1, 2):
+        never_wait_for(output)
     try:
         rclpy.init(
             args=None if args is None else list(args),
             signal_handler_options=SignalHandlerOptions.NO,
         )
     except Exception as error:  # rclpy has no common base for what it raises here.
-        print(f"{name}: {_first_line(error)}", file=sys.stderr)
-        return 2
+        return _refuse(name, _first_line(error))
     sys.setswitchinterval(_SWITCH_INTERVAL)
     try:
         node = create()
     except RelayAutotuneError as error:
-        print(f"{name}: {error}", file=sys.stderr)
         rclpy.try_shutdown()
-        return 2
+        return _refuse(name, str(error))
     try:
         for unknown in unknown_parameters(list(node._parameter_overrides), parameters):
             # A file may hold what is meant for others.
@@ -152,6 +153,14 @@ def run(
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _refuse(name: str, why: str) -> int:
+    """Say why a node cannot run; return the exit status."""
+    # Nobody may be there to read it.
+    with contextlib.suppress(OSError):
+        print(f"{name}: {why}", file=sys.stderr)
+    return 2
 
 
 def _outside_of_ros(words: Sequence[str]) -> list[str]:
@@ -209,12 +218,17 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
         while not signals.came:
             busy = executor.turn(0.0 if more else None)
             more = node.work(idle=not busy)
-        reason = f"the node was stopped by {signal.Signals(signals.came[0]).name}"
+        reason = f"the node was stopped by {signal_name(signals.came[0])}"
     except Exception as error:
         status, reason = 1, f"the node failed: {_where(error)}"
     # The safe command goes out before anything is said about why.
     try:
         node.end(reason)
+    except Exception as error:
+        status = 1
+        node.get_logger().fatal(f"could not end in order: {_where(error)}")
+    try:
+        executor.finish(_FINISH_WITHIN)
     except Exception as error:
         status = 1
         node.get_logger().fatal(f"could not end in order: {_where(error)}")
@@ -226,7 +240,7 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
 
 
 class _Signals:
-    """SIGINT and SIGTERM, from now on: which came, in their order.
+    """The signals that end a process, from now on: which came, in their order.
 
     A second one changes nothing: the end of a node is bounded in time. A handler in Python waits
     until the main thread is back from C, where the executor waits. The interpreter writes the
@@ -234,15 +248,16 @@ class _Signals:
     do.
     """
 
-    _HEEDED = (signal.SIGINT, signal.SIGTERM)
-
     def __init__(self) -> None:
         self.came: list[int] = []
+        self._heeded = ending_signals()
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
         signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
-        for number in self._HEEDED:
+        for number in self._heeded:
             signal.signal(number, lambda n, _: self.came.append(n))
+        # It would stop a node in the background that says something on its terminal.
+        signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         self._thread: threading.Thread | None = None
 
     def wake(self, executor: Executor) -> None:
@@ -260,7 +275,7 @@ class _Signals:
         # `ros2 launch` sends a second SIGINT beside the terminal's, which may come as late as
         # while the interpreter ends: there a handler of Python's is undone, and the signal would
         # kill.
-        for number in self._HEEDED:
+        for number in self._heeded:
             signal.signal(number, signal.SIG_IGN)
         signal.set_wakeup_fd(-1)
         # The pipe stays open: a handler that has begun in another thread may still write to it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from std_msgs.msg import Float64
@@ -99,6 +100,13 @@ class RemoteLoop:
         value = self._setpoint + offset
         self._on_the_way.append(value)
         self._publisher.publish(Float64(data=value))
+
+    def wait_for_setpoint(self, timeout: Duration) -> None:
+        """Wait until the last set-point has arrived.
+
+        :param timeout: how long at most.
+        """
+        self._publisher.wait_for_all_acked(timeout)
 
     def _on_setpoint(self, message: Float64) -> None:
         if message.data in self._on_the_way:

@@ -134,6 +134,12 @@ class Verifier:
         """True from the acceptance of a goal to its end."""
         return self._goal is not None
 
+    @property
+    def rested_at(self) -> float:
+        """Command at which the loop rested before the step that is made [u]; NaN: none is."""
+        moved = self._phase in (_Phase.STEPPING, _Phase.RETURNING)
+        return self._rest.command if moved else math.nan
+
     # Beginning.
 
     def require_samples(self) -> None:

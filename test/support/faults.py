@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import math
+import os
+import pty
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from random import Random
@@ -15,6 +19,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from faulty_loop import BASELINE, DEFAULTS, PERIOD, REST, SAFE, Loop
 from rclpy.action import ActionClient
+from rclpy.node import Node
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
@@ -32,6 +37,11 @@ relay.RelayExperiment.step = broken
 sys.exit(relay.main())
 """
 
+
+OTHER_SIGNALS = (
+    signal.SIGQUIT, signal.SIGABRT, signal.SIGALRM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGPWR,
+    signal.SIGTSTP, signal.SIGXCPU, signal.SIGIO, signal.SIGRTMIN, signal.SIGRTMIN + 5,
+)  # fmt: skip
 
 Undo = Callable[[], object]
 Cause = Callable[[Loop, Random], "Undo | None"]
@@ -106,16 +116,102 @@ def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
         else:
             loop.rig.until(lambda: loop.commands[-1] != BASELINE, "a first step")
             began = time.monotonic()
-        taken = until_safe(loop, began)
-        loop.check_the_end(said)
-        assert process.wait() == status
-        assert "Traceback" not in process.log
-        loop.process = None
-        loop.rig.run_for(0.05)
-        assert loop.commands[-1] == SAFE
-        return taken
+        return ended_by_itself(loop, began, said, status)
 
     return Fault(course)
+
+
+def any_other_signal(loop: Loop, random: Random) -> float:
+    """Send a signal that would end a process that has not asked for it."""
+    number = random.choice(OTHER_SIGNALS)
+    name = f"SIGRTMIN+{number - signal.SIGRTMIN}"
+    if number in set(signal.Signals):
+        name = signal.Signals(number).name
+    return with_the_node("", number, f"was stopped by {name}", 0).course(loop, random)
+
+
+def ended_by_itself(loop: Loop, began: float, said: str, status: int) -> float:
+    """See that relay_node ends its tune and itself; return the time since the cause [s].
+
+    :param began: when the cause was.
+    :param said: what the reason has to contain.
+    :param status: its exit status.
+    """
+    taken = until_safe(loop, began)
+    loop.check_the_end(said)
+    assert loop.process is not None
+    assert loop.process.wait() == status
+    assert "Traceback" not in loop.process.log
+    loop.process = None
+    loop.rig.run_for(0.05)
+    assert loop.commands[-1] == SAFE
+    return taken
+
+
+# Where a node may write: what makes it, and returns the end for the node and the other end.
+
+
+def terminal() -> tuple[int, int]:
+    """Return a terminal for a node, and the window that shows it."""
+    window, inside = pty.openpty()
+    return inside, window
+
+
+def small_pipe() -> tuple[int, int]:
+    """Return a pipe that is soon full."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    return writer, reader
+
+
+def terminal_closed(loop: Loop, random: Random) -> float:
+    """Close the terminal in which relay_node runs."""
+    output, window = terminal()
+    replace_relay(loop, output=output)
+    os.close(output)
+    loop.tune()
+    wait_for_a_moment(loop, random)
+    began = time.monotonic()
+    os.close(window)
+    return ended_by_itself(loop, began, "was stopped by SIGHUP", 0)
+
+
+def output_not_taken(
+    loop: Loop,
+    random: Random,
+    make: Callable[[], tuple[int, int]],
+    stop: Callable[[int], object] = lambda _: None,
+) -> float:
+    """Let nobody take what relay_node says: a tune goes on, and is ended as ever.
+
+    :param make: makes the two ends of its output.
+    :param stop: stops the other end from taking more.
+    """
+    output, other = make()
+    replace_relay(loop, output=output)
+    os.close(output)
+    try:
+        loop.tune()
+        wait_for_a_moment(loop, random)
+        stop(other)
+        # Each refusal is a line of the log; all of them are more than a pipe holds.
+        for _ in range(40):
+            assert not loop.rig.ask_for_tune().accepted
+        count = loop.switches
+        loop.rig.until(lambda: loop.switches > count + 2, "a tune that goes on")
+        began = time.monotonic()
+        abort(loop, random)
+        taken = until_safe(loop, began)
+        loop.check_the_end("aborted on request")
+        loop.check_that_it_stays()
+        assert loop.process is not None
+        loop.process.signal(signal.SIGTERM)
+        assert loop.process.wait() == 0
+        loop.process = None
+    finally:
+        with suppress(OSError):
+            os.close(other)
+    return taken
 
 
 def have_relay(loop: Loop) -> None:
@@ -124,7 +220,7 @@ def have_relay(loop: Loop) -> None:
         replace_relay(loop)
 
 
-def replace_relay(loop: Loop, code: str = "") -> None:
+def replace_relay(loop: Loop, code: str = "", output: int | None = None) -> None:
     """Start a relay_node, or a Python text in its place, once there is none any more."""
     if loop.process is not None:
         loop.process.end()
@@ -132,7 +228,7 @@ def replace_relay(loop: Loop, code: str = "") -> None:
     loop.rig.until(
         lambda: node.count_publishers("relay_experiment") == 0, "the end of the relay before"
     )
-    loop.start(code)
+    loop.start(code, output)
 
 
 def wait_for_a_moment(loop: Loop, random: Random) -> None:
@@ -214,9 +310,20 @@ def clock_step(size: float) -> Callable[[Loop, Random], None]:
     return cause
 
 
-def second_publisher(loop: Loop, _: Random) -> Callable[[], None]:
-    other = loop.rig.node.create_publisher(Float64, "command", 10)
-    return lambda: loop.rig.node.destroy_publisher(other)
+def second_publisher(topic: str) -> Cause:
+    """Return a cause that is one more publisher of a topic."""
+
+    def cause(loop: Loop, _: Random) -> Callable[[], None]:
+        other = loop.rig.node.create_publisher(Float64, topic, 10)
+        return lambda: loop.rig.node.destroy_publisher(other)
+
+    return cause
+
+
+def second_node(loop: Loop, _: Random) -> Callable[[], None]:
+    """Let there be a node more that is called as the relay is."""
+    other = Node("relay_node", context=loop.rig.context, start_parameter_services=False)
+    return other.destroy_node
 
 
 def abort(loop: Loop, _: Random) -> None:
@@ -376,7 +483,13 @@ FAULTS = {
     "sensor on change, silent before a cycle": in_a_tune(
         before_a_cycle, "it does not respond", kind="on change", at_start=True, max_half_cycle=0.6
     ),
-    "second publisher of command": in_a_tune(second_publisher, "/command is also published by "),
+    "second publisher of command": in_a_tune(
+        second_publisher("command"), "/command is also published by "
+    ),
+    "second publisher of measurement": in_a_tune(
+        second_publisher("measurement"), "/measurement is published by 2 publishers, /onlooker"
+    ),
+    "second node of the name": in_a_tune(second_node, "2 nodes have the name /relay_node"),
     "controller silent in a tune": Fault(partial(controller, in_tune=True)),
     "controller silent when idle": Fault(partial(controller, in_tune=False)),
     "actuator that does not follow": Fault(actuator),
@@ -384,5 +497,13 @@ FAULTS = {
     "cancelled action": Fault(cancelled),
     "SIGINT": with_the_node("", signal.SIGINT, "was stopped by SIGINT", 0),
     "SIGTERM": with_the_node("", signal.SIGTERM, "was stopped by SIGTERM", 0),
+    "SIGHUP": with_the_node("", signal.SIGHUP, "was stopped by SIGHUP", 0),
+    "any other signal": Fault(any_other_signal),
+    "terminal that is closed": Fault(terminal_closed),
+    "terminal that is paused": Fault(
+        partial(output_not_taken, make=terminal, stop=lambda window: os.write(window, b"\x13"))
+    ),
+    "output that is full": Fault(partial(output_not_taken, make=small_pipe)),
+    "output that is gone": Fault(partial(output_not_taken, make=small_pipe, stop=os.close)),
     "exception in a callback": with_the_node(BROKEN, 0, "ZeroDivisionError: a defect", 1),
 }

@@ -180,14 +180,17 @@ class Loop:
 
     # The relay.
 
-    def start(self, code: str = "") -> Process:
-        """Start a relay_node, or a Python text in its place."""
+    def start(self, code: str = "", output: int | None = None) -> Process:
+        """Start a relay_node, or a Python text in its place.
+
+        :param output: where it writes, a pipe or a terminal; None: to its log.
+        """
         parameters = {**RELAY, **KINDS[self.kind]}
         if code:
             parameters["record_directory"] = str(self.rig.records)
             self.process = self.rig.start_python("broken_relay", code, **parameters)
         else:
-            self.process = self.rig.relay(**parameters)
+            self.process = self.rig.relay(output=output, **parameters)
         self.values = dict(DEFAULTS)
         return self.process
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -36,13 +38,27 @@ PATIENCE = 30.0
 class Process:
     """One executable, its log, and what it leaves behind."""
 
-    def __init__(self, name: str, command: list[str], environment: dict[str, str], log: Path):
+    def __init__(
+        self,
+        name: str,
+        command: list[str],
+        environment: dict[str, str],
+        log: Path,
+        output: int | None = None,
+    ):
         self.name = name
         self.log_path = log
         self.segments: set[Path] = set()
+        # A terminal becomes its own.
+        own = output is not None and os.isatty(output)
         with log.open("wb") as file:
             self._process = subprocess.Popen(
-                command, env=environment, stdout=file, stderr=subprocess.STDOUT
+                command,
+                env=environment,
+                stdout=file if output is None else output,
+                stderr=subprocess.STDOUT,
+                start_new_session=own,
+                preexec_fn=(lambda: fcntl.ioctl(1, termios.TIOCSCTTY, 0)) if own else None,
             )
 
     @property
@@ -95,25 +111,39 @@ class Rig:
 
     # Processes.
 
-    def start(self, executable: str, *arguments: str, **parameters: Any) -> Process:
-        """Start an installed executable with parameters and further ROS arguments."""
-        path = shutil.which(executable)
-        if path is None:
-            raise RuntimeError(f"{executable} is not on the PATH; source env.sh")
-        return self._launch(executable, [path], arguments, parameters)
+    def start(
+        self, executable: str, *arguments: str, output: int | None = None, **parameters: Any
+    ) -> Process:
+        """Start an installed executable with parameters and further ROS arguments.
+
+        :param output: what takes the place of its log, a pipe or a terminal; None: nothing does.
+        """
+        return self._launch(executable, [_path(executable)], arguments, parameters, output)
+
+    def start_command(self, executable: str, *words: str, output: int) -> Process:
+        """Start an installed command with its own words in a terminal."""
+        return self._begin(executable, [_path(executable), *words], output)
 
     def start_python(self, name: str, code: str, **parameters: Any) -> Process:
         """Start a Python text in the place of an executable."""
         return self._launch(name, [sys.executable, "-c", code], (), parameters)
 
     def _launch(
-        self, name: str, command: list[str], arguments: tuple[str, ...], parameters: dict[str, Any]
+        self,
+        name: str,
+        command: list[str],
+        arguments: tuple[str, ...],
+        parameters: dict[str, Any],
+        output: int | None = None,
     ) -> Process:
         ros = ["--ros-args", *arguments]
         for key, value in parameters.items():
             ros += ["-p", f"{key}:={_yaml(value)}"]
+        return self._begin(name, [*command, *ros], output)
+
+    def _begin(self, name: str, command: list[str], output: int | None) -> Process:
         log = self.folder / f"{len(self.processes)}_{name}.log"
-        process = Process(name, [*command, *ros], self.environment, log)
+        process = Process(name, command, self.environment, log, output)
         self.processes.append(process)
         return process
 
@@ -169,7 +199,10 @@ class Rig:
                 return answer
             # Nothing else may keep a tune from starting here; who has left another test's topic
             # may stay in the graph for a moment.
-            transient = ("no measurement", "no command", "use_sim_time", "/command is also")
+            transient = (
+                "no measurement", "no command", "use_sim_time", "/command is also",
+                "/measurement is published by", "2 nodes have the name",
+            )  # fmt: skip
             assert answer.reason.startswith(transient), answer.reason
             self.run_for(0.1)
             return None
@@ -201,6 +234,13 @@ class Rig:
         killed = {path for process in self.processes for path in process.segments}
         if killed:
             remove_leftovers(self.domain, killed)
+
+
+def _path(executable: str) -> str:
+    path = shutil.which(executable)
+    if path is None:
+        raise RuntimeError(f"{executable} is not on the PATH; source env.sh")
+    return path
 
 
 def _yaml(value: Any) -> str:

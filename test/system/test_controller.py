@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import signal
 from typing import Any
 
 import pytest
@@ -266,3 +268,40 @@ def test_a_relay_on_the_set_point_ends_when_it_knows_enough(rig: Rig) -> None:
     assert judged.ultimate_gain == pytest.approx(models[-1].ultimate_gain, rel=0.1)
     assert models[-1].gain == pytest.approx(2.0, rel=0.15)
     assert models[-1].dead_time == pytest.approx(0.4, abs=0.06)
+
+
+@pytest.mark.parametrize("given", [math.nan, 0.7])
+def test_its_end_leaves_no_load_of_a_verification(rig: Rig, given: float) -> None:
+    commands = rig.listen("command", Float64, RELIABLE)
+    rig.plant(**PLANT)
+    controller = rig.start(
+        "controller_node", "-r", "controller_command:=command",
+        **CONTROLLER, verify_load_max=0.6, safe_command=given,
+    )  # fmt: skip
+    models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+    models.publish(
+        TransferFunction(final=True, numerator=[2.0], denominator=[0.8, 1.0], dead_time=0.4)
+    )
+    rig.until(lambda: len(commands) > 400, "a closed loop")
+    client = ActionClient(rig.node, Verify, "controller_node/verify")
+    rig.until(client.server_is_ready, "the action")
+
+    def has_begun() -> bool:
+        """Ask until the loop rests well enough."""
+        sent = client.send_goal_async(Verify.Goal(load_step=0.6))
+        rig.until(sent.done, "the goal")
+        answer = sent.result().get_result_async()
+        rig.until(lambda: answer.done() or commands[-1].data > 1.4, "the load")
+        return not answer.done()
+
+    rig.until(has_begun, "a verification")
+    controller.signal(signal.SIGHUP)
+    assert controller.wait() == 0
+    rig.until(
+        lambda: commands[-1].data == pytest.approx(1.0 if math.isnan(given) else given, abs=0.03),
+        "the safe command",
+    )
+    assert "was stopped by SIGHUP; the command is left at" in controller.log
+    assert "Traceback" not in controller.log
+    assert "never awaited" not in controller.log
+    client.destroy()

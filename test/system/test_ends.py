@@ -45,7 +45,7 @@ class RunningTune:
         return self.rig.until(lambda: self.experiments, "the record")[-1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_the_safe_command_and_a_whole_bag(rig: Rig, number: int) -> None:
     tune = RunningTune(rig)
     rig.run_for(0.7)
@@ -166,6 +166,30 @@ sys.exit(relay.main())
     assert relay.log.count("[FATAL]") == 1
     (record,) = read_experiments(rig.bag(tune.answer)).experiments
     assert len(record) == 100
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1])
+def test_nodes_that_command_nothing_end_in_order_too(rig: Rig, number: int) -> None:
+    plant = rig.plant(sample_period=0.02, structure="fopdt", time_constants=[1.0])
+    nodes = [rig.identifier(), plant]
+    for node in nodes:
+        rig.until(lambda node=node: "sample period" in node.log or "ready" in node.log, "a node")
+        node.signal(number)
+        assert node.wait() == 0
+        assert "Traceback" not in node.log
+
+
+def test_nohup_is_heeded(rig: Rig) -> None:
+    """Whoever starts a node with SIGHUP ignored wants it to go on without the terminal."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        node = rig.identifier()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    rig.until(lambda: "ready" in node.log, "the node")
+    node.signal(signal.SIGHUP)
+    rig.run_for(0.5)
+    assert node.running
 
 
 def test_an_idle_node_is_silent_to_its_end(rig: Rig) -> None:
