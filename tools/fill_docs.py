@@ -20,16 +20,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
-from relay_autotune.nodes.identifier import PARAMETERS as IDENTIFIER_PARAMETERS
-from relay_autotune.nodes.parameters import Entry
+from relay_autotune.nodes.identifier_parameters import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
 from relay_autotune.nodes.tune_parameters import FIXED_PARAMETERS, TUNE_PARAMETERS
+from relay_autotune.quantities import Quantity
 
 ROOT = Path(__file__).resolve().parent.parent
 PARAMETER_FILE = ROOT / "config/parameters.yaml"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
-TABLES: Mapping[str, Sequence[Entry]] = {
+TABLES: Mapping[str, Sequence[Quantity]] = {
     "relay_node": (*TUNE_PARAMETERS, *FIXED_PARAMETERS),
     "identifier_node": IDENTIFIER_PARAMETERS,
     "plant_node": PLANT_PARAMETERS,
@@ -57,7 +57,7 @@ def _block(asked: re.Match[str]) -> str:
     return f"<!-- {asked['kind']} of {what} -->\n\n{content}\n\n<!-- end -->"
 
 
-def table(entries: Iterable[Entry]) -> str:
+def table(entries: Iterable[Quantity]) -> str:
     """Return parameters as a table, a row for each.
 
     :param entries: the parameters.

@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.reader import Selection
 from relay_autotune.bag.timing import CLOCKS
-from relay_autotune.cli.arguments import add_known, finite, known_facts
+from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
 from relay_autotune.cli.design_arguments import add_design, design_options
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import RelayAutotuneError, SelectionError
+from relay_autotune.identification.known import Known
+from relay_autotune.quantities import declared
 
 
 def add_analysis(parser: argparse.ArgumentParser) -> None:
@@ -53,10 +55,7 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     how = parser.add_argument_group("identification and design")
     how.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
-    add_known(how)
-    how.add_argument(
-        "--loss", metavar="NAME", help="huber or tukey: for a sensor with many outliers"
-    )
+    add_quantities(how, declared(Known))
     how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
     add_design(parser)
 
@@ -83,7 +82,7 @@ def jobs_of(
 
     try:
         check_names(options.method, options.rule)
-        known = known_facts(options)
+        known = Known(**given_quantities(options, declared(Known)))
         asked = design_options(options)
     except RelayAutotuneError as error:
         raise SelectionError(str(error)) from error

@@ -7,13 +7,12 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError
-
-if TYPE_CHECKING:
-    from relay_autotune.identification.known import Known
+from relay_autotune.quantities import Quantity
 
 DONE, NOTHING_FOUND, USAGE = 0, 1, 2
 
@@ -67,29 +66,62 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     return status
 
 
-def add_known(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add the flags that say what is known of the process, which :func:`known_facts` reads.
+_KINDS: dict[type, Callable[[str], Any]] = {int: int, float: finite}
+
+
+def typed_as(quantity: Quantity) -> Quantity:
+    """Return a quantity as people type it: an angle in degrees."""
+    if quantity.unit != "rad":
+        return quantity
+    numbers = {n: math.degrees(getattr(quantity, n)) for n in ("default", "lower", "upper")}
+    return replace(quantity, unit="deg", **numbers)  # type: ignore[arg-type]
+
+
+def flag_of(quantity: Quantity) -> str:
+    """Return the flag that sets a quantity, such as --loop-delay."""
+    return "--" + (quantity.flag or quantity.name).replace("_", "-")
+
+
+def add_quantities(
+    parser: argparse.ArgumentParser | argparse._ArgumentGroup, quantities: Iterable[Quantity]
+) -> None:
+    """Add a flag for each of some quantities; :func:`given_quantities` reads them.
 
     :param parser: of the command, or a group of its options.
+    :param quantities: what the flags set.
     """
-    parser.add_argument("--gain", type=finite, metavar="K", help="known gain of the process [y/u]")
-    parser.add_argument("--dead-time", type=finite, metavar="S", help="known dead time [s]")
-    parser.add_argument("--structure", metavar="NAME", default="", help="known structure")
-    parser.add_argument("--order", type=int, metavar="N", default=0, help="known number of lags")
+    for each in map(typed_as, quantities):
+        default = ""
+        if each.is_number and math.isfinite(each.default):  # type: ignore[arg-type]
+            default = f" ({each.default:g})"
+        text = each.description.removesuffix(".").replace("NaN:", "not given:")
+        parser.add_argument(
+            flag_of(each),
+            dest=each.name,
+            type=_KINDS.get(type(each.default), str),
+            metavar=each.unit.upper() if each.unit else "N" if each.is_number else "NAME",
+            help=f"{text[0].lower()}{text[1:]}{default}".replace("%", "%%"),
+        )
 
 
-def known_facts(options: argparse.Namespace) -> Known:
-    """Return what the options say to be known of the process.
+def given_quantities(
+    options: argparse.Namespace, quantities: Iterable[Quantity]
+) -> dict[str, Any]:
+    """Return the values that were given on the command line, by the quantities' names.
 
-    :param options: with gain and dead_time, None where they were not given; structure, order.
-    :raises ParameterError: if a value cannot be.
+    :param options: with the flags of :func:`add_quantities`.
+    :param quantities: what the flags set.
+    :raises SelectionError: if a value is out of its range.
     """
-    from relay_autotune.identification.known import Known
-
-    return Known(
-        gain=math.nan if options.gain is None else options.gain,
-        dead_time=math.nan if options.dead_time is None else options.dead_time,
-        structure=options.structure,
-        order=options.order,
-        loss=getattr(options, "loss", None) or Known.loss,
-    )
+    given = {}
+    for each in quantities:
+        value, typed = getattr(options, each.name), typed_as(each)
+        if value is None:
+            continue
+        # What is not given on a command line is left out, not NaN.
+        asked = replace(typed, default=type(typed.default)()) if typed.is_number else typed
+        problem = asked.problem(value)
+        if problem is not None:
+            raise SelectionError(flag_of(typed) + problem.removeprefix(typed.name))
+        given[each.name] = value if typed is each else math.radians(value)
+    return given

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import math
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from relay_autotune.cli.arguments import finite
-from relay_autotune.errors import SelectionError, TuningError
+from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
+from relay_autotune.quantities import declared
+from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
 
 if TYPE_CHECKING:
     from relay_autotune.cli.export import Target
-    from relay_autotune.tuning.task import DesignOptions
 
-CONTROLLERS = ("auto", "pi", "pid")
 EXPORTS = ("pid_controller", "yaml")
 
 
@@ -36,36 +33,7 @@ def add_design(parser: argparse.ArgumentParser) -> None:
             const=each,
             help=f"the same as --controller {each}",
         )
-    number: dict[str, Any] = {"type": finite}
-    group.add_argument("--ms", **number, metavar="M", help="largest Ms, 1.2 to 4 (1.4)")
-    group.add_argument(
-        "--mt", **number, metavar="M", help="largest Mt (1.4, of an integrating process 1.26)"
-    )
-    group.add_argument(
-        "--sample-period", **number, metavar="S", help="period of the controller (0: continuous)"
-    )
-    group.add_argument(
-        "--loop-delay", **number, metavar="S", help="dead time that the loop adds (0)"
-    )
-    group.add_argument(
-        "--lambda",
-        dest="closed_loop_time",
-        **number,
-        metavar="S",
-        help="closed-loop time constant of imc, simc and unstable (the rule's own)",
-    )
-    group.add_argument("--noise-std", **number, metavar="Y", help="measurement noise [y]")
-    group.add_argument(
-        "--amplitude", **number, metavar="U", help="what a command may move, as the relay's [u]"
-    )
-    group.add_argument(
-        "--noise-share", **number, metavar="R", help="noise in the command over --amplitude (0.1)"
-    )
-    group.add_argument("--filter-ratio", **number, metavar="N", help="largest td/tf (10)")
-    group.add_argument(
-        "--phase-peak", **number, metavar="DEG", help="phase peak of luyben2003 (-120)"
-    )
-    group.add_argument("--resonance", **number, metavar="DB", help="resonance of luyben2003 (2)")
+    add_quantities(group, (each for each in declared(DesignOptions) if each.name != "controller"))
 
 
 def design_options(options: argparse.Namespace) -> DesignOptions:
@@ -74,16 +42,7 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     :param options: with those of :func:`add_design`.
     :raises SelectionError: if a value is out of its range.
     """
-    from relay_autotune.tuning.task import DesignOptions
-
-    names = {f.name for f in fields(DesignOptions)}
-    given = {n: v for n, v in vars(options).items() if n in names and v is not None}
-    if "phase_peak" in given:
-        given["phase_peak"] = math.radians(given["phase_peak"])
-    try:
-        return DesignOptions(**given)
-    except TuningError as error:
-        raise SelectionError(str(error).replace("closed_loop_time", "lambda")) from error
+    return DesignOptions(**given_quantities(options, declared(DesignOptions)))
 
 
 def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:

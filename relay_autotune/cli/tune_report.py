@@ -7,13 +7,13 @@ import shlex
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from relay_autotune.cli.arguments import flag_of, typed_as
 from relay_autotune.cli.report import write_report
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
     from relay_autotune.record.record import Record
 
-_RENAMED = {"known_gain": "gain", "known_dead_time": "dead_time", "closed_loop_time": "lambda"}
 _NEAR = 1e-6
 
 
@@ -23,17 +23,17 @@ def flags_of(values: Mapping[str, Any]) -> str:
     :param values: of its parameters, by name.
     :return: the flags of those that are not the default.
     """
-    from relay_autotune.nodes.identifier import PARAMETERS
+    from relay_autotune.nodes.identifier_parameters import PARAMETERS
 
     found = []
     for entry in PARAMETERS:
         value = values[entry.name]
         if value == entry.default or value != value:
             continue
-        name = _RENAMED.get(entry.name, entry.name).replace("_", "-")
-        if entry.name == "phase_peak":
+        typed = typed_as(entry)
+        if typed.unit != entry.unit:
             value = math.degrees(value)
-        found += [f"--{name}", f"{value:.12g}" if isinstance(value, float) else str(value)]
+        found += [flag_of(typed), f"{value:.12g}" if isinstance(value, float) else str(value)]
     return shlex.join(found)
 
 
@@ -44,8 +44,7 @@ def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
     :param values: of its parameters, by name.
     """
     from relay_autotune.analysis import analyse
-    from relay_autotune.nodes.design_parameters import options_from
-    from relay_autotune.nodes.known_parameters import known_from
+    from relay_autotune.nodes.identifier_parameters import known_from, options_from
 
     return analyse(
         record,
@@ -58,7 +57,7 @@ def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
 
 def defaults() -> dict[str, Any]:
     """Return the parameters of an identifier_node that was told nothing, by name."""
-    from relay_autotune.nodes.identifier import PARAMETERS
+    from relay_autotune.nodes.identifier_parameters import PARAMETERS
 
     return {entry.name: entry.default for entry in PARAMETERS}
 

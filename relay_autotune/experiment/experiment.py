@@ -11,16 +11,14 @@ from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.faults.repetition import SilenceWatch
 from relay_autotune.experiment.faults.sample_check import SampleCheck
 from relay_autotune.experiment.faults.sensor_watch import FrozenWatch
-from relay_autotune.experiment.parameters import PARAMETERS, ExperimentParameters, Parameter
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import Procedure, State
 from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
 
 __all__ = [
-    "PARAMETERS",
     "ExperimentParameters",
-    "Parameter",
     "RelayExperiment",
     "SafePolicy",
     "State",

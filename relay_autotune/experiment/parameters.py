@@ -6,84 +6,33 @@ import math
 from dataclasses import dataclass
 
 from relay_autotune.errors import ParameterError
+from relay_autotune.quantities import check, declared, quantity
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """What one parameter means and which values it may take.
+class ExperimentParameters:
+    """What the user may set of a relay experiment."""
 
-    :param name: its name, as a field of :class:`ExperimentParameters` and as a ROS parameter.
-    :param default: its default; the type of the default is the type of the parameter.
-    :param unit: its unit; "y" and "u" are those of measurement and command, "" is none.
-    :param description: one sentence for people.
-    :param lower: smallest value allowed.
-    :param upper: largest value allowed.
-    :param open_ended: True if ``lower`` and ``upper`` themselves are not allowed.
-    :param nan_allowed: True if NaN stands for "not given".
-    """
-
-    name: str
-    default: float | int
-    unit: str
-    description: str
-    lower: float = -math.inf
-    upper: float = math.inf
-    open_ended: bool = False
-    nan_allowed: bool = False
-
-    @property
-    def range_text(self) -> str:
-        """The range in words, for messages and parameter descriptions."""
-        unit = f" {self.unit}" if self.unit else ""
-        if math.isinf(self.lower) and math.isinf(self.upper):
-            text = "any number" if self.unit == "" else f"any number [{self.unit}]"
-        elif math.isinf(self.upper):
-            relation = "above" if self.open_ended else "at least"
-            text = f"{relation} {self.lower:g}{unit}"
-        else:
-            relation = "between" if self.open_ended else "from"
-            joint = "and" if self.open_ended else "to"
-            text = f"{relation} {self.lower:g} {joint} {self.upper:g}{unit}"
-        return f"{text}, or NaN where it is not given" if self.nan_allowed else text
-
-    def problem(self, value: float) -> str | None:
-        """Return a sentence on what is wrong with a value, or None if it is within range."""
-        if math.isnan(value):
-            inside = self.nan_allowed
-        elif self.open_ended:
-            inside = self.lower < value < self.upper
-        else:
-            inside = self.lower <= value <= self.upper
-        if inside:
-            return None
-        return f"{self.name} is {value:g}, expected {self.range_text}"
-
-
-PARAMETERS: tuple[Parameter, ...] = (
-    Parameter(
-        "amplitude",
+    amplitude: float = quantity(
         0.0,
         "u",
         "Half the distance of the two command levels; 0: found by itself between command_min and "
         "command_max, from small to large.",
         lower=0.0,
-    ),
-    Parameter(
-        "target_amplitude",
+    )
+    target_amplitude: float = quantity(
         0.0,
         "y",
         "Half the swing of the measurement at which an amplitude that is found by itself is large "
         "enough; 0: when the oscillation stands clear of noise, hysteresis and resolution.",
         lower=0.0,
-    ),
-    Parameter(
-        "bias",
+    )
+    bias: float = quantity(
         0.0,
         "u",
         "Offset of the middle of the two levels from the baseline; 0: bias_ratio decides.",
-    ),
-    Parameter(
-        "bias_ratio",
+    )
+    bias_ratio: float = quantity(
         0.3,
         "",
         "Bias as a fraction of the amplitude, used where bias is 0; a biased relay also tells "
@@ -91,56 +40,48 @@ PARAMETERS: tuple[Parameter, ...] = (
         lower=-1.0,
         upper=1.0,
         open_ended=True,
-    ),
-    Parameter(
-        "hysteresis",
+    )
+    hysteresis: float = quantity(
         0.0,
         "y",
         "Half width of the band about the set-point in which the relay does not switch; "
         "0: three times the measured noise standard deviation.",
         lower=0.0,
-    ),
-    Parameter(
-        "setpoint",
+    )
+    setpoint: float = quantity(
         math.nan,
         "y",
         "Measurement about which the relay switches; NaN: the measured mean at the start.",
-        nan_allowed=True,
-    ),
-    Parameter(
-        "process_gain_sign",
+    )
+    process_gain_sign: int = quantity(
         0,
         "",
         "1 if a higher command raises the measurement in the end, -1 if it lowers it; "
         "0: found by the kick.",
         lower=-1,
         upper=1,
-    ),
-    Parameter(
-        "settle_time",
+    )
+    settle_time: float = quantity(
         0.0,
         "s",
         "Time at the baseline before the kick; 0: until the measurement is seen to be steady.",
         lower=0.0,
-    ),
-    Parameter(
-        "min_cycles",
+    )
+    min_cycles: int = quantity(
         3,
         "",
         "Number of successive cycles that must agree before the experiment ends.",
         lower=2,
         upper=1000,
-    ),
-    Parameter(
-        "max_cycles",
+    )
+    max_cycles: int = quantity(
         12,
         "",
         "Number of cycles after which the experiment ends, agreeing or not.",
         lower=2,
         upper=1000,
-    ),
-    Parameter(
-        "cycle_tolerance",
+    )
+    cycle_tolerance: float = quantity(
         0.02,
         "",
         "Largest difference of half periods and of peaks between agreeing cycles, as a fraction "
@@ -148,98 +89,67 @@ PARAMETERS: tuple[Parameter, ...] = (
         lower=0.0,
         upper=1.0,
         open_ended=True,
-    ),
-    Parameter(
-        "measurement_min",
+    )
+    measurement_min: float = quantity(
         -math.inf,
         "y",
         "The experiment is aborted when the measurement falls below this.",
-    ),
-    Parameter(
-        "measurement_max",
+    )
+    measurement_max: float = quantity(
         math.inf,
         "y",
         "The experiment is aborted when the measurement rises above this.",
-    ),
-    Parameter(
-        "max_deviation",
+    )
+    max_deviation: float = quantity(
         0.0,
         "y",
         "The experiment is aborted when the measurement is further than this from the set-point, "
         "once that is known; 0: no limit.",
         lower=0.0,
-    ),
-    Parameter("command_min", -math.inf, "u", "Lowest command that may be sent."),
-    Parameter("command_max", math.inf, "u", "Highest command that may be sent."),
-    Parameter(
-        "command_rate",
+    )
+    command_min: float = quantity(
+        -math.inf,
+        "u",
+        "Lowest command that may be sent.",
+    )
+    command_max: float = quantity(
+        math.inf,
+        "u",
+        "Highest command that may be sent.",
+    )
+    command_rate: float = quantity(
         0.0,
         "u/s",
         "Fastest change of the relay's command; the safe command at the end is a step all the "
         "same; 0: no limit.",
         lower=0.0,
-    ),
-    Parameter(
-        "extra_delay",
+    )
+    extra_delay: float = quantity(
         0.0,
         "s",
         "Dead time that the relay adds to its switches, for the second test of the method li.",
         lower=0.0,
-    ),
-    Parameter(
-        "max_half_cycle",
+    )
+    max_half_cycle: float = quantity(
         0.0,
         "s",
         "Longest stay of the relay at one level; 0: ten times the longest so far, and more for "
         "a biased relay.",
         lower=0.0,
-    ),
-    Parameter(
-        "max_duration",
+    )
+    max_duration: float = quantity(
         0.0,
         "s",
         "Longest duration of the whole experiment; 0: each of its parts has a limit scaled to "
         "what was seen before.",
         lower=0.0,
-    ),
-    Parameter(
-        "sample_period",
+    )
+    sample_period: float = quantity(
         0.0,
         "s",
         "Period of the samples where they carry no time of their own; 0: by their stamps.",
         lower=0.0,
-    ),
-)
-
-# These may be infinite ("unlimited"); every other parameter must be a finite number.
-_LIMITS = frozenset({"measurement_min", "measurement_max", "command_min", "command_max"})
-
-
-@dataclass(frozen=True)
-class ExperimentParameters:
-    """What the user may set of a relay experiment; :data:`PARAMETERS` describes each field."""
-
-    amplitude: float = 0.0
-    target_amplitude: float = 0.0
-    bias: float = 0.0
-    bias_ratio: float = 0.3
-    hysteresis: float = 0.0
-    setpoint: float = math.nan
-    process_gain_sign: int = 0
-    settle_time: float = 0.0
-    min_cycles: int = 3
-    max_cycles: int = 12
-    cycle_tolerance: float = 0.02
-    measurement_min: float = -math.inf
-    measurement_max: float = math.inf
-    max_deviation: float = 0.0
-    command_min: float = -math.inf
-    command_max: float = math.inf
-    command_rate: float = 0.0
-    extra_delay: float = 0.0
-    max_half_cycle: float = 0.0
-    max_duration: float = 0.0
-    sample_period: float = 0.0
+    )
 
     @property
     def relay_bias(self) -> float:
@@ -259,21 +169,10 @@ class ExperimentParameters:
         :raises ParameterError: with a sentence that names the parameter, the value found and the
             values expected.
         """
-        self._validate_each()
+        check(self, ParameterError)
         self._validate_together()
         if baseline is not None:
             self._validate_levels(baseline)
-
-    def _validate_each(self) -> None:
-        for parameter in PARAMETERS:
-            value = getattr(self, parameter.name)
-            problem = parameter.problem(value)
-            if problem is None and math.isinf(value) and parameter.name not in _LIMITS:
-                problem = f"{parameter.name} is {value:g}, expected a finite number"
-            if problem is None and isinstance(parameter.default, int) and value != int(value):
-                problem = f"{parameter.name} is {value:g}, expected a whole number"
-            if problem is not None:
-                raise ParameterError(problem)
 
     def _validate_together(self) -> None:
         if self.finds_amplitude:
@@ -294,12 +193,11 @@ class ExperimentParameters:
                 f"max_cycles is {self.max_cycles}, expected at least min_cycles, "
                 f"which is {self.min_cycles}"
             )
-        for quantity in ("measurement", "command"):
-            low, high = getattr(self, f"{quantity}_min"), getattr(self, f"{quantity}_max")
+        for signal in ("measurement", "command"):
+            low, high = getattr(self, f"{signal}_min"), getattr(self, f"{signal}_max")
             if low >= high:
                 raise ParameterError(
-                    f"{quantity}_min is {low:g}, expected less than {quantity}_max, "
-                    f"which is {high:g}"
+                    f"{signal}_min is {low:g}, expected less than {signal}_max, which is {high:g}"
                 )
         if not math.isnan(self.setpoint) and not (
             self.measurement_min < self.setpoint < self.measurement_max
@@ -342,3 +240,6 @@ class ExperimentParameters:
                 f"amplitude is {self.amplitude:g}, expected enough to tell the two levels apart "
                 f"at a baseline of {baseline:g}"
             )
+
+
+PARAMETERS = declared(ExperimentParameters)

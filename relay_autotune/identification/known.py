@@ -6,44 +6,49 @@ import math
 from dataclasses import dataclass
 
 from relay_autotune.errors import ParameterError
+from relay_autotune.process.transfer_function import STRUCTURES
+from relay_autotune.quantities import check, quantity
 
 LOSSES = ("squares", "huber", "tukey")
+_MOST_LAGS = 20
 
 
 @dataclass(frozen=True)
 class Known:
     """Facts about the process that a method may need and a record may not tell.
 
-    :param gain: static gain, or integrating gain of an integrating process [y/u, y/(u s)];
-        NaN: not known.
-    :param dead_time: dead time [s]; NaN: not known.
-    :param structure: structure to be fitted; empty: the method's own choice.
-    :param order: number of equal lags; 0: not known.
-    :param loss: what the waveform fit minimises: "squares"; "huber" or "tukey" where the
-        sensor's noise has many outliers.
-    :raises ParameterError: if the gain is zero or infinite, the dead time negative, or there is
-        no such loss.
+    :raises ParameterError: if a value is out of its range, or the gain is zero.
     """
 
-    gain: float = math.nan
-    dead_time: float = math.nan
-    structure: str = ""
-    order: int = 0
-    loss: str = LOSSES[0]
+    gain: float = quantity(
+        math.nan,
+        "y/u",
+        "Static gain of the process, of an integrating one its gain in y/(u s); NaN: to be "
+        "found, which atv, and chang with unequal lags, cannot.",
+    )
+    dead_time: float = quantity(
+        math.nan, "s", "Dead time of the process; NaN: to be found.", lower=0.0
+    )
+    structure: str = quantity(
+        "",
+        "",
+        "Structure of the model; empty: chosen by the method.",
+        choices=("", *STRUCTURES[:-1]),
+    )
+    order: int = quantity(
+        0, "", "Number of equal lags, for lag_n; 0: to be found.", lower=0, upper=_MOST_LAGS
+    )
+    loss: str = quantity(
+        LOSSES[0],
+        "",
+        "How the waveform fit counts residuals; huber and tukey bear many outliers.",
+        choices=LOSSES,
+    )
 
     def __post_init__(self) -> None:
-        if self.gain == 0.0 or math.isinf(self.gain):
-            raise ParameterError(f"a known gain must be finite and not zero, found {self.gain:g}")
-        if self.dead_time < 0.0 or math.isinf(self.dead_time):
-            raise ParameterError(
-                f"a known dead time must be finite and >= 0 s, found {self.dead_time:g} s"
-            )
-        if self.order < 0:
-            raise ParameterError(
-                f"an order must be at least 1, or 0: not known; found {self.order}"
-            )
-        if self.loss not in LOSSES:
-            raise ParameterError(f"unknown loss {self.loss!r}; known: {', '.join(LOSSES)}")
+        check(self, ParameterError)
+        if self.gain == 0.0:
+            raise ParameterError("gain is 0, expected a gain that is not zero")
 
 
 NOTHING = Known()

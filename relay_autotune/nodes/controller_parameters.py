@@ -5,43 +5,43 @@ from __future__ import annotations
 import math
 
 from relay_autotune.nodes.live_types import FLOAT64
-from relay_autotune.nodes.parameters import NodeParameter
+from relay_autotune.quantities import Quantity
 
 GAINS = (
-    NodeParameter(
+    Quantity(
         "kc",
         0.0,
         "u/y",
         "Proportional gain, with the sign of the process; 0: no gains yet, the command is held.",
     ),
-    NodeParameter("ti", 0.0, "s", "Integral time; 0: no integral action.", 0.0),
-    NodeParameter("td", 0.0, "s", "Derivative time.", 0.0),
-    NodeParameter("tf", 0.0, "s", "Time constant of the filter on the measurement.", 0.0),
-    NodeParameter("b", 1.0, "", "Weight of the set-point in the proportional part.", 0.0, 1.0),
+    Quantity("ti", 0.0, "s", "Integral time; 0: no integral action.", 0.0),
+    Quantity("td", 0.0, "s", "Derivative time.", 0.0),
+    Quantity("tf", 0.0, "s", "Time constant of the filter on the measurement.", 0.0),
+    Quantity("b", 1.0, "", "Weight of the set-point in the proportional part.", 0.0, 1.0),
 )
 OTHERS = (
-    NodeParameter("command_min", -math.inf, "u", "Lowest command."),
-    NodeParameter("command_max", math.inf, "u", "Highest command."),
-    NodeParameter(
+    Quantity("command_min", -math.inf, "u", "Lowest command."),
+    Quantity("command_max", math.inf, "u", "Highest command."),
+    Quantity(
         "safe_command",
         math.nan,
         "u",
         "Command that is left when the node ends; NaN: the last one, and where a verification was "
         "running, the one at which the loop rested before.",
     ),
-    NodeParameter(
+    Quantity(
         "auto_apply",
         False,
         "",
         "True: gains that come are put in force at once; false: only when ~/apply is called.",
     ),
-    NodeParameter(
+    Quantity(
         "verify_step",
         0.0,
         "y",
         "Height of the set-point step of ~/verify, where the request gives none.",
     ),
-    NodeParameter(
+    Quantity(
         "verify_load_max",
         0.0,
         "u",
@@ -50,26 +50,26 @@ OTHERS = (
     ),
 )
 FIXED = (
-    NodeParameter(
+    Quantity(
         "initial_setpoint",
         math.nan,
         "y",
         "Set-point until one comes; NaN: the first measurement.",
     ),
-    NodeParameter("initial_command", 0.0, "u", "Command from which it starts."),
-    NodeParameter("manual", False, "", "True: it starts in manual, holding initial_command."),
-    NodeParameter(
+    Quantity("initial_command", 0.0, "u", "Command from which it starts."),
+    Quantity("manual", False, "", "True: it starts in manual, holding initial_command."),
+    Quantity(
         "sample_period",
         0.0,
         "s",
         "Period of the samples where they carry no time; 0: stamps.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "measurement_type", FLOAT64, "", "Message type of the measurement, as in relay_node."
     ),
-    NodeParameter("measurement_field", "data", "", "Path of the measurement in it."),
-    NodeParameter(
+    Quantity("measurement_field", "data", "", "Path of the measurement in it."),
+    Quantity(
         "repeat_period",
         0.0,
         "s",
@@ -77,14 +77,14 @@ FIXED = (
         "the last value is a sample again; 0: only what comes is one.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "apply_to",
         "",
         "",
         "Name of a node that shall get the gains by its parameters, such as /pid_controller; "
         "empty: this node controls.",
     ),
-    NodeParameter(
+    Quantity(
         "apply_parameters",
         "p:p,i:i,d:d",
         "",

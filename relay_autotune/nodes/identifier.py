@@ -23,34 +23,17 @@ from relay_autotune.exchange.messages import (
     start_nanoseconds,
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
-from relay_autotune.identification import DEFAULT_METHOD, METHODS, ONLY_JOINT
+from relay_autotune.identification import ONLY_JOINT
 from relay_autotune.identification.running_fit import RunningFit, Task
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.design_parameters import DESIGN_PARAMETERS, options_from
-from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
+from relay_autotune.nodes.identifier_parameters import PARAMETERS, known_from, options_from
 from relay_autotune.nodes.lifetime import ServedNode, run
-from relay_autotune.nodes.parameters import NodeParameter, declare, merged, values_of
+from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.results import Refusals
 from relay_autotune.nodes.signs_of_life import SignsOfLife
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
-
-PARAMETERS = (
-    NodeParameter(
-        "method",
-        DEFAULT_METHOD,
-        "",
-        "Method whose model is published.",
-        choices=tuple(METHODS),
-    ),
-    NodeParameter(
-        "rule", DEFAULT_RULE, "", "Rule whose gains are published.", choices=tuple(RULES)
-    ),
-    *KNOWN_PARAMETERS,
-    *DESIGN_PARAMETERS,
-)
 
 # Latched cycles that may wait for an identifier that comes late.
 CYCLE_DEPTH = 1000

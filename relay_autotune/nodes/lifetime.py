@@ -28,8 +28,9 @@ from rclpy.subscription import Subscription
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.executor import Executor
-from relay_autotune.nodes.parameters import Entry, unknown_parameters
+from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.nodes.signals import ending_signals, never_wait_for, signal_name
+from relay_autotune.quantities import Quantity
 
 # How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
@@ -103,7 +104,7 @@ def run(
     create: Callable[[], ServedNode],
     name: str,
     args: Sequence[str] | None = None,
-    parameters: Sequence[Entry] = (),
+    parameters: Sequence[Quantity] = (),
 ) -> int:
     """Run a node until a signal ends it, or until a callback raises.
 
@@ -184,7 +185,7 @@ def _typed_parameters(words: Sequence[str]) -> list[str]:
     return [name.rsplit(":", maxsplit=1)[-1] for name in given]
 
 
-def _help(name: str, purpose: str, parameters: Sequence[Entry]) -> str:
+def _help(name: str, purpose: str, parameters: Sequence[Quantity]) -> str:
     lines = [
         f"usage: {name} [--ros-args [-p NAME:=VALUE ...] [-r NAME:=NAME ...]",
         f"{'':<{len(name) + 8}}[--params-file FILE] ...]",

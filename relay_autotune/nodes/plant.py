@@ -21,10 +21,11 @@ from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
-from relay_autotune.nodes.parameters import NodeParameter, declare, values_of
+from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.quantities import Quantity
 
 MODES = ("realtime", "clock", "lockstep")
 
@@ -35,39 +36,35 @@ LONGEST_WAIT = 0.2
 CLOCK_START = 1.0
 
 PARAMETERS = (
-    NodeParameter("numerator", (), "", "Coefficients of s in the numerator, highest power first."),
-    NodeParameter(
-        "denominator", (), "", "Coefficients of s in the denominator, highest power first."
-    ),
-    NodeParameter(
+    Quantity("numerator", (), "", "Coefficients of s in the numerator, highest power first."),
+    Quantity("denominator", (), "", "Coefficients of s in the denominator, highest power first."),
+    Quantity(
         "structure",
         "",
         "",
         "Named structure of the process, instead of the two polynomials.",
         choices=("", *STRUCTURES[:-1]),
     ),
-    NodeParameter("gain", 1.0, "y/u", "Gain of the structure."),
-    NodeParameter("time_constants", (), "s", "Lags of the structure."),
-    NodeParameter("zeros", (), "s", "Time constants of the structure's zeros."),
-    NodeParameter("order", 0, "", "Number of equal lags, for lag_n and lag_n_zero.", 0, 50),
-    NodeParameter("zeta", 0.0, "", "Damping of the structure's complex pair."),
-    NodeParameter("w0", 0.0, "rad/s", "Natural frequency of the structure's complex pair.", 0.0),
-    NodeParameter("dead_time", 0.0, "s", "Dead time of the process.", 0.0),
-    NodeParameter("sample_period", 0.1, "s", "Time between samples.", 1e-5),
-    NodeParameter("noise_std", 0.0, "y", "Standard deviation of white noise.", 0.0),
-    NodeParameter("seed", 0, "", "Seed of the noise.", 0),
-    NodeParameter("quantisation", 0.0, "y", "Resolution of the sensor; 0: none.", 0.0),
-    NodeParameter(
-        "operating_point", (), "", "Measurement [y] and command [u] at rest, y0 and u0."
-    ),
-    NodeParameter("load_time", 0.0, "s", "When a load step enters before the process.", 0.0),
-    NodeParameter("load_size", 0.0, "u", "Height of the load step; 0: none."),
-    NodeParameter("drift", 0.0, "y/s", "Slope added to the measurement."),
-    NodeParameter("command_min", -math.inf, "u", "Lower limit of the actuator."),
-    NodeParameter("command_max", math.inf, "u", "Upper limit of the actuator."),
-    NodeParameter("stiction", 0.0, "u", "Band in which the actuator sticks.", 0.0),
-    NodeParameter("dead_band", 0.0, "u", "Play of the actuator.", 0.0),
-    NodeParameter(
+    Quantity("gain", 1.0, "y/u", "Gain of the structure."),
+    Quantity("time_constants", (), "s", "Lags of the structure."),
+    Quantity("zeros", (), "s", "Time constants of the structure's zeros."),
+    Quantity("order", 0, "", "Number of equal lags, for lag_n and lag_n_zero.", 0, 50),
+    Quantity("zeta", 0.0, "", "Damping of the structure's complex pair."),
+    Quantity("w0", 0.0, "rad/s", "Natural frequency of the structure's complex pair.", 0.0),
+    Quantity("dead_time", 0.0, "s", "Dead time of the process.", 0.0),
+    Quantity("sample_period", 0.1, "s", "Time between samples.", 1e-5),
+    Quantity("noise_std", 0.0, "y", "Standard deviation of white noise.", 0.0),
+    Quantity("seed", 0, "", "Seed of the noise.", 0),
+    Quantity("quantisation", 0.0, "y", "Resolution of the sensor; 0: none.", 0.0),
+    Quantity("operating_point", (), "", "Measurement [y] and command [u] at rest, y0 and u0."),
+    Quantity("load_time", 0.0, "s", "When a load step enters before the process.", 0.0),
+    Quantity("load_size", 0.0, "u", "Height of the load step; 0: none."),
+    Quantity("drift", 0.0, "y/s", "Slope added to the measurement."),
+    Quantity("command_min", -math.inf, "u", "Lower limit of the actuator."),
+    Quantity("command_max", math.inf, "u", "Upper limit of the actuator."),
+    Quantity("stiction", 0.0, "u", "Band in which the actuator sticks.", 0.0),
+    Quantity("dead_band", 0.0, "u", "Play of the actuator.", 0.0),
+    Quantity(
         "falling_gain",
         1.0,
         "",
@@ -75,14 +72,14 @@ PARAMETERS = (
         1e-3,
         1e3,
     ),
-    NodeParameter(
+    Quantity(
         "jitter",
         0.0,
         "s",
         "Largest delay of a sample after its time, evenly spread, in the mode realtime.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "loss",
         0.0,
         "",
@@ -90,26 +87,26 @@ PARAMETERS = (
         0.0,
         0.9,
     ),
-    NodeParameter(
+    Quantity(
         "on_change",
         False,
         "",
         "True: a sample is published only if it differs from the last one; not in lockstep.",
     ),
-    NodeParameter(
+    Quantity(
         "feedback",
         False,
         "",
         "True: the actuator's position is published on command_feedback after each command.",
     ),
-    NodeParameter(
+    Quantity(
         "mode",
         "realtime",
         "",
         "realtime; clock: publishes /clock; lockstep: one step for each command.",
         choices=MODES,
     ),
-    NodeParameter(
+    Quantity(
         "lockstep_speed",
         0.0,
         "",
@@ -117,9 +114,7 @@ PARAMETERS = (
         0.0,
         1e4,
     ),
-    NodeParameter(
-        "speed", 1.0, "", "Simulated seconds in a second, in the mode clock.", 1e-3, 1e4
-    ),
+    Quantity("speed", 1.0, "", "Simulated seconds in a second, in the mode clock.", 1e-3, 1e4),
 )
 
 

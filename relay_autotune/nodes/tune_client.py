@@ -231,7 +231,7 @@ class TuneClient:
         :param patience: how long to wait for them [s].
         """
         # Imported here, since no tune shall wait for it.
-        from relay_autotune.nodes.identifier import PARAMETERS
+        from relay_autotune.nodes.identifier_parameters import PARAMETERS
 
         names = [entry.name for entry in PARAMETERS]
         for end in self._node.get_publishers_info_by_topic(self._resolved("pi_gains")):

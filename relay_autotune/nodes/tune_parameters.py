@@ -7,25 +7,25 @@ import math
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.nodes.live_types import COMMAND_TYPES, FLOAT64
-from relay_autotune.nodes.parameters import Entry, NodeParameter
+from relay_autotune.quantities import Quantity
 
 __all__ = ["EXPERIMENT_PARAMETERS", "FIXED_PARAMETERS", "NODE_PARAMETERS", "TUNE_PARAMETERS"]
 
 NODE_PARAMETERS = (
-    NodeParameter(
+    Quantity(
         "baseline",
         math.nan,
         "u",
         "Command of the operating point; NaN: the mean of controller_command where that comes, "
         "else the command held now, else initial_command.",
     ),
-    NodeParameter(
+    Quantity(
         "safe_command",
         math.nan,
         "u",
         "Command after a tune that was aborted or failed; NaN: the baseline.",
     ),
-    NodeParameter(
+    Quantity(
         "process_type",
         "self_regulating",
         "",
@@ -34,21 +34,21 @@ NODE_PARAMETERS = (
         "control, when a tune ends.",
         choices=("self_regulating", "integrating", "unstable"),
     ),
-    NodeParameter(
+    Quantity(
         "hold_gain",
         0.0,
         "u/y",
         "Gain of that proportional control, with the sign of the process; 0: half of K_u, as "
         "soon as a whole cycle was seen.",
     ),
-    NodeParameter(
+    Quantity(
         "start_without_hold",
         False,
         "",
         "True: a tune of a process that is not self-regulating may start with neither "
         "controller_command nor hold_gain.",
     ),
-    NodeParameter(
+    Quantity(
         "stop_when",
         "converged",
         "",
@@ -56,14 +56,14 @@ NODE_PARAMETERS = (
         "of confident_of from identifier_node is narrow enough.",
         choices=("converged", "confident"),
     ),
-    NodeParameter(
+    Quantity(
         "confident_of",
         ULTIMATE_GAIN,
         "",
         "For stop_when confident: ultimate_gain, K_u; ms, the Ms that the gains would have.",
         choices=SOUGHT,
     ),
-    NodeParameter(
+    Quantity(
         "confidence",
         0.0135,
         "",
@@ -71,7 +71,7 @@ NODE_PARAMETERS = (
         1e-4,
         1.0,
     ),
-    NodeParameter(
+    Quantity(
         "controller_timeout",
         1.0,
         "s",
@@ -79,7 +79,7 @@ NODE_PARAMETERS = (
         "silent for longer, the safe command goes out.",
         1e-3,
     ),
-    NodeParameter(
+    Quantity(
         "return_time",
         0.0,
         "s",
@@ -87,7 +87,7 @@ NODE_PARAMETERS = (
         "period of the oscillation, else 5 s.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "feedback_tolerance",
         0.0,
         "u",
@@ -95,21 +95,21 @@ NODE_PARAMETERS = (
         "half of the amplitude, from the first cycle on where that finds itself.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "feedback_timeout",
         1.0,
         "s",
         "For how long it may be further away before the actuator counts as stuck.",
         1e-3,
     ),
-    NodeParameter(
+    Quantity(
         "measurement_timeout",
         1.0,
         "s",
         "A tune is aborted when no measurement comes for so long.",
         1e-3,
     ),
-    NodeParameter(
+    Quantity(
         "model_timeout",
         10.0,
         "s",
@@ -117,7 +117,7 @@ NODE_PARAMETERS = (
         "sign that identifier_node works on them.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "record_directory",
         "~/.ros/relay_autotune",
         "",
@@ -125,13 +125,13 @@ NODE_PARAMETERS = (
     ),
 )
 FIXED_PARAMETERS = (
-    NodeParameter(
+    Quantity(
         "initial_command",
         math.nan,
         "u",
         "Answer to each measurement before the first tune; NaN: silent until then.",
     ),
-    NodeParameter(
+    Quantity(
         "path",
         "passthrough",
         "",
@@ -139,7 +139,7 @@ FIXED_PARAMETERS = (
         "the controller publishes command by itself and is silent during a tune.",
         choices=("passthrough", "takeover"),
     ),
-    NodeParameter(
+    Quantity(
         "relay_on",
         "command",
         "",
@@ -147,16 +147,16 @@ FIXED_PARAMETERS = (
         "present loop stays closed, its controller connected by controller_command.",
         choices=("command", "setpoint"),
     ),
-    NodeParameter(
+    Quantity(
         "measurement_type",
         FLOAT64,
         "",
         "Message type of the measurement; its header's stamp, if it has one, is the time.",
     ),
-    NodeParameter(
+    Quantity(
         "measurement_field", "data", "", "Path of the measurement in it, such as position[2]."
     ),
-    NodeParameter(
+    Quantity(
         "repeat_period",
         0.0,
         "s",
@@ -165,7 +165,7 @@ FIXED_PARAMETERS = (
         "a fault.",
         0.0,
     ),
-    NodeParameter(
+    Quantity(
         "command_type",
         FLOAT64,
         "",
@@ -174,4 +174,4 @@ FIXED_PARAMETERS = (
         choices=COMMAND_TYPES,
     ),
 )
-TUNE_PARAMETERS: tuple[Entry, ...] = (*EXPERIMENT_PARAMETERS, *NODE_PARAMETERS)
+TUNE_PARAMETERS: tuple[Quantity, ...] = (*EXPERIMENT_PARAMETERS, *NODE_PARAMETERS)

@@ -209,7 +209,7 @@ COMPENSATORS: dict[str, Callable[[DesignTask], Compensator]] = {
 
 
 def _lambda(task: DesignTask, default: float, why: str) -> tuple[float, str]:
-    given = task.options.closed_loop_time
+    given = task.options.given_closed_loop_time
     if given is None:
         return default, f"{why} = {default:.4g} s"
     return given, f"{given:.4g} s, as given"

@@ -9,6 +9,7 @@ from functools import cached_property
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
+from relay_autotune.quantities import check, quantity
 from relay_autotune.tuning.model_set import ModelSet
 
 CONTROLLERS = ("auto", "pi", "pid")
@@ -21,71 +22,84 @@ MT_SELF_REGULATING, MT_INTEGRATING = 1.4, 1.26
 class DesignOptions:
     """What is asked of a controller, the same for every rule; each rule reads what it needs.
 
-    :param ms: largest magnitude of the sensitivity function that is allowed, 1.2 to 4.
-    :param mt: largest magnitude of the complementary sensitivity function that is allowed, above
-        1; None: 1.4, for an integrating process 1.26 (+2 dB).
-    :param controller: "pi", "pid", or "auto": PI unless PID is worth it.
-    :param sample_period: of the controller to be [s]; 0: continuous.
-    :param loop_delay: dead time of the loop beside the process's own [s].
-    :param noise_std: standard deviation of the measurement noise [y]; NaN: not known.
-    :param amplitude: of the relay, the measure of what a command may move [u]; NaN: not known.
-    :param noise_share: standard deviation of the noise in the command, over ``amplitude``, that
-        derivative action may cause.
-    :param filter_ratio: largest td/tf.
-    :param closed_loop_time: lambda of internal model control and of the compensators [s]; None:
-        the rule's default.
-    :param phase_peak: phase of the loop at its peak (Luyben 2003) [rad].
-    :param resonance: closed-loop resonance (Luyben 2003) [dB].
     :raises TuningError: if a value is out of its range.
     """
 
-    ms: float = 1.4
-    mt: float | None = None
-    controller: str = "auto"
-    sample_period: float = 0.0
-    loop_delay: float = 0.0
-    noise_std: float = math.nan
-    amplitude: float = math.nan
-    noise_share: float = 0.1
-    filter_ratio: float = 10.0
-    closed_loop_time: float | None = None
-    phase_peak: float = math.radians(-120.0)
-    resonance: float = 2.0
+    controller: str = quantity(
+        "auto",
+        "",
+        "What is designed; auto: PI, unless the rule finds PID worth it.",
+        choices=CONTROLLERS,
+    )
+    ms: float = quantity(1.4, "", "Largest Ms, for robust and unstable.", *MS_RANGE)
+    mt: float = quantity(
+        math.nan,
+        "",
+        "Largest Mt, above 1, for robust; NaN: 1.4, of an integrating process 1.26.",
+        lower=1.0,
+        open_ended=True,
+    )
+    sample_period: float = quantity(
+        0.0,
+        "s",
+        "Period of the controller to be, half of which counts as dead time; 0: the recording's, "
+        "or continuous where there is no recording.",
+        lower=0.0,
+    )
+    loop_delay: float = quantity(
+        0.0,
+        "s",
+        "Dead time that the loop of the controller to be adds to the process.",
+        lower=0.0,
+    )
+    noise_std: float = quantity(
+        math.nan,
+        "y",
+        "Standard deviation of the measurement noise; NaN: the recording's, or not known.",
+        lower=0.0,
+    )
+    amplitude: float = quantity(
+        math.nan,
+        "u",
+        "What a command may move; NaN: the relay's amplitude, or not known.",
+        lower=0.0,
+    )
+    noise_share: float = quantity(
+        0.1,
+        "",
+        "Standard deviation of the noise in the command over the amplitude that derivative "
+        "action may cause.",
+        lower=0.0,
+        open_ended=True,
+    )
+    filter_ratio: float = quantity(10.0, "", "Largest td/tf.", lower=0.0, open_ended=True)
+    closed_loop_time: float = quantity(
+        math.nan,
+        "s",
+        "Lambda of imc, simc and unstable; NaN: the rule's own.",
+        lower=0.0,
+        open_ended=True,
+        flag="lambda",
+    )
+    phase_peak: float = quantity(
+        math.radians(-120.0),
+        "rad",
+        "Phase of the loop at its peak, for luyben2003.",
+        lower=-math.pi,
+        upper=-0.5 * math.pi,
+        open_ended=True,
+    )
+    resonance: float = quantity(
+        2.0, "dB", "Closed-loop resonance, for luyben2003.", lower=0.0, open_ended=True
+    )
 
     def __post_init__(self) -> None:
-        low, high = MS_RANGE
-        if not low <= self.ms <= high:
-            raise TuningError(f"ms must be from {low:g} to {high:g}, found {self.ms:g}")
-        if self.mt is not None and not 1.0 < self.mt < math.inf:
-            raise TuningError(f"mt must be above 1 and finite, found {self.mt:g}")
-        if self.controller not in CONTROLLERS:
-            raise TuningError(
-                f"unknown controller {self.controller!r}; known: {', '.join(CONTROLLERS)}"
-            )
-        for name in ("sample_period", "loop_delay"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise TuningError(
-                    f"{name} must be >= 0 s and finite, found {getattr(self, name):g} s"
-                )
-        for name in ("noise_std", "amplitude"):
-            # NaN stands for what is not known.
-            if getattr(self, name) < 0.0 or math.isinf(getattr(self, name)):
-                raise TuningError(
-                    f"{name} must be >= 0 and finite, or NaN where it is not known, "
-                    f"found {getattr(self, name):g}"
-                )
-        for name in ("noise_share", "filter_ratio", "resonance"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise TuningError(f"{name} must be > 0 and finite, found {getattr(self, name):g}")
-        if self.closed_loop_time is not None and not 0.0 < self.closed_loop_time < math.inf:
-            raise TuningError(
-                f"closed_loop_time must be > 0 s and finite, found {self.closed_loop_time:g} s"
-            )
-        if not -math.pi < self.phase_peak < -0.5 * math.pi:
-            raise TuningError(
-                "phase_peak must lie between -180 and -90 degrees, found "
-                f"{math.degrees(self.phase_peak):g}"
-            )
+        check(self, TuningError)
+
+    @property
+    def given_closed_loop_time(self) -> float | None:
+        """Lambda as it was given [s]; None: the rule decides."""
+        return None if math.isnan(self.closed_loop_time) else self.closed_loop_time
 
     @property
     def added_delay(self) -> float:
@@ -100,7 +114,7 @@ class DesignOptions:
 
         :param model: the process; integrating ones have a default of their own.
         """
-        if self.mt is not None:
+        if not math.isnan(self.mt):
             return self.mt
         return MT_INTEGRATING if model.integrators > 0 else MT_SELF_REGULATING
 

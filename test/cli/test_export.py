@@ -159,4 +159,4 @@ def test_replay_exports_the_gains_of_a_recording(capsys):
         assert replay.main([*asked, bag, *more]) == 2
         assert "one bag alone" in capsys.readouterr().err
     assert replay.main(["--ms", "9", bag]) == 2
-    assert "ms must be from 1.2 to 4" in capsys.readouterr().err
+    assert "--ms is 9, expected from 1.2 to 4" in capsys.readouterr().err

@@ -100,7 +100,10 @@ WANG = "--method wang --period-high 1 --period-low 1 --peak-max 1 --peak-min -1 
         ("--method chang --period x", "'x' is no number"),
         (f"{WANG} --bias 0.1", "also needs --gain, or --mean-measurement and --mean-command"),
         (f"{WANG} --bias 0.1 --structure sopdt", "makes no use of --structure"),
-        (f"--method chang {EXAMPLE} --dead-time 10 --order -1", "an order must be at least 1"),
+        (
+            f"--method chang {EXAMPLE} --dead-time 10 --order -1",
+            "order is -1, expected from 0 to 20",
+        ),
     ],
 )
 def test_a_command_line_that_does_not_fit(arguments, message):

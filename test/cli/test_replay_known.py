@@ -64,7 +64,7 @@ def test_known_facts_reach_the_method(tmp_path, capsys):
 def test_a_fact_that_cannot_be_is_one_line(tmp_path, capsys):
     status, found, err = run(capsys, "--dead-time", "-1", tmp_path / "none")
     assert (status, found) == (2, [])
-    assert err == "replay: a known dead time must be finite and >= 0 s, found -1 s\n"
+    assert err == "replay: --dead-time is -1, expected at least 0 s\n"
 
 
 @pytest.mark.parametrize("one_bag", [True, False])

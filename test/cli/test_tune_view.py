@@ -29,8 +29,7 @@ from relay_autotune.cli.tune_view import (
     result_lines,
     wants_colour,
 )
-from relay_autotune.nodes.design_parameters import options_from
-from relay_autotune.nodes.known_parameters import known_from
+from relay_autotune.nodes.identifier_parameters import known_from, options_from
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 

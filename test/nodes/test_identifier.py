@@ -17,15 +17,15 @@ from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification import Known
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.executor import Executor
-from relay_autotune.nodes.identifier import PARAMETERS, IdentifierNode
-from relay_autotune.nodes.known_parameters import KNOWN_PARAMETERS, known_from
+from relay_autotune.nodes.identifier import IdentifierNode
+from relay_autotune.nodes.identifier_parameters import KNOWN, PARAMETERS, known_from
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 PROCESS = TransferFunction.lag_n(2.0, 3.0, 2, 1.0)
-NOTHING = {entry.name: entry.default for entry in KNOWN_PARAMETERS}
+NOTHING = {entry.name: entry.default for entry in KNOWN}
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
     refused = node.set_parameters([Parameter("known_gain", value=0.0)])[0]
     assert not refused.successful
     assert "not zero" in refused.reason
-    assert {entry.name for entry in KNOWN_PARAMETERS} <= {entry.name for entry in PARAMETERS}
+    assert {entry.name for entry in KNOWN} <= {entry.name for entry in PARAMETERS}
 
 
 def test_progress_is_answered_with_what_is_sought(

@@ -6,15 +6,16 @@ import math
 
 import pytest
 
-from relay_autotune.nodes.parameters import NodeParameter, descriptor_of
+from relay_autotune.nodes.parameters import descriptor_of
 from relay_autotune.nodes.plant import PARAMETERS as PLANT
 from relay_autotune.nodes.tune_parameters import FIXED_PARAMETERS, TUNE_PARAMETERS
+from relay_autotune.quantities import Quantity
 
-LENGTH = NodeParameter("length", 1.0, "m", "How long.", 0.5, 2.0)
-LIMIT = NodeParameter("limit", math.inf, "y", "Where it ends.")
-OPTIONAL = NodeParameter("optional", math.nan, "y", "Perhaps.")
-WORD = NodeParameter("word", "a", "", "Which.", choices=("a", "b"))
-LIST = NodeParameter("list", (), "s", "Several.")
+LENGTH = Quantity("length", 1.0, "m", "How long.", 0.5, 2.0)
+LIMIT = Quantity("limit", math.inf, "y", "Where it ends.")
+OPTIONAL = Quantity("optional", math.nan, "y", "Perhaps.")
+WORD = Quantity("word", "a", "", "Which.", choices=("a", "b"))
+LIST = Quantity("list", (), "s", "Several.")
 
 
 @pytest.mark.parametrize(
@@ -24,30 +25,30 @@ LIST = NodeParameter("list", (), "s", "Several.")
         *((OPTIONAL, math.nan), (OPTIONAL, 0.0), (WORD, "b"), (LIST, []), (LIST, [1.0, 2.0])),
     ],
 )
-def test_what_may_be(entry: NodeParameter, value: object) -> None:
+def test_what_may_be(entry: Quantity, value: object) -> None:
     assert entry.problem(value) is None
 
 
 @pytest.mark.parametrize(
     ("entry", "value", "said"),
     [
-        (LENGTH, 2.5, "length is 2.5, expected a finite number from 0.5 to 2 m"),
-        (LENGTH, math.nan, "length is nan, expected a finite number from 0.5 to 2 m"),
-        (LIMIT, math.nan, "limit is nan, expected a finite number"),
+        (LENGTH, 2.5, "length is 2.5, expected from 0.5 to 2 m"),
+        (LENGTH, math.nan, "length is nan, expected from 0.5 to 2 m"),
+        (LIMIT, math.nan, "limit is nan, expected any number [y]"),
         (LIMIT, -math.inf, "limit is -inf, expected a finite number"),
         (OPTIONAL, math.inf, "optional is inf, expected a finite number, or NaN where"),
         (WORD, "c", "word is 'c', expected one of a, b"),
         (LIST, [1.0, math.nan], "list is [1.0, nan], expected finite numbers"),
     ],
 )
-def test_what_may_not_be(entry: NodeParameter, value: object, said: str) -> None:
+def test_what_may_not_be(entry: Quantity, value: object, said: str) -> None:
     problem = entry.problem(value)
     assert problem is not None
     assert problem.startswith(said)
 
 
 @pytest.mark.parametrize("entry", [*TUNE_PARAMETERS, *FIXED_PARAMETERS, *PLANT])
-def test_every_parameter_is_described_and_its_default_allowed(entry: NodeParameter) -> None:
+def test_every_parameter_is_described_and_its_default_allowed(entry: Quantity) -> None:
     descriptor = descriptor_of(entry)
     assert "." in descriptor.description
     assert descriptor.additional_constraints

@@ -20,7 +20,7 @@ import yaml
 from pages import ROOT, rows
 from parameter_values import check_parameter_file
 
-from relay_autotune.nodes.parameters import Entry
+from relay_autotune.quantities import Quantity
 from tools.fill_docs import PARAMETER_FILE, TABLES, parameter_file
 
 SHARE = "$(find-pkg-share relay_autotune)/"
@@ -74,7 +74,7 @@ def names_of(node: str) -> set[str]:
     return {name.strip("`") for n, _, name, _ in rows("docs/messages.md", "node") if node in n}
 
 
-def entries_of(node: str) -> dict[str, Entry]:
+def entries_of(node: str) -> dict[str, Quantity]:
     return {entry.name: entry for entry in TABLES[node]}
 
 

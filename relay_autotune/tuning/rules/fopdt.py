@@ -64,7 +64,7 @@ def imc(task: DesignTask) -> tuple[Controller, str]:
     process = fopdt_of("imc", task)
     share = 0.8 if wants_pid("imc", task) else 1.7
     default = max(share * process.dead_time, 0.2 * process.time_constant)
-    given = task.options.closed_loop_time
+    given = task.options.given_closed_loop_time
     closed = default if given is None else given
     why = f"lambda = {closed:.4g} s" + (", as given" if given is not None else "")
     return _imc("imc", task, process, closed, why)

@@ -58,7 +58,7 @@ def simc(task: DesignTask) -> tuple[Controller, str]:
     """
     model = process_of(task)
     pid = wants_pid("simc", task)
-    given = task.options.closed_loop_time
+    given = task.options.given_closed_loop_time
     process = half_rule(model, 2 if pid else 1, given)
     if pid and process.second == 0.0:
         raise TuningError(

@@ -54,7 +54,7 @@ def unstable(task: DesignTask) -> tuple[Controller, str]:
         )
     tau = -lags[0].real
     late = model.dead_time + sum(t.real for t in lags[1:])
-    given = task.options.closed_loop_time
+    given = task.options.given_closed_loop_time
     if not late > 0.0 and given is None:
         raise TuningError(
             "the rule unstable has no bound on the gain of a process without dead time: give the "

@@ -1,0 +1,53 @@
+"""The parameters of identifier_node: method, rule, what is known, what a controller shall do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from relay_autotune.identification import DEFAULT_METHOD, METHODS, Known
+from relay_autotune.quantities import Quantity, declared
+from relay_autotune.tuning import DEFAULT_RULE, RULES
+from relay_autotune.tuning.task import DesignOptions
+
+# A recording tells these.
+_MEASURED = ("noise_std", "amplitude")
+# Names that stand for something else beside those of a controller.
+_PREFIXED = {"gain": "known_gain", "dead_time": "known_dead_time"}
+
+KNOWN = tuple(
+    replace(each, name=_PREFIXED.get(each.name, each.name), flag=each.name)
+    for each in declared(Known)
+)
+DESIGN = tuple(each for each in declared(DesignOptions) if each.name not in _MEASURED)
+PARAMETERS = (
+    Quantity(
+        "method",
+        DEFAULT_METHOD,
+        "",
+        "Method whose model is published.",
+        choices=tuple(METHODS),
+    ),
+    Quantity("rule", DEFAULT_RULE, "", "Rule whose gains are published.", choices=tuple(RULES)),
+    *KNOWN,
+    *DESIGN,
+)
+
+
+def known_from(values: Mapping[str, Any]) -> Known:
+    """Return what is known of the process.
+
+    :param values: of the parameters, by name.
+    :raises ParameterError: if a value is out of its range, or the gain is zero.
+    """
+    return Known(**{each.flag: values[each.name] for each in KNOWN})
+
+
+def options_from(values: Mapping[str, Any]) -> DesignOptions:
+    """Return what the parameters ask of a controller.
+
+    :param values: of the parameters, by name.
+    :raises TuningError: if a value is out of its range.
+    """
+    return DesignOptions(**{each.name: values[each.name] for each in DESIGN})
