@@ -21,12 +21,10 @@ from relay_autotune.identification import (
 )
 from relay_autotune.identification.judgement.assessment import assess
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
-from relay_autotune.identification.judgement.direction import speaks_for_other, wrong_direction
-from relay_autotune.identification.judgement.disturbance import (
-    is_far_off,
-    with_its_load,
-    without_disturbance,
-)
+from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
+from relay_autotune.identification.judgement.evidence import Evidence, Loop
+from relay_autotune.identification.judgement.quality import is_far_off
+from relay_autotune.identification.judgement.table import LOOP_CHECKS, MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
@@ -42,8 +40,10 @@ from relay_autotune.tuning import (
     ensemble,
     rule_named,
 )
+from relay_autotune.tuning.loop.analysis import ms_on
 from relay_autotune.tuning.prediction import PredictedMs, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
+from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge
 
 _NO_GAINS = {
     Outcome.ABORTED: "the experiment was aborted",
@@ -51,10 +51,6 @@ _NO_GAINS = {
 }
 # Parameters of a load step: its instant and size.
 _LOAD = 2
-_OPEN_DEAD_TIME = (
-    "no gains: the record goes with a dead time of any length, so that it bounds no gain; record "
-    "a relay test, or a step that stands clear of the noise"
-)
 
 
 @dataclass(frozen=True)
@@ -70,6 +66,7 @@ class Analysis:
     :param reason: why there is no model or no gains; empty where there are both.
     :param added_delay: dead time beside the process's own with which the gains were judged [s]:
         half a sampling period of the controller, and what else its loop adds.
+    :param judgement: what the checks found, and the verdict.
     :param predicted: of a running experiment, Ms with the gains that its model would give; None:
         not asked for, or there would be none.
     """
@@ -82,6 +79,7 @@ class Analysis:
     recommended: int | None = None
     reason: str = ""
     added_delay: float = 0.0
+    judgement: Judgement = NOT_JUDGED
     predicted: PredictedMs | None = None
 
     @property
@@ -93,6 +91,11 @@ class Analysis:
     def best_gains(self) -> Gains | None:
         """The gains that count."""
         return None if self.recommended is None else self.gains[self.recommended]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the gains may be used."""
+        return self.judgement.verdict
 
     @property
     def finding(self) -> Finding:
@@ -135,7 +138,9 @@ def analyse(
     """Identify a record and, where the experiment was completed, tune.
 
     Data that tell no model are a result, not an exception: the reason says what was found and
-    what to do. Only a completed experiment, or data that carry no outcome at all, yield gains.
+    what to do. Only a completed experiment, or data that carry no outcome at all, yield gains,
+    and only where no check of the table in ``identification.judgement`` failed; the verdict says
+    whether they may be used.
 
     :param record: the experiment.
     :param method: the method whose model counts.
@@ -158,7 +163,7 @@ def analyse(
         cycles = cycles_of(record)
         chosen = _guarded(record, method, known)
     except RelayAutotuneError as error:
-        return Analysis(record, cycles, reason=_with_outcome(record, str(error)))
+        return _nothing(record, cycles, error, final=final)
     chosen = without_disturbance(
         chosen, record, cycles, lambda part: _guarded(part, method, known)
     )
@@ -175,10 +180,6 @@ def analyse(
         # Its interval is that of a model which the record contradicts: nothing to end a test on.
         chosen = replace(chosen, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
     models = [chosen]
-    if final and not known.structure and _tells_direction(chosen, record):
-        other = speaks_for_other(chosen, record, beside=0 if driven is record else _LOAD)
-        if other is not None:
-            return Analysis(record, cycles, reason=wrong_direction(other))
     if final:
         if not alone:
             models += _others(driven, method, known, chosen)
@@ -189,18 +190,16 @@ def analyse(
     found = Analysis(record, cycles, tuple(models), 0)
     if not final:
         return _with_prediction(found, rule, rng, simple, options) if predict else found
-    refused = _NO_GAINS.get(record.outcome)
-    if refused:
-        return Analysis(
-            record, cycles, found.models, 0, reason=f"{refused}: no gains. {record.reason}".strip()
-        )
-    return _tuned(found, (rule,) if alone else _first(rule), rng, simple, options)
-
-
-def _tells_direction(chosen: Identification, record: Record) -> bool:
-    """Return whether to ask a record if its relay worked in the right direction."""
-    gains = record.settings is not None and record.outcome not in _NO_GAINS
-    return gains and chosen.method == DEFAULT_METHOD
+    evidence = Evidence(
+        record,
+        found.models[0],
+        beside=0 if driven is record else _LOAD,
+        free=not known.structure,
+        samples=chosen.method == DEFAULT_METHOD,
+    )
+    return _judged(
+        found, evidence, (record,), (rule,) if alone else _first(rule), simple, options, rng
+    )
 
 
 def analyse_jointly(
@@ -229,16 +228,60 @@ def analyse_jointly(
         cycles = cycles_of(first)
         chosen = identify_jointly(records, method, known)
     except RelayAutotuneError as error:
-        return Analysis(first, cycles, reason=_with_outcome(first, str(error)))
+        return _nothing(first, cycles, error)
     told = unequal_amplitudes(records, chosen.model)
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
     found = Analysis(first, cycles, assess((chosen,), first), 0)
-    for record in records:
-        if record.outcome in _NO_GAINS:
-            why = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
-            return replace(found, reason=why)
-    return _tuned(found, _first(rule), rng, _simple(records, known, chosen), options)
+    evidence = Evidence(first, found.models[0], free=False, samples=method == DEFAULT_METHOD)
+    simple = _simple(records, known, chosen)
+    return _judged(found, evidence, records, _first(rule), simple, options, rng)
+
+
+def _nothing(
+    record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError, *, final: bool = True
+) -> Analysis:
+    """Return the analysis of a record that tells no model."""
+    reason = _with_outcome(record, str(error))
+    judgement = Judgement(refused=reason) if final else NOT_JUDGED
+    return Analysis(record, cycles, reason=reason, judgement=judgement)
+
+
+def _judged(
+    found: Analysis,
+    evidence: Evidence,
+    records: Sequence[Record],
+    rules: Sequence[str],
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
+    rng: np.random.Generator | None,
+) -> Analysis:
+    """Judge the model, add gains where nothing forbids them, and judge these."""
+    refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")
+    findings = judge(MODEL_CHECKS, evidence)
+    judgement = Judgement(findings, refused=refused)
+    if judgement.verdict is Verdict.NONE:
+        return _without_gains(found, judgement)
+    task = _task(found, rng, simple, options)
+    tuned = _tuned(found, task, rules)
+    gains = tuned.best_gains
+    if gains is None:
+        return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
+    loop = Loop(gains, lambda model: ms_on(gains, task.in_loop(model)), gains.ms, gains.ms_95)
+    findings = (*findings, *judge(LOOP_CHECKS, replace(evidence, loop=loop)))
+    judgement = Judgement(findings)
+    if judgement.verdict is Verdict.NONE:
+        return _without_gains(found, judgement)
+    return replace(tuned, judgement=judgement)
+
+
+def _refusal(record: Record) -> str:
+    return f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
+
+
+def _without_gains(found: Analysis, judgement: Judgement) -> Analysis:
+    reason = judgement.refused or f"no gains: {judgement.reason}"
+    return replace(found, gains=(), recommended=None, judgement=judgement, reason=reason)
 
 
 def _first(rule: str) -> tuple[str, ...]:
@@ -259,17 +302,8 @@ def _simple(
     return found.model
 
 
-def _tuned(
-    found: Analysis,
-    rules: Sequence[str],
-    rng: np.random.Generator | None,
-    simple: TransferFunction | None,
-    options: DesignOptions | None,
-) -> Analysis:
+def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
     """Add the gains of the rules that apply to the selected model; the first one has to."""
-    if _dead_time_is_open(found.models[0]):
-        return replace(found, reason=_OPEN_DEAD_TIME)
-    task = _task(found, rng, simple, options)
     try:
         first = design(task, rules[0])
     except TuningError as error:
@@ -311,12 +345,6 @@ def _task(
         models=ensemble(chosen, rng=rng or np.random.default_rng(0)),
         describing=_describing_point(found),
     )
-
-
-def _dead_time_is_open(chosen: Identification) -> bool:
-    """Return whether the data go with any dead time, so that they bound no gain."""
-    high = dict(zip(chosen.parameters, chosen.ci95_high, strict=True)).get("dead_time", 0.0)
-    return math.isinf(high)
 
 
 def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:

@@ -6,6 +6,7 @@ A page asks for it with a pair of comments, and what is between them is replaced
 
     <!-- parameters of relay_node -->    <!-- end -->    a table of the node's parameters
     <!-- text of FILE -->                <!-- end -->    a file, in a fenced block
+    <!-- checks of judgement -->         <!-- end -->    the table of checks behind a verdict
 
 It also writes config/parameters.yaml, in which every parameter of every node has its default.
 """
@@ -16,14 +17,16 @@ import math
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.identifier_parameters import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
 from relay_autotune.nodes.tune_parameters import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity
+from relay_autotune.verdict import Check
 
 ROOT = Path(__file__).resolve().parent.parent
 PARAMETER_FILE = ROOT / "config/parameters.yaml"
@@ -37,7 +40,7 @@ TABLES: Mapping[str, Sequence[Quantity]] = {
 }
 
 _BLOCK = re.compile(
-    r"<!-- (?P<kind>parameters|text) of (?P<what>\S+) -->\n.*?<!-- end -->", re.DOTALL
+    r"<!-- (?P<kind>parameters|text|checks) of (?P<what>\S+) -->\n.*?<!-- end -->", re.DOTALL
 )
 
 
@@ -53,7 +56,12 @@ def filled(page: str) -> str:
 
 def _block(asked: re.Match[str]) -> str:
     what = asked["what"]
-    content = table(TABLES[what]) if asked["kind"] == "parameters" else text_of(what)
+    kinds: dict[str, Callable[[str], str]] = {
+        "parameters": lambda name: table(TABLES[name]),
+        "text": text_of,
+        "checks": lambda _: checks_table(CHECKS),
+    }
+    content = kinds[asked["kind"]](what)
     return f"<!-- {asked['kind']} of {what} -->\n\n{content}\n\n<!-- end -->"
 
 
@@ -73,6 +81,31 @@ def table(entries: Iterable[Quantity]) -> str:
         )
         lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
     return "\n".join(lines)
+
+
+def checks_table(checks: Iterable[Check]) -> str:
+    """Return the table of checks, a row for each.
+
+    :param checks: rows of the code's table.
+    """
+    lines = [
+        "| check | what is measured | doubtful above | no gains above | what to do then |",
+        "|---|---|---|---|---|",
+    ]
+    for check in checks:
+        limits = (limit_text(check, limit) for limit in (check.doubtful, check.failed))
+        cells = (f"`{check.name}`", check.what, *limits, check.remedy)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def limit_text(check: Check, limit: float) -> str:
+    """Return a limit with its unit; a dash for none.
+
+    :param check: whose limit it is.
+    :param limit: the number; inf: there is none.
+    """
+    return f"{limit:g} {check.unit}".rstrip() if math.isfinite(limit) else "-"
 
 
 def default_text(default: object) -> str:

@@ -14,7 +14,17 @@ from typing import Any
 from relay_autotune.errors import RelayAutotuneError, SelectionError
 from relay_autotune.quantities import Quantity
 
-DONE, NOTHING_FOUND, USAGE = 0, 1, 2
+DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
+# What a command of several bags ends with is the worst of theirs.
+_WORSE = (DONE, DOUBTFUL, NOTHING_FOUND, USAGE)
+
+
+def worst(*statuses: int) -> int:
+    """Return the exit status that says the worst of several.
+
+    :param statuses: at least one.
+    """
+    return max(statuses, key=_WORSE.index)
 
 
 def finite(text: str) -> float:

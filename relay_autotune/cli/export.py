@@ -69,14 +69,16 @@ class Target:
             )
 
 
-def exported(gains: Gains, how: str, target: Target) -> str:
+def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
     """Return gains as the text of a file.
 
     :param gains: what is to be loaded.
     :param how: "pid_controller" or "yaml".
     :param target: for pid_controller: where they go.
+    :param doubt: what to look at before they are used; empty: they are trusted.
     """
-    return pid_controller(gains, target) if how == "pid_controller" else plain(gains)
+    text = pid_controller(gains, target) if how == "pid_controller" else plain(gains)
+    return f"# DOUBTFUL: {' '.join(doubt.split())}\n{text}" if doubt else text
 
 
 def pid_controller(gains: Gains, target: Target) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
-from relay_autotune.cli.arguments import DONE, guarded, say
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
 from relay_autotune.cli.design_arguments import add_export, export_target
 from relay_autotune.cli.progress import ProgressLine
 from relay_autotune.cli.replay_bag import Done, Job, replay
@@ -28,7 +28,7 @@ number, that looks like measurement and command.
 
 Results go to standard output, everything else to standard error.
 Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command line, or the
-choice of topics, does not fit.
+choice of topics, does not fit; 3 gains of at least one experiment are doubtful.
 
 Examples:
   replay ~/.ros/relay_autotune/20261120T234315Z_2c010118
@@ -79,7 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
     )
-    add_export(parser)
+    add_export(parser).add_argument(
+        "--accept-doubtful", action="store_true", help="write gains that are doubtful, too"
+    )
     return parser
 
 
@@ -105,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
         _tell(done)
         if done.text:
             print(done.text, flush=True)
-        status = max(status, done.status)
+        status = worst(status, done.status)
         analyses += [(done.name, analysis) for analysis in found]
     if options.report and analyses:
         from relay_autotune.cli.report import write_report
@@ -130,7 +132,14 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
             raise SelectionError(
                 "--export writes the gains of one bag alone, without --json and --output"
             )
-        jobs = [replace(jobs[0], export=(options.export, export_target(options)))]
+        target = export_target(options)
+        jobs = [
+            replace(
+                jobs[0],
+                export=(options.export, target),
+                accept_doubtful=options.accept_doubtful,
+            )
+        ]
     return jobs
 
 
@@ -149,8 +158,8 @@ def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
             progress.clear()
             _tell(done)
             results.add(done.name, done.text)
-            failed += done.status != DONE
-            status = max(status, done.status)
+            failed += done.status not in (DONE, DOUBTFUL)
+            status = worst(status, done.status)
             progress(count, len(left))
         progress.clear()
     of_these = f", {failed} of them without a model" if failed else ""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE
 from relay_autotune.errors import RelayAutotuneError, SelectionError
+from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
@@ -34,6 +35,7 @@ class Job:
     :param with_table: whether the table for people is wanted, else the document.
     :param options: what is asked of the controller; None: the defaults.
     :param export: the kind of file that is wanted instead, and where its gains go; None: none.
+    :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Job:
     with_table: bool = False
     options: DesignOptions | None = None
     export: tuple[str, Target] | None = None
+    accept_doubtful: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Anal
     try:
         analyses = analysed(job, said, progress)
         if job.export is not None:
-            text = _exported(analyses, *job.export)
-            return Done(job.name, DONE, tuple(said), text), analyses
+            text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
+            return Done(job.name, status_of(analyses), tuple(said), text), analyses
     except SelectionError as error:
         return _failed(job, said, str(error), USAGE), ()
     except RelayAutotuneError as error:
@@ -91,11 +94,20 @@ def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Anal
     except (Exception, RecursionError) as error:  # noqa: BLE001  it must not stop the other bags
         why = f"{job.name}: could not be analysed: {type(error).__name__}: {error}"
         return _failed(job, said, why, NOTHING_FOUND), ()
-    status = DONE
-    if not any(analysis.models for analysis in analyses):
-        status = NOTHING_FOUND
+    status = status_of(analyses)
+    if status == NOTHING_FOUND:
         said += [f"{job.name}: nothing identified: {a.reason}" for a in analyses]
     return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
+
+
+def status_of(analyses: Sequence[Analysis]) -> int:
+    """Return the exit status that a bag deserves.
+
+    :param analyses: of its experiments.
+    """
+    if not any(a.models and not a.judgement.contradicted for a in analyses):
+        return NOTHING_FOUND
+    return DOUBTFUL if any(a.verdict is Verdict.DOUBTFUL for a in analyses) else DONE
 
 
 def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tuple[Analysis, ...]:
@@ -129,11 +141,13 @@ def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tup
     )
 
 
-def _exported(analyses: Sequence[Analysis], how: str, target: Target) -> str:
+def _exported(
+    analyses: Sequence[Analysis], how: str, target: Target, *, accept_doubtful: bool
+) -> str:
     """Return the gains as a file; there must be those of one experiment alone."""
     from relay_autotune.cli.export import exported
 
-    found = [a.best_gains for a in analyses if a.best_gains is not None]
+    found = [a for a in analyses if a.best_gains is not None]
     if not found:
         why = analyses[0].reason if analyses else "there is no experiment"
         raise RelayAutotuneError(f"no gains to export: {why}")
@@ -142,7 +156,14 @@ def _exported(analyses: Sequence[Analysis], how: str, target: Target) -> str:
             f"{len(found)} experiments have gains and a file holds those of one: choose it by "
             "--start and --end, or take all for tests of one process by --joint"
         )
-    return exported(found[0], how, target).rstrip("\n")
+    only = found[0]
+    if only.verdict is not Verdict.TRUSTED and not accept_doubtful:
+        raise RelayAutotuneError(
+            f"gains are {only.verdict.name.lower()}: {only.judgement.reason}; give "
+            "--accept-doubtful to export them all the same"
+        )
+    assert only.best_gains is not None
+    return exported(only.best_gains, how, target, doubt=only.judgement.reason).rstrip("\n")
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:

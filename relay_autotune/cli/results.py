@@ -11,12 +11,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, worst
 from relay_autotune.errors import BagError, SelectionError
 
 ENDINGS = (".jsonl", ".csv", ".parquet")
 
-_OF_EXPERIMENT = ("start", "duration", "outcome", "reason", "experiment_id")
+_OF_EXPERIMENT = (
+    *("start", "duration", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
+)
 _OF_MODEL = (
     *("method", "structure", "gain", "zeros", "time_constants", "dead_time"),
     *("ultimate_gain", "ultimate_gain_std", "ultimate_frequency", "ultimate_frequency_std"),
@@ -27,7 +29,7 @@ _OF_GAINS = (
 )
 _TEXTS = {
     *("bag", "error", "outcome", "reason", "experiment_id", "method", "structure", "rule"),
-    *("zeros", "time_constants"),
+    *("zeros", "time_constants", "verdict", "verdict_reason"),
 }
 COLUMNS = (
     *("bag", "experiment", "error"),
@@ -114,8 +116,7 @@ class Results:
                 break
             document = self._document(line)
             self.done.add(document["bag"])
-            if not _identified(document):
-                self.status = NOTHING_FOUND
+            self.status = worst(self.status, _status(document))
             end += len(line)
 
     def _document(self, line: bytes) -> dict[str, Any]:
@@ -169,7 +170,7 @@ def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
     if not experiments:
         yield base
     for number, experiment in enumerate(experiments, start=1):
-        row = base | {"experiment": number} | {n: experiment[n] for n in _OF_EXPERIMENT}
+        row = base | {"experiment": number} | {n: experiment.get(n) for n in _OF_EXPERIMENT}
         if experiment["selected"] is not None:
             model = experiment["models"][experiment["selected"]]
             row |= {name: _cell(model[name]) for name in _OF_MODEL}
@@ -184,8 +185,16 @@ def _cell(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, list) else value
 
 
-def _identified(document: dict[str, Any]) -> bool:
-    return any(experiment.get("models") for experiment in document.get("experiments", []))
+def _status(document: dict[str, Any]) -> int:
+    """Return the exit status that a bag deserves, as when it was done."""
+    found = document.get("experiments", [])
+    if not any(e.get("models") and not _contradicted(e) for e in found):
+        return NOTHING_FOUND
+    return DOUBTFUL if any(e.get("verdict") == "doubtful" for e in found) else DONE
+
+
+def _contradicted(experiment: dict[str, Any]) -> bool:
+    return any(check["result"] == "failed" for check in experiment.get("checks", ()))
 
 
 def _pyarrow() -> Any:

@@ -13,6 +13,7 @@ from relay_autotune.confidence import NORMAL_95
 from relay_autotune.exchange.text import date_text, digits, process_text, unit_of
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
+from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
@@ -51,11 +52,25 @@ def _experiment(analysis: Analysis, which: str) -> list[str]:
     if analysis.model is not None:
         lines += ["", *identification_lines(analysis.model)]
         lines += _others(analysis)
+    if analysis.models and analysis.judgement.judged:
+        lines += ["", *verdict_lines(analysis.judgement)]
     if analysis.best_gains is not None:
-        lines += ["", *gains_lines(analysis.best_gains)]
+        lines += ["", *gains_lines(analysis.best_gains, analysis.verdict)]
         lines += _other_gains(analysis)
     if analysis.reason:
         lines += ["", *_wrapped("gains" if analysis.models else "process", analysis.reason)]
+    return lines
+
+
+def verdict_lines(judgement: Judgement) -> list[str]:
+    """Return the verdict on an experiment, with each check that did not pass, as lines."""
+    worse = [f for f in judgement.findings if f.result is not Result.PASSED]
+    if judgement.contradicted and not judgement.refused:
+        # The worst of them stands in the place of the gains.
+        worse = [f for f in worse if f is not judgement.worst]
+    lines = [_line("verdict", judgement.verdict.name.lower())]
+    for found in worse:
+        lines += _wrapped(f"  {found.title.lower()}", found.said)
     return lines
 
 
@@ -195,10 +210,15 @@ def _other_gains(analysis: Analysis) -> list[str]:
     ]
 
 
-def gains_lines(gains: Gains) -> list[str]:
-    """Return a controller with what it does on the model, as lines."""
+def gains_lines(gains: Gains, verdict: Verdict = Verdict.UNKNOWN) -> list[str]:
+    """Return a controller with what it does on the model, as lines.
+
+    :param gains: the controller, or a message with the same fields.
+    :param verdict: on the experiment that it comes from.
+    """
+    mark = "   DOUBTFUL: see the verdict" if verdict is Verdict.DOUBTFUL else ""
     lines = [
-        _line("gains", gains.rule),
+        _line("gains", gains.rule + mark),
         _line(
             "  ISA form",
             f"kc {digits(gains.kc)} u/y   ti {digits(gains.ti)} s   td {digits(gains.td)} s"

@@ -6,7 +6,8 @@ On a terminal the progress is shown in place and in colour (NO_COLOR turns that 
 for each cycle goes to standard error. The result goes to standard output.
 
 Exit status: 0 the tune completed, with gains (of a dry run: it could start); 1 it did not, or
-there is nobody to do it, or the report was not written; 2 the command line does not fit.
+there is nobody to do it, or the report was not written; 2 the command line does not fit; 3 the
+gains are doubtful.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TextIO
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
 from relay_autotune.cli.tune_view import (
     NARROWEST,
     Paint,
@@ -36,6 +37,7 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError
+from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
@@ -207,7 +209,9 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
             print(f"  {what:<26} {command}")
     complete = result.gains.experiment_id or options.record_only
     written = report or not options.report
-    return DONE if client.succeeded and complete and written else NOTHING_FOUND
+    if not (client.succeeded and complete and written):
+        return NOTHING_FOUND
+    return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
 
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ from relay_autotune.cli.table import gains_lines
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.exchange.text import digits, process_text
+from relay_autotune.verdict import Verdict
 
 # By the constants of Tune.Feedback and RelayExperiment.
 STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")
@@ -174,10 +175,20 @@ def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:
         lines.append(f"  {'':<16} the plant is left at the safe command; no gains are given")
     if result.transfer_function.experiment_id:
         lines += ["", *model_lines(result.transfer_function, paint)]
+    if result.transfer_function.experiment_id:
+        lines += ["", *_verdict_lines(result, paint)]
     if result.gains.experiment_id:
-        lines += ["", *gains_lines(result.gains)]
+        lines += ["", *gains_lines(result.gains, Verdict(result.verdict))]
     lines += ["", f"  {'recording':<16} {result.bag or 'none'}"]
     return lines
+
+
+def _verdict_lines(result: Any, paint: Paint) -> list[str]:
+    """Return the verdict with what to look at, in the colour of how good it is."""
+    verdict = Verdict(result.verdict)
+    colour = {Verdict.TRUSTED: _GREEN, Verdict.DOUBTFUL: _YELLOW}.get(verdict, _RED)
+    lines = [f"  {'verdict':<16} {paint(verdict.name.lower(), f'{_BOLD};{colour}')}"]
+    return lines + _continued(textwrap.wrap(result.verdict_reason, _TEXT))
 
 
 def model_lines(message: Any, paint: Paint) -> list[str]:
@@ -239,6 +250,13 @@ def next_commands(
         steps.append(("see every method and rule", f"{prefix}replay {bag}"))
     if result.gains.experiment_id:
         for name in controllers:
+            if result.verdict != Verdict.TRUSTED:
+                steps.append(
+                    (
+                        "allow doubtful gains",
+                        f"ros2 param set {name} accept_doubtful true",
+                    )
+                )
             steps += [
                 ("put the gains in force", f"ros2 service call {name}/apply std_srvs/srv/Trigger"),
                 (
@@ -263,6 +281,8 @@ def document(result: Any, node: str, cancelled: bool, report: str = "") -> dict[
         "experiment_id": result.experiment.experiment_id,
         "outcome": "cancelled" if cancelled else OUTCOMES[result.outcome],
         "reason": result.reason,
+        "verdict": Verdict(result.verdict).name.lower(),
+        "verdict_reason": result.verdict_reason,
         "bag": result.bag or None,
         "report": report or None,
         "transfer_function": _fields(model) if model.experiment_id else None,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from relay_autotune.identification import Identification
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import Gains, Performance
+    from relay_autotune.verdict import Finding, Judgement
 
 _LIMIT_CYCLE = (
     *("period", "period_high", "period_low", "peak_max", "peak_min"),
@@ -83,6 +84,30 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "gains": [gains_fields(gains) for gains in analysis.gains],
         "recommended": analysis.recommended,
         "added_delay": _number(analysis.added_delay),
+        **judgement_fields(analysis.judgement),
+    }
+
+
+def judgement_fields(judgement: Judgement) -> dict[str, Any]:
+    """Return the verdict on an experiment with the table of its checks."""
+    return {
+        "verdict": judgement.verdict.name.lower(),
+        "verdict_reason": judgement.reason,
+        "checks": [_finding(found) for found in judgement.findings],
+    }
+
+
+def _finding(found: Finding) -> dict[str, Any]:
+    return {
+        "name": found.name,
+        "title": found.title,
+        "what": found.what,
+        "value": _number(found.value),
+        "unit": found.unit,
+        "limit": _number(found.limit),
+        "result": found.result.name.lower(),
+        "sentence": found.sentence,
+        "remedy": found.remedy,
     }
 
 

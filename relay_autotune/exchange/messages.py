@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from relay_autotune.errors import ModelError, RecordError, RelayAutotuneError, TuningError
 from relay_autotune.experiment.early_end import Finding
 from relay_autotune.record.record import LARGEST, Cycle, FloatArray, Outcome, Record, RelaySettings
+from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 if TYPE_CHECKING:
     from relay_autotune.identification import Identification
@@ -297,6 +298,7 @@ def fill_transfer_function(
     final: bool = True,
     stamp_ns: int = 0,
     finding: Finding | None = None,
+    judgement: Judgement | None = None,
 ) -> None:
     """Write an identified model into a `TransferFunction` message.
 
@@ -306,6 +308,7 @@ def fill_transfer_function(
     :param final: True once the experiment has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
     :param finding: of a running experiment, with the predicted Ms; None: it is not predicted.
+    :param judgement: of the experiment; None: it was not judged.
     """
     from relay_autotune.identification.judgement.validation import DIFFERENCES
 
@@ -361,6 +364,13 @@ def fill_transfer_function(
     message.support = float(identification.support)
     for name in _PREDICTED:
         setattr(message, name, math.nan if finding is None else float(getattr(finding, name)))
+    _fill_verdict(message, judgement)
+
+
+def _fill_verdict(message: Any, judgement: Judgement | None) -> None:
+    judgement = judgement or NOT_JUDGED
+    message.verdict = int(judgement.verdict)
+    message.verdict_reason = judgement.reason
 
 
 def finding_from_message(message: Any) -> Finding:
@@ -446,6 +456,7 @@ def fill_gains(
     experiment_id: str = "",
     final: bool = True,
     stamp_ns: int = 0,
+    judgement: Judgement | None = None,
 ) -> None:
     """Write controller gains into a `PidGains` message.
 
@@ -454,6 +465,7 @@ def fill_gains(
     :param experiment_id: the id of the experiment they come from.
     :param final: True once the experiment has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
+    :param judgement: of the experiment; None: it was not judged.
     """
     # A relay_node, which has no gains, need not load what computes them.
     from relay_autotune.control.gains import NUMBERS
@@ -467,6 +479,7 @@ def fill_gains(
     message.warnings = [str(text) for text in gains.warnings]
     for name in NUMBERS:
         setattr(message, name, float(getattr(gains, name)))
+    _fill_verdict(message, judgement)
 
 
 def without_impossible(message: Any) -> list[str]:

@@ -55,9 +55,12 @@ class ControllerNode(ServedNode):
         self._results = Results(self, is_stable)
         # The experiment that gains are of, and the gains.
         self._pending: tuple[str, Gains] | None = None
+        # Why they are not to be used without being told to; empty: they are trusted.
+        self._doubt = ""
         self._applying = False
         self._previous: Controller | None = None
         self._model: TransferFunction | None = None
+        self._model_doubt = ""
         self._limits = limits_from(values)
         self._pid = PidController(
             self._gains,
@@ -202,7 +205,10 @@ class ControllerNode(ServedNode):
         if gains is None:
             return
         self._pending = (message.experiment_id, gains)
-        if not self.get_parameter("auto_apply").value:
+        self._doubt = why_doubtful(message)
+        if self._doubt:
+            self.get_logger().warning(f"gains of {message.experiment_id} are {self._doubt}")
+        if self._doubt or not self.get_parameter("auto_apply").value:
             self.get_logger().info(
                 f"gains of {message.experiment_id} wait: {said(gains)}; call "
                 f"{self.get_fully_qualified_name()}/apply or /discard"
@@ -214,7 +220,7 @@ class ControllerNode(ServedNode):
             return
         model = self._results.model(message)
         if model is not None:
-            self._model = model
+            self._model, self._model_doubt = model, why_doubtful(message)
             self._apply_by_itself()
 
     def _on_experiment(self, message: Any) -> None:
@@ -223,7 +229,7 @@ class ControllerNode(ServedNode):
 
     def _apply_by_itself(self) -> None:
         """Apply gains where that is wanted, once record and model of their experiment are here."""
-        if self._pending is None or not self.get_parameter("auto_apply").value:
+        if self._pending is None or self._doubt or not self.get_parameter("auto_apply").value:
             return
         name, gains = self._pending
         doubt = self._results.doubt(name, gains)
@@ -255,6 +261,11 @@ class ControllerNode(ServedNode):
             self._results.check(name, gains)
         except RelayAutotuneError as error:
             return False, f"the gains of {name} are refused: {error}"
+        if self._doubt and not self.get_parameter("accept_doubtful").value:
+            return False, (
+                f"gains of {name} are {self._doubt}; set the parameter accept_doubtful to true to "
+                "have them all the same"
+            )
         if self._remote is not None:
             try:
                 await self._remote.apply(gains)
@@ -318,6 +329,11 @@ class ControllerNode(ServedNode):
         self._verifier.require_samples()
         if self._model is None:
             raise NotVerifiable("no model has come that could predict anything")
+        if self._model_doubt and not self.get_parameter("accept_doubtful").value:
+            raise NotVerifiable(
+                f"the model that would predict the step is {self._model_doubt}; set the parameter "
+                "accept_doubtful to true to step all the same"
+            )
         if self._remote is not None:
             return Verifiable(await self._remote.ready(), self._model, self._limits)
         if self._gains is None or not self._pid.is_automatic:
@@ -409,6 +425,18 @@ def gains_from(values: dict[str, Any]) -> Controller | None:
     if values["kc"] == 0.0:
         return None
     return Controller(**{name: values[name] for name in ("kc", "ti", "td", "tf", "b")})
+
+
+def why_doubtful(message: Any) -> str:
+    """Return why a result is not to be used without being told to; empty: it is trusted.
+
+    :param message: the `PidGains` or `TransferFunction`.
+    """
+    if message.verdict == PidGains.VERDICT_TRUSTED:
+        return ""
+    if message.verdict == PidGains.VERDICT_UNKNOWN:
+        return "not judged, since it carries no verdict"
+    return f"not trusted: {message.verdict_reason}"
 
 
 def limits_from(values: dict[str, Any]) -> Limits:

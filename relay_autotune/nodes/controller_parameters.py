@@ -36,6 +36,13 @@ OTHERS = (
         "True: gains that come are put in force at once; false: only when ~/apply is called.",
     ),
     Quantity(
+        "accept_doubtful",
+        False,
+        "",
+        "True: ~/apply and ~/verify take gains and models whose verdict is not trusted, too; "
+        "auto_apply never does.",
+    ),
+    Quantity(
         "verify_step",
         0.0,
         "y",

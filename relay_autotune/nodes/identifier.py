@@ -160,15 +160,27 @@ class IdentifierNode(ServedNode):
             return response
         name, stamp = record.experiment_id, _last_stamp(record)
         response.success, response.reason = found.model is not None, found.reason
-        for identification in found.models:
+        # Only what counts was judged.
+        for number, identification in enumerate(found.models):
             message = TransferFunction()
             fill_transfer_function(
-                message, identification, experiment_id=name, final=True, stamp_ns=stamp
+                message,
+                identification,
+                experiment_id=name,
+                final=True,
+                stamp_ns=stamp,
+                judgement=found.judgement if number == found.selected else None,
             )
             response.models.append(message)
-        for gains in found.gains:
+        for number, gains in enumerate(found.gains):
             message = PidGains()
-            fill_gains(message, gains, experiment_id=name, stamp_ns=stamp)
+            fill_gains(
+                message,
+                gains,
+                experiment_id=name,
+                stamp_ns=stamp,
+                judgement=found.judgement if number == found.recommended else None,
+            )
             response.gains.append(message)
         response.selected = found.selected or 0
         response.recommended = found.recommended or 0
@@ -253,12 +265,20 @@ class IdentifierNode(ServedNode):
             self.get_logger().warning(f"experiment {name}: {analysis.reason}")
             return analysis.reason
         message = PidGains()
-        fill_gains(message, gains, experiment_id=name, stamp_ns=_last_stamp(record))
+        fill_gains(
+            message,
+            gains,
+            experiment_id=name,
+            stamp_ns=_last_stamp(record),
+            judgement=analysis.judgement,
+        )
         self._gains.publish(message)
         self.get_logger().info(
             f"experiment {name}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
-            f"ti {gains.ti:.6g} s, td {gains.td:.6g} s"
+            f"ti {gains.ti:.6g} s, td {gains.td:.6g} s, {analysis.verdict.name.lower()}"
         )
+        if analysis.judgement.reason:
+            self.get_logger().warning(f"experiment {name}: {analysis.judgement.reason}")
         return ""
 
     def _analysis(self, name: str, found: Any) -> Analysis | None:
@@ -285,6 +305,7 @@ class IdentifierNode(ServedNode):
             final=final,
             stamp_ns=_last_stamp(analysis.record),
             finding=None if final else analysis.finding,
+            judgement=analysis.judgement,
         )
         self._models.publish(message)
         if final:

@@ -148,6 +148,10 @@ class TuneAction:
         result.bag = bag
         result.outcome = summary.outcome
         result.reason = "; ".join(filter(None, (summary.reason, missing)))
+        given = bool(result.gains.experiment_id)
+        told = result.gains if given else result.transfer_function
+        result.verdict = told.verdict if given else Tune.Result.VERDICT_NONE
+        result.verdict_reason = told.verdict_reason or ("" if given else result.reason)
         self._goal = None
         conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
 

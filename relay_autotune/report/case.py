@@ -22,6 +22,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.tuning import Gains, ensemble
+from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 FloatArray = NDArray[np.float64]
 
@@ -114,6 +115,7 @@ class Case:
     :param models_around: models within the uncertainty of the one that counts.
     :param points: of the frequency response, by Fourier integrals over the cycles.
     :param added_delay: dead time that the controller's loop adds to the process [s].
+    :param judgement: what the checks found, and the verdict.
     """
 
     source: str
@@ -135,6 +137,7 @@ class Case:
     models_around: tuple[TransferFunction, ...] = ()
     points: tuple[FrequencyPoint, ...] = ()
     added_delay: float = 0.0
+    judgement: Judgement = NOT_JUDGED
 
     @property
     def model(self) -> ModelCase | None:
@@ -183,6 +186,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         cycles=analysis.cycles or _cycles(record),
         models_around=around(analysis.model),
         added_delay=analysis.added_delay,
+        judgement=analysis.judgement,
         points=measured_points(analysis.models),
     )
 

@@ -8,8 +8,8 @@ from typing import Literal
 
 from relay_autotune.exchange.text import date_text, digits
 from relay_autotune.record.record import Outcome
-from relay_autotune.report.case import Case, ModelCase
-from relay_autotune.tuning import Gains
+from relay_autotune.report.case import Case
+from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
 
@@ -20,17 +20,19 @@ _OUTCOMES = {
     Outcome.ABORTED: "aborted",
     Outcome.FAILED: "failed",
 }
-# Ms of 1.2 to 2 is the range that textbooks recommend (Astrom and Hagglund).
-_USUAL_MS, _LARGEST_MS = 2.0, 2.5
-_GAIN_MARGIN, _PHASE_MARGIN = 2.0, math.radians(30.0)
-# A residual as large as the noise leaves nothing to explain.
-_RESIDUAL_GOOD, _RESIDUAL_FAIR = 1.3, 2.5
-_FIT_GOOD, _FIT_FAIR = 0.95, 0.85
-_WHITE = 0.01
+_TONES: dict[Result, Tone] = {
+    Result.PASSED: "good", Result.DOUBTFUL: "warn", Result.FAILED: "bad",
+}  # fmt: skip
+_VERDICTS: dict[Verdict, tuple[str, Tone]] = {
+    Verdict.TRUSTED: ("gains ready to use", "good"),
+    Verdict.DOUBTFUL: ("doubtful gains: read first what to look at", "warn"),
+    Verdict.NONE: ("model, but no gains", "bad"),
+    Verdict.UNKNOWN: ("not judged", "warn"),
+}
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Chip:
     """What came of an experiment, in a few words.
 
     :param text: for people.
@@ -74,21 +76,14 @@ class Number:
     text: str
 
 
-def verdict_of(case: Case) -> Verdict:
+def verdict_of(case: Case) -> Chip:
     """Return what came of an experiment.
 
     :param case: the experiment.
     """
     if case.model is None:
-        return Verdict("nothing identified", "bad")
-    if case.best_gains is None:
-        return Verdict("model, but no gains", "bad")
-    tones = {check.tone for check in checks_of(case)}
-    if "bad" in tones:
-        return Verdict("gains with serious doubts", "bad")
-    if "warn" in tones or warnings_of(case):
-        return Verdict("gains, with something to read first", "warn")
-    return Verdict("gains ready to use", "good")
+        return Chip("nothing identified", "bad")
+    return Chip(*_VERDICTS[case.judgement.verdict])
 
 
 def facts_of(case: Case, *, with_id: bool) -> tuple[str, ...]:
@@ -115,7 +110,9 @@ def warnings_of(case: Case) -> tuple[str, ...]:
 
     :param case: the experiment.
     """
-    found = list(case.model.warnings) if case.model is not None else []
+    doubtful = case.judgement.verdict is Verdict.DOUBTFUL
+    found = [f.said for f in case.judgement.findings if f.sentence] if doubtful else []
+    found += case.model.warnings if case.model is not None else ()
     if case.best_gains is not None:
         found += case.best_gains.warnings
     disturbed = [c.index + 1 for c in case.cycles if c.disturbed]
@@ -130,83 +127,22 @@ def checks_of(case: Case) -> tuple[Check, ...]:
 
     :param case: the experiment.
     """
-    found = []
-    if case.best_gains is not None:
-        found += [_robustness(case.best_gains), _margins(case.best_gains)]
-    if case.model is not None:
-        found += [c for c in (_fit(case.model), _determined(case.model)) if c is not None]
-    if case.limit_cycle is not None:
-        cycles = len(case.limit_cycle.cycles)
-        agree = f"The last {cycles} cycles agree" if cycles > 1 else "There is one cycle only"
-        found.append(
-            Check("Limit cycle", "settled", f"{agree}.", "good")
-            if case.limit_cycle.converged
-            else Check("Limit cycle", "not settled", "The cycles still differ.", "warn")
-        )
-    return tuple(found)
+    return tuple(_check(found) for found in case.judgement.findings)
 
 
-def _robustness(gains: Gains) -> Check:
-    worst = gains.ms_95 if math.isfinite(gains.ms_95) else gains.ms
-    tone: Tone = "good" if worst <= _USUAL_MS else "warn" if worst <= _LARGEST_MS else "bad"
+def _check(found: Finding) -> Check:
+    unit = f" {found.unit}" if found.unit else ""
+    meaning = found.said if found.sentence else f"{found.what[0].upper()}{found.what[1:]}"
     return Check(
-        "Ms",
-        f"{digits(gains.ms, 3)}, for 95 % of the models below {digits(gains.ms_95, 3)}",
-        "The largest amplification of a disturbance by the loop; 1.2 to 2 is usual.",
-        tone,
+        found.title,
+        f"{_number(found.value)}{unit}, at most {_number(found.limit)}{unit}",
+        f"{meaning}.",
+        _TONES[found.result],
     )
 
 
-def _margins(gains: Gains) -> Check:
-    phase = math.degrees(gains.phase_margin)
-    good = gains.gain_margin >= _GAIN_MARGIN and gains.phase_margin >= _PHASE_MARGIN
-    delay = ""
-    if math.isfinite(gains.delay_margin):
-        delay = f" The loop bears {digits(gains.delay_margin, 3)} s more dead time."
-    factor = digits(gains.gain_margin, 3) if math.isfinite(gains.gain_margin) else "any"
-    return Check(
-        "Margins",
-        f"gain {factor}, phase {digits(phase, 3)}°",
-        f"At least 2 and 30° are wanted.{delay}",
-        "good" if good else "warn",
-    )
-
-
-def _fit(model: ModelCase) -> Check | None:
-    fit = model.fit
-    if not math.isfinite(fit.residual_rms):
-        return None
-    share = f"{100.0 * fit.fit:.2f} %" if math.isfinite(fit.fit) else ""
-    left = f"residual {digits(fit.residual_rms, 3)} y rms"
-    value = f"{share}, {left}" if share else left
-    if math.isfinite(fit.noise_std) and fit.noise_std > 0.0:
-        ratio = fit.residual_rms / fit.noise_std
-        tone = _graded(ratio, _RESIDUAL_GOOD, _RESIDUAL_FAIR)
-        noise = digits(fit.noise_std, 3)
-        meaning = f"The residual is {digits(ratio, 3)} times the noise at rest, {noise} y."
-    else:
-        tone = _graded(-fit.fit, -_FIT_GOOD, -_FIT_FAIR)
-        meaning = "The share of the measurement's movement that the model explains."
-    if math.isfinite(fit.whiteness_p) and fit.whiteness_p < _WHITE:
-        meaning += " It has a pattern that noise would not have."
-    return Check("Fit", value, meaning, tone)
-
-
-def _graded(value: float, good: float, fair: float) -> Tone:
-    return "good" if value <= good else "warn" if value <= fair else "bad"
-
-
-def _determined(model: ModelCase) -> Check | None:
-    if not any(math.isfinite(e.low) for e in model.estimates):
-        return None
-    if not model.undetermined:
-        return Check("Parameters", "determined", "Each is known to better than 20 %.", "good")
-    return Check(
-        "Parameters",
-        f"{', '.join(model.undetermined)} not determined",
-        "Their 95 % intervals are wider than 20 %.",
-        "warn",
-    )
+def _number(value: float) -> str:
+    return f"{value:g}" if math.isinf(value) else digits(value, 3)
 
 
 def numbers_of(case: Case) -> tuple[Number, ...]:
@@ -222,6 +158,7 @@ def numbers_of(case: Case) -> tuple[Number, ...]:
         Number("high / low", f"{digits(cycle.period_high)} s / {digits(cycle.period_low)} s"),
         Number("measurement", f"{digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
         Number("cycles averaged", f"{len(cycle.cycles)}"),
+        Number("limit cycle", "settled" if cycle.converged else "still changing"),
     ]
     if case.settings is not None:
         found += [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,14 @@ from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Outcome, RelaySettings
 from relay_autotune.report.case import Case, around, measured_points, model_case
 from relay_autotune.tuning import Gains
+from relay_autotune.verdict import (
+    NOT_JUDGED,
+    Finding,
+    Judgement,
+    Result,
+    Verdict,
+    verdict_named,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -101,7 +109,29 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         models_around=around(None if selected is None else models[selected]),
         added_delay=_number(e.get("added_delay", 0.0)),
         points=measured_points(models),
+        judgement=_judgement(e),
     )
+
+
+def _judgement(e: dict[str, Any]) -> Judgement:
+    """Return what a document says of an experiment; one without a verdict was not judged."""
+    verdict = verdict_named(str(e.get("verdict", "unknown")))
+    if verdict is Verdict.UNKNOWN:
+        return NOT_JUDGED
+    found = Judgement(tuple(_finding(f) for f in e["checks"]))
+    if verdict is Verdict.NONE and not found.contradicted:
+        found = replace(found, refused=str(e["verdict_reason"]))
+    return found
+
+
+def _finding(f: dict[str, Any]) -> Finding:
+    texts: dict[str, Any] = {
+        n: str(f[n]) for n in ("name", "title", "what", "unit", "sentence", "remedy")
+    }
+    numbers: dict[str, Any] = {
+        n: math.inf if f[n] is None else float(f[n]) for n in ("value", "limit")
+    }
+    return Finding(result=Result[str(f["result"]).upper()], **texts, **numbers)
 
 
 def _index(value: Any, things: Sequence[object]) -> int | None:

@@ -16,8 +16,8 @@ from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
     Check,
+    Chip,
     Number,
-    Verdict,
     checks_of,
     doubts_of,
     facts_of,
@@ -114,7 +114,7 @@ def _variables(column: int) -> str:
 
 
 def _section(case: Case, number: int, many: bool) -> _Section:
-    verdict: Verdict = verdict_of(case)
+    verdict: Chip = verdict_of(case)
     present = [plate for plate in PLATES if not plate.missing(case)]
     alone = sum(not plate.wide for plate in present) == 1
     known = not case.experiment_id or case.experiment_id in case.source

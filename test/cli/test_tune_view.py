@@ -91,7 +91,29 @@ def completed() -> Any:
             experiment_id="x", rule="robust", kc=0.5, ti=4.0, p=0.5, i=0.125, ms_95=NAN
         ),
         bag="/records/x y",
+        verdict=Tune.Result.VERDICT_TRUSTED,
     )
+
+
+def doubtful() -> Any:
+    found = completed()
+    found.verdict = Tune.Result.VERDICT_DOUBTFUL
+    found.verdict_reason = "the cycles differ: look at the valve"
+    return found
+
+
+def test_doubtful_gains_are_marked_and_need_a_parameter_to_be_applied() -> None:
+    text = "\n".join(result_lines(doubtful(), False, Paint()))
+    assert "verdict          doubtful" in text
+    assert "the cycles differ: look at the valve" in text
+    assert "DOUBTFUL: see the verdict" in text
+    commands = [c for _, c in next_commands(doubtful(), ["/controller_node"])]
+    assert "ros2 param set /controller_node accept_doubtful true" in commands
+    assert document(doubtful(), "/relay_node", False)["verdict"] == "doubtful"
+    trusted = "\n".join(result_lines(completed(), False, Paint()))
+    assert "verdict          trusted" in trusted
+    assert "DOUBTFUL" not in trusted
+    assert not any("accept" in c for _, c in next_commands(completed(), ["/controller_node"]))
 
 
 def test_states_and_outcomes_have_the_names_of_the_constants() -> None:

@@ -9,7 +9,7 @@ from virtual_tune import tuned
 from relay_autotune.analysis import analyse
 from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import identify
-from relay_autotune.identification.judgement.direction import speaks_for_other
+from relay_autotune.identification.judgement.direction import other_direction
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
 
@@ -73,5 +73,6 @@ def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting
     tune = run(model, sign=1, period=0.03, **acting)
     assert tune.outcome is Outcome.COMPLETED
     record = tune.record()
-    assert speaks_for_other(identify(record, "waveform"), record) is None
+    other = other_direction(identify(record, "waveform"), record)
+    assert other is None or other.lead < -6.0
     assert analyse(record, alone=True).best_gains is not None

@@ -14,6 +14,7 @@ from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.report import figures, page
+from relay_autotune.verdict import Judgement
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
@@ -55,9 +56,14 @@ def aborted(reason: str = "the operator pressed the button") -> Analysis:
     found = completed()
     record = replace(found.record, outcome=Outcome.ABORTED, reason=reason)
     why = f"the experiment was aborted: no gains. {reason}"
-    return replace(found, record=record, gains=(), recommended=None, reason=why)
+    judgement = replace(found.judgement, refused=why)
+    return replace(
+        found, record=record, gains=(), recommended=None, reason=why, judgement=judgement
+    )
 
 
 def fruitless(reason: str = "found no response to the command") -> Analysis:
     """Return an experiment that gave nothing."""
-    return Analysis(completed().record, completed().cycles, reason=reason)
+    return Analysis(
+        completed().record, completed().cycles, reason=reason, judgement=Judgement(refused=reason)
+    )

@@ -146,10 +146,25 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
     gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
     experiments.publish(experiment_of(PROCESS, "wrong"))
-    model = TransferFunction(final=True, numerator=[0.9], denominator=[0.8, 1.0], dead_time=0.4)
+    model = TransferFunction(
+        final=True,
+        verdict=TransferFunction.VERDICT_TRUSTED,
+        numerator=[0.9],
+        denominator=[0.8, 1.0],
+        dead_time=0.4,
+    )
     model.experiment_id = "wrong"
     models.publish(model)
-    gains.publish(PidGains(final=True, kc=0.9, ti=0.8, b=1.0, experiment_id="wrong"))
+    gains.publish(
+        PidGains(
+            final=True,
+            verdict=PidGains.VERDICT_TRUSTED,
+            kc=0.9,
+            ti=0.8,
+            b=1.0,
+            experiment_id="wrong",
+        )
+    )
     rig.until(lambda: len(commands) > 400, "a closed loop")
     status, result = verify(rig)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
@@ -190,7 +205,17 @@ rclpy.spin(node)
 
     assert values() == [1.0, 1.0, 1.0]
     gains.publish(
-        PidGains(final=True, kc=2.0, ti=4.0, td=0.125, p=2.0, i=0.5, d=0.25, experiment_id="one")
+        PidGains(
+            final=True,
+            verdict=PidGains.VERDICT_TRUSTED,
+            kc=2.0,
+            ti=4.0,
+            td=0.125,
+            p=2.0,
+            i=0.5,
+            d=0.25,
+            experiment_id="one",
+        )
     )
     rig.until(lambda: "gains of one wait" in controller.log, "the gains")
     applied = rig.until(
@@ -199,7 +224,16 @@ rclpy.spin(node)
     assert "/pid_controller has the gains of one" in applied.message
     assert values() == [2.0, 0.5, 0.25]
     gains.publish(
-        PidGains(final=True, kc=200.0, ti=4.0, p=200.0, i=50.0, d=0.0, experiment_id="two")
+        PidGains(
+            final=True,
+            verdict=PidGains.VERDICT_TRUSTED,
+            kc=200.0,
+            ti=4.0,
+            p=200.0,
+            i=50.0,
+            d=0.0,
+            experiment_id="two",
+        )
     )
     rig.until(lambda: "gains of two wait" in controller.log, "the gains")
     refused = trigger(rig, "apply")

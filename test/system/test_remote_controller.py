@@ -81,11 +81,25 @@ class Loop:
 
     def apply(self, p: float, i: float, gain: float) -> None:
         """Let gains and a model come, and put them in force."""
-        model = TransferFunction(final=True, denominator=[0.3, 1.0], dead_time=0.1)
+        model = TransferFunction(
+            final=True,
+            verdict=TransferFunction.VERDICT_TRUSTED,
+            denominator=[0.3, 1.0],
+            dead_time=0.1,
+        )
         model.numerator = [gain]
         self.models.publish(model)
         self.gains.publish(
-            PidGains(final=True, kc=p, ti=p / i, p=p, i=i, b=1.0, experiment_id=f"with {p:g}")
+            PidGains(
+                final=True,
+                verdict=PidGains.VERDICT_TRUSTED,
+                kc=p,
+                ti=p / i,
+                p=p,
+                i=i,
+                b=1.0,
+                experiment_id=f"with {p:g}",
+            )
         )
         said = f"gains of with {p:g} wait"
         self.rig.until(lambda: said in self.controller.log, "the gains")

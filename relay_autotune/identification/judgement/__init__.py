@@ -1,1 +1,1 @@
-"""How far a model is to be trusted: quality, validation, direction, load, advice."""
+"""How far a model is to be trusted: the table of checks and its verdict, and what they ask."""

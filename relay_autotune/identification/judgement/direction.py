@@ -9,7 +9,7 @@ such a model have the wrong sign, and the loop would run away.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,6 @@ _MOST_SAMPLES = 4096
 _CORRELATED = 2.0
 # Part of the measurement's range from which something was estimated beside the model.
 _BESIDE = 1e-6
-# Difference of the criterion from which the relay's own direction is clear, for odds of e^3.
-_CLEAR = 6.0
 # How many times the fast lag the slow one is at the start.
 _SLOWER = (2.0, 6.0, 20.0)
 # An answer that turns only so many times the test's length after a step is a drift.
@@ -51,16 +49,28 @@ _HORIZON = 2.0
 _TRIAL = 1e-6
 
 
-def speaks_for_other(
+@dataclass(frozen=True)
+class OtherDirection:
+    """A model of the other direction than the relay worked in.
+
+    :param model: the best one.
+    :param lead: criterion of the relay's own direction minus this one's; a difference of 6 is
+        odds of e^3.
+    """
+
+    model: TransferFunction
+    lead: float
+
+
+def other_direction(
     found: Identification, record: Record, *, beside: int = 0
-) -> TransferFunction | None:
-    """Return a model of the other direction that may explain a record; None: there is none.
+) -> OtherDirection | None:
+    """Return the best model of the other direction; None: the record does not ask for one.
 
     A process at rest before the relay needs neither drift nor load nor initial state in its own
     direction, so the other one is given none of them, and is asked only where the model of the
     relay's direction needs them or leaves something unexplained. The two are compared by the
-    Bayesian information criterion, and where it does not clearly speak for the relay's, the other
-    one may be true.
+    Bayesian information criterion.
 
     :param found: what was identified from all samples, in the direction of the relay.
     :param record: the relay test.
@@ -94,22 +104,7 @@ def speaks_for_other(
     left = n * float(np.mean(residual**2)) / scale**2
     told = information_criterion(left, n, parameters, floor, each)
     other = information_criterion(state.cost, n, state.parameters, floor, each)
-    return model if other < told + _CLEAR else None
-
-
-def wrong_direction(other: TransferFunction) -> str:
-    """Return why there is no model where a record speaks for the other direction.
-
-    :param other: the model that it speaks for.
-    """
-    sign = other.process_sign
-    raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
-    return (
-        f"the relay took it that a higher command {lowers} the measurement, but the record goes "
-        f"as well with a process where it {raises} it in the end, after a first answer the other "
-        f"way: have the relay work in the other direction (process_gain_sign {sign}; 0: it is "
-        "found), or test again when nothing drifts"
-    )
+    return OtherDirection(model, told - other)
 
 
 def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:

@@ -10,66 +10,17 @@ import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification
-from relay_autotune.identification.shown.symmetric_cycle import roughness
+from relay_autotune.identification.judgement.quality import is_contradicted, misfit
 from relay_autotune.record.record import Cycle, PiecewiseConstant, Record
 
-# A fit is looked at again if its residual is larger than so many times the noise, known to 10 %
-# from the 50 samples before the test, and than this part of the measurement's spread; its record's
-# end alone is better if what it leaves beyond the noise is so much less.
-_MORE_THAN_NOISE = 1.3
-_MORE_THAN_SPREAD = 0.02
+# The end of a record alone is better if what it leaves beyond the noise is so much less.
 _BETTER = 0.5
-# What is less probable than this as noise is looked at again for a load.
-_NOT_WHITE = 1e-6
-# With so many times the noise, and so much of the spread, left over, a model is another process's.
-_FAR_OFF_NOISE = 2.0
-_FAR_OFF_SPREAD = 0.05
 
 # A load is looked for in these structures, the second one being what was found without it.
 _SIMPLE = ("sopdt", "", "fopdt")
 
 # So many last cycles are kept.
 KEPT_CYCLES = 3
-
-
-def fits_badly(found: Identification, record: Record) -> bool:
-    """Return True if the model leaves more than noise, so that a disturbance may be the cause.
-
-    :param found: what was identified from the whole record.
-    :param record: the record.
-    """
-    residual, noise = found.fit.residual_rms, record.noise_std
-    if math.isnan(residual):
-        return False
-    if residual <= _MORE_THAN_SPREAD * float(np.std(record.measurement)):
-        return False
-    return math.isnan(noise) or residual > _MORE_THAN_NOISE * noise
-
-
-def is_contradicted(found: Identification, record: Record) -> bool:
-    """Return True if the model fits badly, or what it leaves is clearly no noise.
-
-    :param found: what was identified from the whole record.
-    :param record: the record.
-    """
-    if not found.fit.residual_rms > _MORE_THAN_SPREAD * float(np.std(record.measurement)):
-        return False
-    # Where the noise is not known, only its shape tells.
-    known = not math.isnan(record.noise_std)
-    return (known and fits_badly(found, record)) or found.fit.whiteness_p < _NOT_WHITE
-
-
-def is_far_off(found: Identification, record: Record) -> bool:
-    """Return True if the model leaves so much that its intervals say nothing.
-
-    :param found: what was identified.
-    :param record: its record.
-    """
-    residual = found.fit.residual_rms
-    if not residual > _FAR_OFF_SPREAD * float(np.std(record.measurement)):
-        return False
-    noise = roughness(record) if math.isnan(record.noise_std) else record.noise_std
-    return residual > _FAR_OFF_NOISE * noise
 
 
 def _unexplained(found: Identification, record: Record) -> float:
@@ -122,7 +73,7 @@ def without_disturbance(
     :param identify: identifies a record by the same method.
     :return: the better identification; what it has left out is a warning, and NaN in ``fitted``.
     """
-    end = last_cycles(record, cycles) if fits_badly(found, record) else None
+    end = last_cycles(record, cycles) if misfit(found, record) > 1.0 else None
     if end is None:
         return found
     try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 from relay_autotune.control.gains import Performance
-from relay_autotune.errors import TuningError
+from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.loop.control_law import ControlLaw
 from relay_autotune.tuning.loop.margins import frequencies, margins, sensitivity_peaks
@@ -15,7 +17,7 @@ from relay_autotune.tuning.task import DesignTask
 # What was asked for may be missed by so little without a word.
 _HELD = 1.01
 
-__all__ = ["analyse_loop", "cautions", "frequencies", "is_stable", "sensitivity_peaks"]
+__all__ = ["analyse_loop", "cautions", "frequencies", "is_stable", "ms_on", "sensitivity_peaks"]
 
 
 def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
@@ -57,6 +59,22 @@ def analyse_loop(
         effort_load=figures.effort_load,
         noise_gain=noise_gain(controller, model, sample_period),
     )
+
+
+def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
+    """Return Ms of a controller on any model; infinite where the loop is unstable.
+
+    :param controller: the gains, or any other linear controller.
+    :param model: the process, with all dead time of the loop.
+    """
+    try:
+        if not is_stable(controller, model):
+            return math.inf
+    except RelayAutotuneError:
+        # Nobody can tell, which is no better.
+        return math.inf
+    grid = frequencies(*controller.characteristic(model))
+    return sensitivity_peaks(lambda s: controller(s) * model(s), grid)[0]
 
 
 def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:

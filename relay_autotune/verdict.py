@@ -1,0 +1,195 @@
+"""What is said of an experiment: one finding for each check, and one verdict from all of them."""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from relay_autotune.errors import ParameterError
+from relay_autotune.exchange.text import digits
+
+if TYPE_CHECKING:
+    from relay_autotune.identification.judgement.evidence import Evidence
+
+
+class Verdict(enum.IntEnum):
+    """Whether gains may be used; the values are those of TransferFunction.msg and PidGains.msg.
+
+    TRUSTED: every check passed. DOUBTFUL: there are gains, and something to look at first. NONE:
+    there are no gains. UNKNOWN: nobody has judged, as while an experiment runs.
+    """
+
+    UNKNOWN = 0
+    TRUSTED = 1
+    DOUBTFUL = 2
+    NONE = 3
+
+
+class Result(enum.IntEnum):
+    """What came of one check, the better the smaller."""
+
+    PASSED = 0
+    DOUBTFUL = 1
+    FAILED = 2
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a check measured on one experiment.
+
+    :param value: in the check's unit; NaN counts as beyond every limit.
+    :param detail: what more the sentence has to say, such as names; it stands for ``{detail}``.
+    """
+
+    value: float
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One row of the table of checks. A larger number is always the worse one.
+
+    :param name: in documents and tests.
+    :param title: for people.
+    :param what: what is measured, for the guide.
+    :param unit: of the number; "" for a pure number.
+    :param doubtful: the result is doubtful above this number; inf: never.
+    :param failed: there are no gains above this number; inf: never.
+    :param sentence: what is said of a result that did not pass; ``{value}``, ``{limit}`` and
+        ``{detail}`` are filled in.
+    :param remedy: what to do then.
+    :param measure: measures it; None: it does not apply to this experiment.
+    """
+
+    name: str
+    title: str
+    what: str
+    unit: str
+    sentence: str
+    remedy: str
+    measure: Callable[[Evidence], Measured | None]
+    doubtful: float = math.inf
+    failed: float = math.inf
+
+    def __call__(self, evidence: Evidence) -> Finding | None:
+        """Return what the check finds; None if it does not apply.
+
+        :param evidence: the experiment with what was made of it.
+        """
+        measured = self.measure(evidence)
+        if measured is None:
+            return None
+        value = measured.value
+        # Written so that NaN does not pass.
+        result = Result.PASSED
+        if not value <= self.doubtful:
+            result = Result.DOUBTFUL
+        if not value <= self.failed:
+            result = Result.FAILED
+        limit = self.failed if result is Result.FAILED else min(self.doubtful, self.failed)
+        found = Finding(self.name, self.title, self.what, value, self.unit, limit, result)
+        if result is Result.PASSED:
+            return found
+        number = f"{value:g}" if math.isinf(value) else digits(value, 3)
+        said = self.sentence.format(value=number, limit=digits(limit, 3), detail=measured.detail)
+        return replace(found, sentence=said, remedy=self.remedy)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found.
+
+    :param name: of the check.
+    :param title: of the check, for people.
+    :param what: what was measured.
+    :param value: the measured number; NaN: it could not be computed.
+    :param unit: of value and limit; "" for pure numbers.
+    :param limit: what the number may be at most; where the check failed, the limit of that.
+    :param result: what came of it.
+    :param sentence: what a result that did not pass means; empty: it passed.
+    :param remedy: what to do then.
+    """
+
+    name: str
+    title: str
+    what: str
+    value: float
+    unit: str
+    limit: float
+    result: Result
+    sentence: str = ""
+    remedy: str = ""
+
+    @property
+    def said(self) -> str:
+        """What was found and what to do, in one sentence."""
+        return f"{self.sentence}: {self.remedy}"
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What all checks found, and whether the gains may be used.
+
+    :param findings: of the checks that apply, in the order of the table.
+    :param refused: why there are no gains whatever the checks say; empty: nothing forbids them.
+    :param judged: False: no check was made, as while an experiment runs.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    refused: str = ""
+    judged: bool = True
+
+    @property
+    def worst(self) -> Finding | None:
+        """The first finding with the worst result; None where all passed."""
+        found = max(self.findings, key=lambda f: f.result, default=None)
+        return None if found is None or found.result is Result.PASSED else found
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the record contradicts the model: a check failed."""
+        return any(f.result is Result.FAILED for f in self.findings)
+
+    @property
+    def verdict(self) -> Verdict:
+        """What all of it comes to."""
+        if not self.judged:
+            return Verdict.UNKNOWN
+        if self.refused or self.contradicted:
+            return Verdict.NONE
+        return Verdict.TRUSTED if self.worst is None else Verdict.DOUBTFUL
+
+    @property
+    def reason(self) -> str:
+        """Why the verdict is not better, what to look at, in one sentence; empty: trusted."""
+        if self.refused:
+            return self.refused
+        worst = self.worst
+        return "" if worst is None else worst.said
+
+
+NOT_JUDGED = Judgement(judged=False)
+
+
+def judge(checks: Sequence[Check], evidence: Evidence) -> tuple[Finding, ...]:
+    """Return what the checks of a table find, without those that do not apply.
+
+    :param checks: rows of the table.
+    :param evidence: the experiment with what was made of it.
+    """
+    return tuple(found for check in checks if (found := check(evidence)) is not None)
+
+
+def verdict_named(name: str) -> Verdict:
+    """Return the verdict that a document names.
+
+    :raises ParameterError: if there is none of that name.
+    """
+    try:
+        return Verdict[name.upper()]
+    except KeyError:
+        known = ", ".join(v.name.lower() for v in Verdict)
+        raise ParameterError(f"verdict {name!r} is not one of {known}") from None
