@@ -22,9 +22,9 @@ _OTHERS = {
     signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH,
     signal.SIGTTIN, signal.SIGTTOU,
 }  # fmt: skip
-# These are obeyed even where the process was started with them ignored, as in the background of a
-# script; SIGHUP then is not, which is what nohup is for.
-_ALWAYS = {signal.SIGINT, signal.SIGTERM}
+# These are obeyed even where the process was started with them ignored, as a shell does with the
+# first two in the background of a script; SIGHUP then is not, which is what nohup is for.
+_ALWAYS = {signal.SIGINT, signal.SIGQUIT, signal.SIGTERM}
 
 
 def ending_signals() -> set[int]:
