@@ -173,6 +173,15 @@ class RelayExperiment:
         return self._procedure.kicked_at
 
     @property
+    def latest(self) -> float:
+        """Time from the first sample on by which it is over or a part of it [s], gaps aside.
+
+        It grows when a part begins, or takes longer than before; an experiment that lasts longer
+        has failed. Infinite where only max_duration limits the part.
+        """
+        return self._procedure.latest
+
+    @property
     def cycles_left(self) -> int:
         """Number of cycles until the end, as far as one can tell; at least 1 while it runs."""
         return max(self.parameters.min_cycles + 1 - self.cycle_count, 0 if self.finished else 1)
@@ -268,10 +277,9 @@ class RelayExperiment:
         if not samples:
             self._origin = float(time)
         t, y = float(time) - self._origin, float(measurement)
-        samples.time.append(t)
-        samples.measurement.append(y)
+        samples.add(t, y)
         over = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
-        command = self.baseline if over else procedure.answer(t, y)
+        command = self.baseline if over else procedure.answer(samples.seen[-1], y)
         if procedure.state in _OUTCOMES:
             command = self._ended(y)
         elif self.parameters.command_rate > 0.0:
@@ -360,6 +368,12 @@ class RelayExperiment:
                 State.FAILED,
                 f"max_duration {p.max_duration:g} s was over {procedure.where()}: allow more time "
                 f"or fewer cycles",
+            )
+        elif (seen := self._samples.seen[-1]) > procedure.latest:
+            procedure.end(
+                State.FAILED,
+                f"the experiment was not over after {seen:.4g} s, longer than its parts may take, "
+                f"{procedure.where()}: let the process rest and look at the recording first",
             )
         return procedure.state in _OUTCOMES
 

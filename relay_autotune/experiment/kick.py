@@ -15,8 +15,8 @@ _RUN = 3
 # or so many samples where that is later: without noise a process without dead time is seen to
 # respond at the first sample, and an interval then says nothing of how fast it is.
 _FIRST_LOOK = 5
-_LAST_LOOK = 50
-_LAST_LOOK_SAMPLES = 200
+LAST_LOOK = 50
+LAST_LOOK_SAMPLES = 200
 
 # Parts of the largest deviation: differing by less is level, being nearer to the rest is back,
 # and having more left at the last look outweighs what was before.
@@ -149,7 +149,7 @@ class DirectionWatch:
             return -self._side
         if self._is_level() or self._tends_back() or self._is_back():
             return self._side
-        if len(self._means) >= _LAST_LOOK and self._samples >= _LAST_LOOK_SAMPLES:
+        if len(self._means) >= LAST_LOOK and self._samples >= LAST_LOOK_SAMPLES:
             return self._side if self._balance() >= 0.0 else -self._side
         return 0
 

@@ -21,13 +21,9 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
+from relay_autotune.experiment.turns import SHORT_STAY, Turns
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.record.record import Cycle, FloatArray, Outcome
-
-# A stay at the low level shorter than this part of the longest stay (less, in proportion to how
-# unequally a biased relay pushes), or of half the time that the process took to respond, cannot be
-# an answer of the process: it is noise at a switch, and no cycle begins after it.
-_SHORT_STAY = 0.2
 
 # Of two instants that rounding tells apart, the later one has come when the earlier one has: part
 # of the sample interval.
@@ -39,6 +35,8 @@ _ROUNDING = 1e-6
 _SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
 _MOST_SHIFTS, _SHIFT = 2, 0.7
 _FOLLOWS = 2
+# A cycle so many times as long as the one before says nothing of a load yet.
+_ALONE = 4.0
 
 # Once a whole cycle was seen, this part of the patience is enough.
 _PATIENCE_IN_CYCLES = 0.4
@@ -46,6 +44,10 @@ _PATIENCE_IN_CYCLES = 0.4
 # What is so many times as far away as the oscillation went has run away, whatever the patience;
 # for so many samples, since a sensor has spikes.
 _RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
+
+# So many cycles more than max_cycles, of two stays of the longest that the relay may stay, is the
+# longest that the switching may last, whatever was counted meanwhile: some may be lost from view.
+_SPARE_CYCLES = 12
 
 # What did not move during so many stays of the relay in a row does not follow it.
 _STAYS = 2
@@ -139,9 +141,15 @@ class Oscillation:
         relay = self._relay
         if relay.update(t, y):
             self.switches += 1
+            self._answers = self._turns.add(
+                t, relay.last_stay, self._balance, is_first=relay.switches == 1
+            )
             self._learn(relay.last_stay)
             self._shifts = 0
-            begins = relay.is_high and not self._is_noise()
+            if begins := relay.is_high and self._answers:
+                self._turns.begin(t)
+            elif self._turns.is_overdue(t, self._samples.interval):
+                self._learn_anew()
             due = t + self._parameters.extra_delay
             self._on_the_way.append((due, relay.is_high, begins))
             self._switched_at.append(len(self._samples) - 1)
@@ -167,7 +175,7 @@ class Oscillation:
         return self._away >= _RUNAWAY_SAMPLES
 
     def _begin(self) -> None:
-        t, y = self._samples.time[-1], self._samples.measurement[-1]
+        t, y = self._samples.seen[-1], self._samples.measurement[-1]
         self._relay = Relay(self.sign, self._setpoint, self._hysteresis, t, y)
         self._is_high = self._relay.is_high
         floor = max(self._hysteresis, abs(y - self._setpoint), 3.0 * self._rest.noise_std)
@@ -177,12 +185,24 @@ class Oscillation:
         self._switched_at.clear()
         self._switches_before = self.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
+        self._turns = Turns(t, self._response_time)
+        self._answers = self._is_lost = False
+        # The shortest cycle before one was lost from view [s]; 0: none was.
+        self._usual = 0.0
+        self._began, self._longest_limit = t, 0.0
         p = self._parameters
         self._learn(self._response_time)
         if not p.max_half_cycle and (p.hysteresis > 0.0 or not math.isnan(p.setpoint)):
             # How far the first switch is from the rest is then the user's choice, and the time
             # to respond says nothing of it.
             self._limit = self._first_limit
+        self._longest_limit = self._limit
+
+    @property
+    def latest(self) -> float:
+        """Time by which it is over, unless a stay before has its limit extended [s]."""
+        cycles = self._parameters.max_cycles + _SPARE_CYCLES
+        return self._began + 2.0 * cycles * self._longest_limit
 
     def _learn(self, stay: float) -> None:
         self._patience.learn(stay, self._samples.interval)
@@ -192,12 +212,43 @@ class Oscillation:
             least = Patience.LEAST_SAMPLES * self._samples.interval
             limit = max(_PATIENCE_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
+        self._longest_limit = max(self._longest_limit, self._limit)
 
-    def _is_noise(self) -> bool:
+    @property
+    def _balance(self) -> float:
+        """The shorter of two stays over the longer one, of a relay that is biased so."""
         amplitude, bias = self._levels.amplitude, abs(self._levels.bias)
-        balance = max(amplitude - bias, 0.0) / (amplitude + bias)
-        longest = max(balance * self._relay.longest_stay, 0.5 * self._response_time)
-        return self._relay.last_stay < _SHORT_STAY * longest
+        return max(amplitude - bias, 0.0) / (amplitude + bias)
+
+    def _learn_anew(self) -> None:
+        """Take what the relay does now for what the process takes, or fail."""
+        turns, most = self._turns, self._parameters.max_cycles
+        self._usual = self._usual or min((cycle.period for cycle in self.cycles), default=0.0)
+        if self._switches_fast(2.0 * turns.longest):
+            return
+        if len(self.cycles) + turns.lost >= most:
+            self._end(
+                Outcome.FAILED,
+                f"no cycle could be told for {turns.lost_for:.3g} s, though the relay went on "
+                f"switching, after {count_cycles(self.cycles)}, and max_cycles, {most}, are over: "
+                f"its stays at the two levels are too unlike each other; check sensor and "
+                f"actuator, and that the process rests at the baseline",
+            )
+            return
+        self._patience.forget(turns.longest)
+        self._is_lost = True
+
+    def _switches_fast(self, period: float) -> bool:
+        """Fail if a period is too short for what the cycles took before one was lost from view."""
+        if period >= SHORT_STAY * self._usual:
+            return False
+        self._end(
+            Outcome.FAILED,
+            f"the relay switches fast, each {0.5 * period:.3g} s or sooner after "
+            f"{count_cycles(self.cycles)}, where a cycle took {self._usual:.3g} s before: check "
+            f"sensor and actuator",
+        )
+        return True
 
     # Cycles.
 
@@ -206,7 +257,12 @@ class Oscillation:
         if len(self.cycle_start) < 2 or self._has_grown():
             return
         cycle = self._cycle_that_ended()
+        if was_lost := self._is_lost:
+            cycle = replace(cycle, disturbed=True)
+            self._is_lost = False
         self.cycles.append(cycle)
+        if self._switches_fast(cycle.period):
+            return
         p = self._parameters
         if is_growing([c.peak_max - c.peak_min for c in self.cycles]):
             self._end(
@@ -222,7 +278,7 @@ class Oscillation:
                 f"{p.cycle_tolerance:g} of half period and amplitude, noise and sample interval "
                 f"allowed for",
             )
-        elif len(self.cycles) >= p.max_cycles:
+        elif len(self.cycles) + self._turns.lost >= p.max_cycles:
             self._complete(
                 f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} do not agree "
                 f"within {p.cycle_tolerance:g} of half period and amplitude"
@@ -232,7 +288,8 @@ class Oscillation:
         else:
             swing = max(c.peak_max - c.peak_min for c in self.cycles)
             self._furthest = 0.5 * _RUNAWAY * swing
-            self._bear_load()
+            if not (was_lost or self._is_alone(cycle.period)):
+                self._bear_load()
 
     def _look_for_noise(self) -> None:
         """Make the amplitude larger, or fail, where the last stays at a level moved nothing."""
@@ -240,7 +297,7 @@ class Oscillation:
         if len(self._switched_at) <= _STAYS or last - first < TELL:
             return
         # While the process passes the band, noise may switch the relay many times.
-        time = self._samples.time[last] - self._samples.time[first]
+        time = self._samples.seen[last] - self._samples.seen[first]
         noise = self._noise_alone(first, last) if time >= _STAYS * self._response_time else ""
         if noise and self._levels.can_grow:
             self._levels.grow()
@@ -287,6 +344,13 @@ class Oscillation:
             min_cycles=p.min_cycles,
             tolerance=p.cycle_tolerance,
         )
+
+    def _is_alone(self, period: float) -> bool:
+        """Return True if a cycle is much longer than the one before: an actuator may have stuck.
+
+        If a load has come, the next one will tell, too.
+        """
+        return len(self.cycles) > 1 and period > _ALONE * self.cycles[-2].period
 
     def _bear_load(self) -> None:
         """Shift the levels by what a load has changed of the mean command."""
@@ -336,7 +400,8 @@ class Oscillation:
         disturbed = sum(cycle.disturbed for cycle in self.cycles)
         if outcome is Outcome.COMPLETED and disturbed:
             self.notes.append(
-                f"{disturbed} of the cycles have a long gap in their samples, or a load came"
+                f"{disturbed} of the cycles have a long gap in their samples, or a load came, or "
+                "they could not be told for a while"
             )
         self.verdict = outcome, reason
 
@@ -344,7 +409,7 @@ class Oscillation:
         """Fail, unless the amplitude can grow or a sign that is in doubt can be reversed."""
         # A half cycle that is no noise shows that the process goes both ways with the relay.
         stays = self.switches - self._switches_before
-        follows = bool(self.cycles) or (stays >= _FOLLOWS and not self._is_noise())
+        follows = bool(self.cycles) or (stays >= _FOLLOWS and self._answers)
         # What stands still, and not only saturates, is no answer to anything.
         moved = has_moved(self._since(self._told_at)[1])
         if self._doubtful and not follows and moved:
@@ -379,7 +444,7 @@ class Oscillation:
 
     def _since(self, time: float) -> tuple[FloatArray, FloatArray]:
         """Return time and measurement from an instant on."""
-        first = bisect_left(self._samples.time, time)
+        first = bisect_left(self._samples.seen, time)
         return self._samples.columns(first, len(self._samples))[:2]
 
     def _why_lost(self, t: float, y: float) -> str:

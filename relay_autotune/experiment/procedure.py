@@ -22,7 +22,12 @@ from collections.abc import Callable
 from functools import partial
 
 from relay_autotune.experiment.faults.no_return import count_cycles
-from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
+from relay_autotune.experiment.kick import (
+    LAST_LOOK,
+    LAST_LOOK_SAMPLES,
+    DirectionWatch,
+    ResponseDetector,
+)
 from relay_autotune.experiment.levels import Levels
 from relay_autotune.experiment.oscillation import Oscillation
 from relay_autotune.experiment.parameters import ExperimentParameters
@@ -41,6 +46,8 @@ KICK_SETTLINGS = 50.0
 
 # With fewer samples a line and a standard deviation mean nothing, whatever settle_time says.
 _LEAST_SETTLING_SAMPLES = 5
+# A part that was not ended by its own rules has lasted too long at so many times its limit.
+_BEYOND = 2.0
 # An interval of the probe has at least this many samples.
 _PROBE_SAMPLES = 2
 # An amplitude that is to be found begins to grow after this part of the settling, or so many
@@ -92,8 +99,11 @@ class Procedure:
         """The measurement at rest at the baseline."""
         self.dead_time_seen = math.nan
         """Time from the kick to the last sample before the response [s]; NaN until it is seen."""
+        self.kicked_at = math.nan
+        """Time of the first kick [s]; NaN before."""
         self.answer: Callable[[float, float], float] = partial(self._settle, Settling())
-        """Take the time [s] and the measurement [y] of the last sample; return the command [u]."""
+        """Take the last sample, its time without gaps [s] and the measurement [y]; return the
+        command [u]."""
 
         self._parameters = parameters
         self._samples = samples
@@ -108,6 +118,7 @@ class Procedure:
         self._hysteresis = math.nan
         self._response_time = math.nan
         self._grow_after = math.inf
+        self._probe_ends = math.inf
 
     @property
     def sign(self) -> int:
@@ -115,9 +126,18 @@ class Procedure:
         return self._oscillation.sign if self._oscillation else self._sign
 
     @property
-    def kicked_at(self) -> float:
-        """Time of the first kick [s]; NaN before."""
-        return self._settled_at
+    def latest(self) -> float:
+        """Time by which the present part must be over, whatever its own rules count [s]."""
+        if self._oscillation is not None:
+            return self._oscillation.latest
+        if self.state is State.PROBE:
+            return self._probe_ends
+        if self.state is State.KICK:
+            return self._settled_at + _BEYOND * self._kick_limit()
+        if self._parameters.max_duration > 0.0:
+            return math.inf
+        longest = max(SETTLING_LIMIT, SETTLING_SAMPLES * self._samples.interval)
+        return _BEYOND * (longest + self._parameters.settle_time)
 
     @property
     def cycles(self) -> list[Cycle]:
@@ -205,7 +225,8 @@ class Procedure:
     def _settled(self, rest: RestState) -> float:
         p = self._parameters
         self.rest = rest
-        self._settled_at = self._samples.time[-1]
+        self._settled_at = self._samples.seen[-1]
+        self.kicked_at = self._samples.time[-1]
         self._setpoint = rest.mean if math.isnan(p.setpoint) else p.setpoint
         self._hysteresis = p.hysteresis if p.hysteresis > 0.0 else 3.0 * rest.noise_std
         return self._kick()
@@ -213,7 +234,7 @@ class Procedure:
     # KICK
 
     def _kick(self) -> float:
-        t, y = self._samples.time[-1], self._samples.measurement[-1]
+        t, y = self._samples.seen[-1], self._samples.measurement[-1]
         # With the sign given, towards the set-point, if that is not where the measurement is.
         is_high = self.sign == 0 or self._starts_high(t, y)
         detector = ResponseDetector(self.rest, t)
@@ -272,6 +293,8 @@ class Procedure:
         watch = DirectionWatch(interval, t, self.rest, detector.side)
         watch.add(t, y)
         self.state = State.PROBE
+        looks = max(LAST_LOOK * interval, LAST_LOOK_SAMPLES * self._samples.interval)
+        self._probe_ends = t + _BEYOND * looks
         self.answer = partial(self._find_direction, watch, t + interval)
         return self._levels.high
 

@@ -35,8 +35,6 @@ class Relay:
         """Instant of the last switch, or of the begin [s]."""
         self.last_stay = 0.0
         """How long it stayed at the level before this one [s]."""
-        self.longest_stay = 0.0
-        """The longest stay between two switches so far [s]."""
         self.switches = 0
         """Number of switches so far."""
 
@@ -51,8 +49,6 @@ class Relay:
         self.is_high = not self.is_high
         self.last_stay = time - self.since
         self.since = time
-        if self.switches > 0:
-            self.longest_stay = max(self.longest_stay, self.last_stay)
         self.switches += 1
         return True
 
@@ -77,6 +73,10 @@ class Patience:
         self._ratio = self.RATIO * (amplitude + abs(bias)) / (amplitude - abs(bias))
         self.limit = math.inf
         """Limit of the present stay [s]."""
+
+    def forget(self, longest: float) -> None:
+        """Take another stay for the longest one so far [s]."""
+        self._longest = longest
 
     def learn(self, stay: float, interval: float) -> None:
         """Set the limit of the stay that begins, from the one that ended.

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from array import array
+from itertools import pairwise
 
 import numpy as np
 
 from relay_autotune.record.record import FloatArray
+
+# An interval counts no more than so many times the mean of those before it: a gap in the samples,
+# or a step of their clock, says nothing of how long the process takes. A sensor that speaks only
+# at a change pauses for less.
+GAP = 300.0
+# Of so many first intervals the mean is that of the shorter half: one of them may be a gap.
+_FIRST = 20
 
 
 class Samples:
@@ -15,18 +23,46 @@ class Samples:
     def __init__(self) -> None:
         self.time = array("d")
         """Instants [s from the first sample]."""
+        self.seen = array("d")
+        """The same without what gaps in the samples, or steps of their clock, add [s]."""
         self.measurement = array("d")
         """Measurements [y]."""
         self.command = array("d")
         """Answers [u]; one fewer while a sample is being answered."""
+        self._gaps = 0.0
+        self._steps = 0
+
+    def add(self, time: float, measurement: float) -> None:
+        """Append a sample that is not answered yet.
+
+        :param time: its instant [s from the first sample], not before that of the last one.
+        :param measurement: [y].
+        """
+        # Several samples of one instant, of a clock that goes in steps, are one step.
+        if self.time and time > self.time[-1]:
+            if self._steps < _FIRST:
+                self._gaps = self._first_gaps(time)
+            else:
+                longest = GAP * self.seen[-1] / self._steps
+                self._gaps += max(0.0, time - self.time[-1] - longest)
+            self._steps += 1
+        self.time.append(time)
+        self.seen.append(time - self._gaps)
+        self.measurement.append(measurement)
+
+    def _first_gaps(self, time: float) -> float:
+        # Few enough to be looked at anew each time, as a first interval that is a gap needs.
+        steps = sorted(b - a for a, b in pairwise((*self.time, time)) if b > a)
+        shorter = steps[: (len(steps) + 1) // 2]
+        return sum(max(0.0, step - GAP * sum(shorter) / len(shorter)) for step in steps)
 
     def __len__(self) -> int:
         return len(self.time)
 
     @property
     def interval(self) -> float:
-        """Mean interval between samples [s]; 0 for fewer than two."""
-        return self.time[-1] / (len(self.time) - 1) if len(self.time) > 1 else 0.0
+        """Mean interval between samples, gaps aside [s]; 0 for fewer than two."""
+        return self.seen[-1] / (len(self.seen) - 1) if len(self.seen) > 1 else 0.0
 
     def columns(self, first: int, stop: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return copies of time, measurement and command of the samples first to stop - 1.

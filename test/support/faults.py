@@ -260,6 +260,13 @@ def frozen(loop: Loop, random: Random) -> None:
     loop.alter = lambda _: value
 
 
+def jittering(loop: Loop, random: Random) -> None:
+    """Let the sensor jump over the relay's band with each sample, after a whole cycle."""
+    loop.rig.until(lambda: loop.cycles, "a whole cycle")
+    size = random.uniform(0.2, 0.4)
+    loop.alter = lambda _: REST + (size if loop.count % 2 else -size)
+
+
 def wrong_sign(loop: Loop, _: Random) -> None:
     loop.gain = -2.0
 
@@ -467,6 +474,7 @@ FAULTS = {
         wrong_sign, "process_gain_sign may be wrong", at_start=True
     ),
     "unstable growth": in_a_tune(growing, "the oscillation grows faster and faster"),
+    "fast switching": in_a_tune(jittering, "the relay switches fast"),
     "step of the source's clock": in_a_tune(
         clock_step(0.2), "a clock has stepped", kind="stamped"
     ),

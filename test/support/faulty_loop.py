@@ -53,6 +53,8 @@ DEFAULTS = {
     "max_deviation": 0.0,
     "max_duration": 0.0,
     "max_half_cycle": 0.0,
+    "min_cycles": 100,
+    "max_cycles": 100,
 }
 KINDS: dict[str, dict[str, Any]] = {
     "plain": {},
@@ -133,6 +135,7 @@ class Loop:
         self.state, self.gain = 0.0, 2.0
         self.alter: Callable[[float], float | None] = lambda y: y
         self.clock_error = 0.0
+        self.stuck_at: float | None = None
         self.now = time.monotonic()
         self.on_the_way = deque([(self.now, 0.0)])
 
@@ -140,6 +143,8 @@ class Loop:
         self.count += 1
         before, self.now = self.now, time.monotonic()
         command = self.commands[-1] if self.commands else BASELINE
+        if self.stuck_at is not None:
+            command = self.stuck_at
         if command == SAFE:
             # The next tune begins at rest at the baseline.
             command = BASELINE
@@ -158,6 +163,14 @@ class Loop:
                 return
             self.said = y
         self.publish(float(y))
+
+    def stick(self) -> None:
+        """Let the actuator stay where it is until :meth:`release`."""
+        self.stuck_at = self.commands[-1]
+
+    def release(self) -> None:
+        """Let the actuator follow its command again."""
+        self.stuck_at = None
 
     def noise(self) -> float:
         return 1e-4 * math.sin(7.0 * self.count**2)

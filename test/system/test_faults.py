@@ -5,6 +5,7 @@ One relay_node serves all that do not end it; the loop about it is played by the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -12,7 +13,7 @@ from random import Random
 
 import pytest
 from faults import FAULTS, abort, have_relay
-from faulty_loop import BASELINE, DEFAULTS, Loop
+from faulty_loop import BASELINE, DEFAULTS, SAFE, Loop
 from loop_rig import RELIABLE, Rig
 from rclpy.node import Node
 from ros_domain import free_domain
@@ -56,6 +57,30 @@ def test_a_fault_ends_in_the_safe_command(loop_of: Callable[[str], Loop], name: 
     loop = loop_of(FAULTS[name].kind)
     for seed in range(RUNS):
         FAULTS[name].course(loop, Random(f"{name} {seed}"))
+
+
+@pytest.mark.parametrize("seed", range(RUNS))
+def test_an_actuator_that_sticks_for_a_moment_is_no_end_of_all_cycles(
+    loop: Loop, seed: int
+) -> None:
+    # One stay of 0.8 s among stays of 0.06 s.
+    sticks = Random(seed).uniform(0.75, 0.85)
+    loop.set(min_cycles=3, max_cycles=12)
+    loop.tune()
+    loop.rig.until(lambda: loop.switches >= 2, "the first switches")
+    loop.stick()
+    loop.rig.run_for(sticks)
+    loop.release()
+    ended = loop.ended()
+    assert ended.reason
+    loop.rig.until(lambda: loop.commands[-1] in (BASELINE, SAFE), "the end")
+    commands = list(ended.command)
+    switches = sum(a != b for a, b in itertools.pairwise(commands))
+    # Twelve cycles, and as many half cycles as three of the long stays hold.
+    assert switches < 2 * 12 + 60
+    if ended.outcome == RelayExperiment.COMPLETED:
+        assert len(ended.cycle_start) > 3
+    loop.check_that_it_stays(commands[-1])
 
 
 @pytest.mark.parametrize(

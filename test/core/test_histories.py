@@ -1,0 +1,153 @@
+"""Random histories: whatever happens to the loop, an experiment ends, with a reason, in time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fopdt_plant import FopdtPlant
+from histories import History
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relay_autotune.experiment.samples import GAP, Samples
+from relay_autotune.experiment.turns import OVERDUE, Turns
+from relay_autotune.record import Outcome
+from relay_autotune.relay import ExperimentParameters, RelayExperiment
+
+PART = 30
+
+
+@pytest.mark.parametrize("part", range(10))
+def test_random_histories_end_within_their_bound(part):
+    for seed in range(part * PART, (part + 1) * PART):
+        history = History(seed)
+        history.run()
+        assert not history.problem, f"{history.problem}: {history}"
+
+
+def disturbed(begin, length, *, kind, min_cycles=3, period=0.01, samples=20_000):
+    """Run an experiment on a process with a period of about 0.5 s that something happens to."""
+    plant, tune = (
+        FopdtPlant(1.0, 1.0, 0.1),
+        RelayExperiment(
+            ExperimentParameters(amplitude=1.0, process_gain_sign=1, min_cycles=min_cycles), 0.0
+        ),
+    )
+    command, acting, now = 0.0, 0.0, 0.0
+    for k in range(samples):
+        acts = tune.kicked_at + begin <= k * period < tune.kicked_at + begin + length
+        if not (acts and kind == "stuck"):
+            acting = command
+        load = 0.5 if acts and kind == "load" else 0.0
+        y = plant.advance(k * period, acting + load)
+        if acts and kind == "gap":
+            continue
+        if kind == "clock" and acts and now == 0.0:
+            now = length
+        command = tune.step(k * period + now, y)
+        if tune.finished:
+            break
+    return tune
+
+
+@pytest.mark.parametrize("begin", [0.25, 0.6, 0.75, 1.0, 1.2])
+@pytest.mark.parametrize("kind", ["stuck", "load"])
+def test_one_long_stay_is_no_end_of_all_cycles(kind, begin):
+    tune = disturbed(begin, 2.5, kind=kind)
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    assert tune.cycles[-1].converged
+    undisturbed = disturbed(9e9, 0.0, kind=kind).cycles[-1].period
+    # Levels that were shifted for a load stay so, and one half cycle is longer then.
+    most = 1.15 if kind == "stuck" else 2.5
+    assert 0.9 * undisturbed < tune.cycles[-1].period < most * undisturbed
+    assert tune.elapsed < 60.0
+    assert tune.switches < 150
+
+
+@pytest.mark.parametrize("size", [0.3, 3.0, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("kind", ["gap", "clock"])
+def test_a_gap_and_a_step_of_the_clock_count_as_no_more_than_some_samples(kind, size):
+    if kind == "gap" and size > 1e3:
+        pytest.skip("a process that goes on for so long takes too long to simulate")
+    for begin in (0.35, 0.8, 1.15):
+        tune = disturbed(begin, size, kind=kind, samples=120_000)
+        assert tune.finished
+        assert tune.sample_count < 120 + 12 * 50 + 3 * OVERDUE * GAP, tune.reason
+
+
+def test_fast_switching_after_slow_cycles_ends_it():
+    plant, command = FopdtPlant(1.0, 1.0, 1.0), 0.0
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0, min_cycles=12), 0.0)
+    for k in range(20_000):
+        y = plant.advance(0.02 * k, command)
+        if len(tune.cycles) == 2:
+            # A loose contact.
+            y = 0.3 * (-1) ** (k // 2)
+        command = tune.step(0.02 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.FAILED
+    assert "the relay switches fast, each 0.04 s or sooner after 2 whole cycles" in tune.reason
+    cycle = tune.cycles[0].period
+    assert tune.elapsed < tune.cycles[-1].start + cycle + 3.0 * cycle + 2.0
+
+
+def test_stays_that_are_too_unlike_for_a_cycle_are_counted_all_the_same():
+    tune, command, k = (
+        RelayExperiment(
+            ExperimentParameters(
+                amplitude=1.0, process_gain_sign=1, settle_time=1.0, max_cycles=7
+            ),
+            0.0,
+        ),
+        0.0,
+        0,
+    )
+    # It falls at once, and rises ever so slowly.
+    while not tune.finished and k < 100_000:
+        y = 0.5 if k % 100 == 99 else -0.5
+        command = tune.step(0.01 * k, y if k > 150 else 0.0)
+        k += 1
+    assert tune.outcome is Outcome.FAILED, tune.reason
+    assert "max_cycles, 7, are over" in tune.reason
+    assert k < 150 + 9 * 4 * 100
+    assert command == 0.0
+
+
+def test_whatever_is_counted_it_lasts_no_longer_than_its_parts(monkeypatch):
+    # Let the count of cycles be lost altogether.
+    monkeypatch.setattr(Turns, "add", lambda *_, **__: False)
+    monkeypatch.setattr(Turns, "is_overdue", lambda *_: False)
+    tune = disturbed(9e9, 0.0, kind="load", samples=60_000)
+    assert tune.outcome is Outcome.FAILED
+    assert "longer than its parts may take" in tune.reason
+
+
+@settings(max_examples=50)
+@given(
+    intervals=st.lists(st.floats(0.5, 1.5), min_size=2, max_size=80),
+    at=st.integers(0, 79),
+    gap=st.floats(0.0, 1e9),
+)
+def test_gaps_are_taken_out_of_the_time_and_nothing_else_is(intervals, at, gap):
+    plain, torn = Samples(), Samples()
+    at %= len(intervals)
+    time = late = 0.0
+    for k, interval in enumerate((0.0, *intervals)):
+        time += interval
+        late += interval + (gap if k == at + 1 else 0.0)
+        plain.add(time, 0.0)
+        torn.add(late, 0.0)
+    assert plain.seen == plain.time
+    # One interval alone may be a gap or not.
+    if len(intervals) > 1:
+        assert torn.seen[-1] <= time + min(gap, 1.5 * GAP * 1.5) + 1e-6 * (1.0 + gap)
+    assert math.isfinite(torn.interval)
+
+
+def test_samples_of_one_instant_take_no_time():
+    coarse = Samples()
+    for k in range(5000):
+        coarse.add(0.1 * (k // 100), 0.0)
+    assert coarse.seen == coarse.time
