@@ -49,6 +49,10 @@ _RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
 # longest that the switching may last, whatever was counted meanwhile: some may be lost from view.
 _SPARE_CYCLES = 12
 
+# So many switches in a cycle, and so many times as many as in any before it, are no noise at the
+# edges of the band.
+_CHATTER, _CHATTER_RATIO = 40, 10.0
+
 # What did not move during so many stays of the relay in a row does not follow it.
 _STAYS = 2
 
@@ -115,6 +119,7 @@ class Oscillation:
         self._until_converged = until_converged
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
         self._switched_at: deque[int] = deque(maxlen=_STAYS + 1)
+        self._turns: Turns
         self._limit = first_limit
         self._patient_from = -math.inf
         self._share = math.nan
@@ -189,6 +194,8 @@ class Oscillation:
         self._answers = self._is_lost = False
         # The shortest cycle before one was lost from view [s]; 0: none was.
         self._usual = 0.0
+        # The most switches in a cycle, and how many there were when the last one ended.
+        self._most, self._counted = 0, self.switches
         self._began, self._longest_limit = t, 0.0
         p = self._parameters
         self._learn(self._response_time)
@@ -242,26 +249,42 @@ class Oscillation:
         """Fail if a period is too short for what the cycles took before one was lost from view."""
         if period >= SHORT_STAY * self._usual:
             return False
-        self._end(
-            Outcome.FAILED,
-            f"the relay switches fast, each {0.5 * period:.3g} s or sooner after "
-            f"{count_cycles(self.cycles)}, where a cycle took {self._usual:.3g} s before: check "
-            f"sensor and actuator",
+        self._end_fast(
+            f"each {0.5 * period:.3g} s or sooner after {count_cycles(self.cycles)}, where a "
+            f"cycle took {self._usual:.3g} s before"
         )
         return True
+
+    def _chatters(self) -> bool:
+        """Fail if the relay switched far more often in the last cycle than in any before."""
+        count, self._counted = self.switches - self._counted, self.switches
+        most, self._most = self._most, max(self._most, count)
+        if not most or count <= max(_CHATTER_RATIO * most, _CHATTER):
+            return False
+        self._end_fast(
+            f"{count} times in the last of {count_cycles(self.cycles)}, and {most} times at most "
+            f"in those before"
+        )
+        return True
+
+    def _end_fast(self, how: str) -> None:
+        self._end(
+            Outcome.FAILED, f"the relay switches fast, {how}: check the sensor and the actuator"
+        )
 
     # Cycles.
 
     def _begin_cycle(self) -> None:
         self.cycle_start.append(len(self._samples) - 1)
         if len(self.cycle_start) < 2 or self._has_grown():
+            self._counted = self.switches
             return
         cycle = self._cycle_that_ended()
         if was_lost := self._is_lost:
             cycle = replace(cycle, disturbed=True)
             self._is_lost = False
         self.cycles.append(cycle)
-        if self._switches_fast(cycle.period):
+        if self._switches_fast(cycle.period) or self._chatters():
             return
         p = self._parameters
         if is_growing([c.peak_max - c.peak_min for c in self.cycles]):

@@ -53,8 +53,9 @@ DEFAULTS = {
     "max_deviation": 0.0,
     "max_duration": 0.0,
     "max_half_cycle": 0.0,
-    "min_cycles": 100,
+    # In this order they never cross.
     "max_cycles": 100,
+    "min_cycles": 100,
 }
 KINDS: dict[str, dict[str, Any]] = {
     "plain": {},
