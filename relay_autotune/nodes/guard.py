@@ -12,11 +12,19 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from relay_autotune.experiment.experiment import RelayExperiment
+
 # The guard looks so often [s], and at the graph every so many looks.
 LOOK_EVERY = 0.05
 _GRAPH_EVERY = 4
 # What the middleware says of a publisher whose node it has not heard of yet.
 _UNKNOWN = "NODE_NAME_UNKNOWN"
+
+# The time of the samples may stand still for so many times measurement_timeout or repeat_period,
+# and for so long at least [s]; and go so many times slower than the steady clock: with gaps in the
+# samples, or on the clock of a simulation.
+_STANDING, _LEAST_STANDING = 2.0, 5.0
+_SLACK, _SLACK_SIMULATED = 3.0, 100.0
 
 # An actuator that is too slow for the time limit is seen by so many of its last stays in which it
 # never came to the level it was told.
@@ -189,6 +197,59 @@ class Silence:
         """Return a sentence if the limit is passed, else ""."""
         silent = self._age()
         return f"{self._what} for {silent:.3g} s" if silent > self._timeout else ""
+
+
+class Overtime:
+    """A limit on a tune by the steady clock, whatever the clock of its samples does.
+
+    The samples' time may stand still, as a stuck ``/clock`` does, or go slowly: no longer than
+    ``standing``, and altogether no longer than ``slack`` times as long as the experiment and its
+    present part may take by that time.
+
+    :param experiment: the tune.
+    :param standing: longest time without progress of the samples' time [s].
+    :param slack: how many times slower than the steady clock that time may go, at most.
+    """
+
+    def __init__(self, experiment: RelayExperiment, standing: float, slack: float) -> None:
+        self._experiment = experiment
+        self._standing = standing
+        self._slack = slack
+        self._begin = self._moved_at = now()
+        self._elapsed = math.nan
+
+    @classmethod
+    def of(cls, experiment: RelayExperiment, node: Node) -> Overtime:
+        """Return the limit by the node's parameters."""
+        pauses = [
+            float(node.get_parameter(name).value)
+            for name in ("measurement_timeout", "repeat_period")
+        ]
+        simulated = bool(node.get_parameter("use_sim_time").value)
+        by_number = experiment.parameters.sample_period > 0.0
+        return cls(
+            experiment,
+            max(_STANDING * max(pauses), _LEAST_STANDING),
+            _SLACK_SIMULATED if simulated or by_number else _SLACK,
+        )
+
+    def __call__(self) -> str:
+        """Return a sentence if a limit is passed, else ""."""
+        tune, present = self._experiment, now()
+        if tune.elapsed != self._elapsed:
+            self._elapsed, self._moved_at = tune.elapsed, present
+        if (still := present - self._moved_at) > self._standing:
+            return (
+                f"the time of the measurement has stood still at {tune.elapsed:.6g} s for "
+                f"{still:.3g} s: check /clock, or what stamps the measurement"
+            )
+        most = min(tune.latest, tune.parameters.max_duration or math.inf)
+        if (lasted := present - self._begin) > self._slack * most + self._standing:
+            return (
+                f"the tune is not over after {lasted:.4g} s, of which the measurement's clock "
+                f"tells {tune.elapsed:.4g} s: check /clock, or what stamps the measurement"
+            )
+        return ""
 
 
 def now() -> float:

@@ -19,6 +19,7 @@ from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.guard import (
     FollowWatch,
     Guard,
+    Overtime,
     Silence,
     namesake,
     second_publisher,
@@ -159,7 +160,10 @@ class LoopEnds:
         self.commanded = math.nan
         if self._ends.setpoint is None:
             self.handover.take_over()
-        checks = [self._guard.every_look_at_the_graph(self._several)]
+        checks: list[Callable[[], str]] = [
+            Overtime.of(experiment, self._node),
+            self._guard.every_look_at_the_graph(self._several),
+        ]
         if not self._takeover:
             checks.append(
                 self._guard.every_look_at_the_graph(

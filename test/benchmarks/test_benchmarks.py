@@ -20,6 +20,7 @@ QUICK = {
     "latency": ("--quick",),
     "fault_table": ("--quick",),
     "simulated_experiments": ("--quick",),
+    "random_histories": ("--quick",),
     "endurance": ("--quick",),
     "confident": ("--quick",),
     "chang_studies": ("--quick",),

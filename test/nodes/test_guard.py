@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 
-from relay_autotune.nodes.guard import FollowWatch, namesake, second_publisher, second_source
+from relay_autotune.nodes import guard
+from relay_autotune.nodes.guard import (
+    FollowWatch,
+    Overtime,
+    namesake,
+    second_publisher,
+    second_source,
+)
 
 LOW, HIGH = 0.5, 1.5
 TIMEOUT = 0.4
@@ -141,3 +149,30 @@ def test_a_namesake_has_the_name_and_the_namespace():
     assert namesake(Graph(nodes=[mine, mine])).startswith(
         "2 nodes have the name /tank/relay_node, expected one: "
     )
+
+
+@pytest.mark.parametrize(
+    ("rate", "most", "duration", "expected"),
+    [
+        # The samples' time over the steady clock's: as it is, a bit slow, stuck, nearly stuck.
+        (1.0, 100.0, 0.0, ""),
+        (0.5, 100.0, 0.0, ""),
+        (0.0, 100.0, 0.0, "has stood still at 0 s for 5"),
+        (1e-6, 100.0, 0.0, "the tune is not over after 305"),
+        (1e-6, math.inf, 40.0, "the tune is not over after 125"),
+    ],
+)
+def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expected):
+    tune = SimpleNamespace(
+        elapsed=0.0, latest=most, parameters=SimpleNamespace(max_duration=duration)
+    )
+    present = 1000.0
+    monkeypatch.setattr(guard, "now", lambda: present)
+    look, said = Overtime(tune, standing=5.0, slack=3.0), ""
+    # An experiment that goes on by its own time ends by its own limit.
+    while not said and rate * (present - 1000.0) <= most:
+        present += 0.05
+        tune.elapsed = rate * (present - 1000.0)
+        said = look()
+    assert said.startswith("the t") if expected else not said
+    assert expected in said

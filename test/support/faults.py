@@ -333,6 +333,10 @@ def second_node(loop: Loop, _: Random) -> Callable[[], None]:
     return other.destroy_node
 
 
+def clock_stands(loop: Loop, _: Random) -> None:
+    loop.clock_stands = True
+
+
 def abort(loop: Loop, _: Random) -> None:
     answer = loop.rig.call(Trigger, "relay_node/abort", Trigger.Request())
     # A busy listener may acknowledge later than relay_node waits for it; whether the command has
@@ -482,6 +486,9 @@ FAULTS = {
         clock_step(-1.0), "time went backwards", kind="stamped"
     ),
     "/clock that goes back": in_a_tune(clock_step(-1.0), "time went backwards", kind="clock"),
+    "/clock that stands still": in_a_tune(
+        clock_stands, "has stood still", kind="clock", measurement_timeout=2.5
+    ),
     "sensor on change that has left": in_a_tune(
         sensor_leaves, "no measurement on /measurement any more", kind="on change"
     ),

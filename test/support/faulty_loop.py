@@ -136,6 +136,7 @@ class Loop:
         self.state, self.gain = 0.0, 2.0
         self.alter: Callable[[float], float | None] = lambda y: y
         self.clock_error = 0.0
+        self.clock_stands = False
         self.stuck_at: float | None = None
         self.now = time.monotonic()
         self.on_the_way = deque([(self.now, 0.0)])
@@ -177,7 +178,7 @@ class Loop:
         return 1e-4 * math.sin(7.0 * self.count**2)
 
     def publish(self, value: float) -> None:
-        if self.clock is not None:
+        if self.clock is not None and not self.clock_stands:
             message = Clock()
             now = _CLOCK_START + self.count * PERIOD + self.clock_error
             message.clock.sec, message.clock.nanosec = divmod(round(now * 1e9), 1_000_000_000)
