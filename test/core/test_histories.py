@@ -10,10 +10,10 @@ from histories import History
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.samples import GAP, Samples
 from relay_autotune.experiment.turns import OVERDUE, Turns
 from relay_autotune.record.record import Outcome
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 
 PART = 30
 

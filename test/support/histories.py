@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.procedure import KICK_LIMIT, KICK_SETTLINGS
 from relay_autotune.experiment.samples import GAP
 from relay_autotune.experiment.turns import OVERDUE, OVERDUE_SAMPLES
 from relay_autotune.record.record import Outcome
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 
 HAPPENINGS = (
     *("stuck actuator", "weak actuator", "gap", "load", "clock ahead", "clock back"),
