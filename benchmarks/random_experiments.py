@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 from relay_autotune import threads  # noqa: F401  before numpy
 
@@ -19,6 +20,7 @@ from relay_autotune.experiment.experiment import (
 )
 from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Cycle, Outcome, RelaySettings
@@ -70,7 +72,10 @@ def random_process(rng: np.random.Generator) -> TransferFunction:
     swing = {"natural_frequency": 1.0 / tau, "damping": float(rng.uniform(0.3, 0.9))}
     # What is unstable must not wait long: D/tau stays below what a biased relay can hold.
     short = tau * float(np.exp(rng.uniform(math.log(0.03), math.log(0.4))))
-    build = TransferFunction.from_structure
+
+    def build(structure: str, **fields: Any) -> TransferFunction:
+        return structure_named(structure).of_fields(**fields)
+
     match kind:
         case "fopdt" | "integrator_lag":
             return build(kind, gain=gain, time_constants=[tau], dead_time=dead)

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from relay_autotune.experiment.experiment import RelayExperiment
     from relay_autotune.experiment.parameters import ExperimentParameters
     from relay_autotune.identification import METHODS, Identification, Known, identify
-    from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
+    from relay_autotune.process.structures import STRUCTURES
+    from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.process.ultimate import ultimate_point
     from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
     from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
@@ -38,7 +39,8 @@ _HOMES = {
     "bag.records": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification": ("METHODS", "Identification", "Known", "identify"),
-    "process.transfer_function": ("STRUCTURES", "TransferFunction"),
+    "process.structures": ("STRUCTURES",),
+    "process.transfer_function": ("TransferFunction",),
     "exchange.python_control": ("to_control",),
     "record.record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
     "experiment.experiment": ("RelayExperiment",),

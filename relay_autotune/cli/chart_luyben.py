@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.methods.luyben_method import STRUCTURE, identify_step_numbers
+from relay_autotune.identification.methods.luyben_method import (
+    identify_step_numbers,
+    require_structure,
+)
 from relay_autotune.identification.result import Identification
 
 
@@ -17,10 +19,7 @@ def identify_step_chart(numbers: Mapping[str, float], known: Known) -> Identific
     :param known: the structure, which can only be this one.
     :raises IdentificationError: if no such process has these numbers.
     """
-    if known.structure not in ("", STRUCTURE):
-        raise IdentificationError(
-            f"luyben_step has no structure {known.structure!r}; it has {STRUCTURE} only"
-        )
+    require_structure(known)
     return identify_step_numbers(
         numbers["t1"], numbers["t2"], numbers["extremum"], numbers["step"], numbers["dead_time"]
     )

@@ -8,15 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from relay_autotune.errors import SelectionError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods.wang1997 import (
-    PARAMETERS,
     FopdtCycle,
     fopdt_from_biased,
     fopdt_with_gain,
 )
-from relay_autotune.identification.result import Identification, with_uncertainty
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.identification.result import Identification, identified
+from relay_autotune.process.structures import FOPDT
 
 
 def identify_biased_chart(numbers: Mapping[str, float], known: Known) -> Identification:
@@ -71,9 +71,4 @@ def identify_unbiased_chart(numbers: Mapping[str, float], known: Known) -> Ident
 
 
 def _fopdt(method: str, gain: float, time_constant: float, dead_time: float) -> Identification:
-    return with_uncertainty(
-        method,
-        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
-        PARAMETERS,
-        np.array((gain, time_constant, dead_time)),
-    )
+    return identified(method, Estimate.of(FOPDT, np.array((gain, time_constant, dead_time))))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.exchange.text import date_text, digits, process_text, unit_of
+from relay_autotune.exchange.text import date_text, digits, process_text
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.verdict import Judgement, Result, Verdict
@@ -113,12 +113,13 @@ def identification_lines(found: Identification) -> list[str]:
     """Return an identified model with its accuracy, as lines."""
     name = f"{found.structure}, {found.method}"
     lines = _process("process", found.model, name)
-    rows = list(zip(found.parameters, found.values, found.ci95_low, found.ci95_high, strict=True))
-    for label, value, low, high in rows:
+    structure = found.estimate.structure
+    intervals = zip(found.values, found.ci95_low, found.ci95_high, strict=True)
+    for parameter, (value, low, high) in zip(structure.parameters, intervals, strict=True):
+        label, unit = parameter.name, structure.unit(parameter)
         end = digits(high) if np.isfinite(high) else "any"
         interval = f"95 %: {digits(low)} to {end}" if np.isfinite(low) else ""
         doubt = "   not determined" if label in found.undetermined else ""
-        unit = unit_of(label, found.model)
         lines.append(_row(label.replace("_", " "), value, unit, interval + doubt))
     for label, value, std, unit in (
         ("ultimate gain", found.ultimate_gain, found.ultimate_gain_std, "u/y"),

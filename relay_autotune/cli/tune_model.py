@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from relay_autotune.errors import ModelError, SelectionError
-from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
+from relay_autotune.process.structures import GENERAL, STRUCTURES, TABLE, structure_named
+from relay_autotune.process.transfer_function import TransferFunction
 
 _FLAGS = (
     *("gain", "time_constants", "zeros", "dead_time", "integrators", "order", "structure"),
@@ -54,15 +55,13 @@ def _built(given: dict[str, Any]) -> TransferFunction:
     numerator, denominator = given.get("numerator"), given.get("denominator")
     structure = given.get("structure") or ""
     if structure and structure not in STRUCTURES:
-        raise SelectionError(
-            f"unknown structure {structure!r}; known: {', '.join(STRUCTURES[:-1])}"
-        )
+        raise SelectionError(f"unknown structure {structure!r}; known: {', '.join(TABLE)}")
     zeros, lags = (_constants(name, given.get(name)) for name in ("zeros", "time_constants"))
     if denominator is not None and "time_constants" in given and "gain" in given:
         below = _coefficients("denominator", denominator)
         integrators = len(below) - 1 - len(lags)
         gain = _number("gain", given["gain"])
-        return TransferFunction(gain, zeros, lags, integrators, dead_time, structure or "general")
+        return TransferFunction(gain, zeros, lags, integrators, dead_time, structure or GENERAL)
     if numerator is not None or denominator is not None:
         if numerator is None or denominator is None:
             raise SelectionError("numerator and denominator belong together: give both")
@@ -80,9 +79,8 @@ def _built(given: dict[str, Any]) -> TransferFunction:
                 f"a time constant must be > 0 s, found {lag.real:g} s; an unstable process has "
                 "--structure unstable_fopdt and a positive one"
             )
-    if structure and structure != "general":
-        return TransferFunction.from_structure(
-            structure,
+    if structure and structure != GENERAL:
+        return structure_named(structure).of_fields(
             gain=gain,
             time_constants=_real("time_constants", lags),
             zeros=_real("zeros", zeros),
@@ -124,13 +122,13 @@ def _unnamed(
 
 def _recognised(model: TransferFunction) -> TransferFunction:
     """Name the structure of a model that was built from its factors."""
-    if model.structure != "general":
+    if model.structure != GENERAL:
         return model
     lags, zeros = model.time_constants, model.zeros
     real = all(t.imag == 0.0 for t in lags)
     stable = all(t.real > 0.0 for t in lags)
     equal = real and len(lags) > 1 and max(abs(t - lags[0]) for t in lags) <= _EQUAL * abs(lags[0])
-    name = "general"
+    name = GENERAL
     match (model.integrators, len(lags), len(zeros)):
         case (0, 1, 0) if stable:
             name = "fopdt"

@@ -14,13 +14,6 @@ if TYPE_CHECKING:
 _MINUS, _TIMES = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}"
 _SPACE = r" \, "
 
-# Of what is no time.
-_UNITS = {
-    "gain": "y/u",
-    "natural_frequency": "rad/s",
-    "damping": "",
-}
-
 # Coefficients of 1, s, s^2 of one factor.
 _Polynomial = tuple[float, ...]
 
@@ -34,17 +27,6 @@ def digits(value: float, count: int = 4) -> str:
     if not math.isfinite(value):
         return "-"
     return f"{value:#.{count}g}".rstrip(".") if value else "0"
-
-
-def unit_of(parameter: str, model: TransferFunction) -> str:
-    """Return the unit of a parameter of a model.
-
-    :param parameter: its name; what is not listed is a time.
-    :param model: the transfer function, whose integrators the gain's unit depends on.
-    """
-    if parameter == "gain" and model.integrators > 0:
-        return "y/(u s)" if model.integrators == 1 else f"y/(u s^{model.integrators})"
-    return _UNITS.get(parameter, "s")
 
 
 def date_text(start: float) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.atv import identify_atv
 from relay_autotune.identification.methods.chang_method import identify_chang
@@ -14,7 +15,6 @@ from relay_autotune.identification.methods.luyben_method import identify_step
 from relay_autotune.identification.methods.thyagarajan_method import identify_thyagarajan
 from relay_autotune.identification.methods.wang_method import identify_biased, identify_unbiased
 from relay_autotune.identification.result import FitReport, Identification
-from relay_autotune.identification.uncertainty import Estimate, estimate
 from relay_autotune.identification.waveform.method import (
     identify_waveform,
     identify_waveform_jointly,

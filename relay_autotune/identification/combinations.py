@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from relay_autotune.identification.uncertainty import Estimate, Uncertain, estimate
+from relay_autotune.identification.estimate import Estimate, Quantity
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 
@@ -45,16 +45,15 @@ def is_determined(value: float, low: float, high: float) -> bool:
 
 
 def determined_combinations(
-    found: Uncertain, point: tuple[Estimate, Estimate]
+    found: Estimate, point: tuple[Quantity, Quantity]
 ) -> tuple[Combination, ...]:
     """Return the combinations that the data hold, of a model that is not determined as a whole.
 
     :param found: the model with its covariance.
     :param point: K_u and w_u, whose uncertainty is known better than to first order.
     """
-    model = found.build(found.values)
-    asked: list[tuple[str, str, Estimate]] = [
-        (name, unit, estimate(found, function)) for name, unit, function in _asked(model)
+    asked: list[tuple[str, str, Quantity]] = [
+        (name, unit, found.quantity(function)) for name, unit, function in _asked(found.model)
     ]
     if math.isfinite(point[0].value):
         asked += [

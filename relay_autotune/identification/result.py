@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,8 +12,7 @@ from numpy.typing import NDArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
-from relay_autotune.identification.uncertainty import Uncertain
-from relay_autotune.identification.uncertainty import is_logarithmic as is_logarithmic
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 
@@ -50,33 +48,21 @@ class FitReport:
     noise_to_signal_power: float = math.nan
 
 
-def _model_alone(_: FloatArray) -> TransferFunction:
-    raise IdentificationError("this rival is known by its model alone, without parameters")
-
-
 @dataclass(frozen=True)
 class Rival:
     """Another structure that the data do not rule out.
 
-    :param model: its best fit.
+    :param estimate: its best fit, with a covariance where its support is worth it.
     :param support: its weight among all structures tried, 0 to 1.
-    :param build: the transfer function for any values of the parameters.
-    :param parameters: names of the structure's parameters; empty: only the model is known.
-    :param values: their values, shape (p,).
-    :param root: B of their covariance B B', shape (p, k).
     """
 
-    model: TransferFunction
+    estimate: Estimate
     support: float
-    build: Callable[[FloatArray], TransferFunction] = _model_alone
-    parameters: tuple[str, ...] = ()
-    values: FloatArray = field(default_factory=lambda: np.empty(0))
-    root: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the values, shape (p, p)."""
-        return self.root @ self.root.T
+    def model(self) -> TransferFunction:
+        """The transfer function."""
+        return self.estimate.model
 
 
 @dataclass(frozen=True)
@@ -84,11 +70,7 @@ class Identification:
     """A model identified by one method, with what is known of its accuracy.
 
     :param method: name in the registry.
-    :param model: the transfer function.
-    :param build: the transfer function for any values of the parameters.
-    :param parameters: names of the structure's parameters.
-    :param values: their values, shape (p,).
-    :param covariance: of the values, shape (p, p); NaN: not estimated.
+    :param estimate: the parameters of the model and their covariance.
     :param ci95_low: lower ends of the 95 % intervals, shape (p,); NaN: not estimated.
     :param ci95_high: upper ends, shape (p,); NaN: not estimated.
     :param ultimate_gain: K_u [u/y], with the sign of the process; NaN: the model has none.
@@ -115,11 +97,7 @@ class Identification:
     """
 
     method: str
-    model: TransferFunction
-    build: Callable[[FloatArray], TransferFunction]
-    parameters: tuple[str, ...]
-    values: FloatArray
-    covariance: FloatArray
+    estimate: Estimate
     ci95_low: FloatArray
     ci95_high: FloatArray
     ultimate_gain: float = math.nan
@@ -139,123 +117,77 @@ class Identification:
     advice: tuple[str, ...] = ()
 
     @property
+    def model(self) -> TransferFunction:
+        """The transfer function."""
+        return self.estimate.model
+
+    @property
     def structure(self) -> str:
         """Name of the model's structure."""
         return self.model.structure
 
     @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the structure's parameters."""
+        return self.estimate.structure.names
+
+    @property
+    def values(self) -> FloatArray:
+        """Their values, shape (p,)."""
+        return self.estimate.values
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the values, shape (p, p); NaN: not estimated."""
+        return self.estimate.covariance
+
+    @property
     def std(self) -> FloatArray:
         """Standard deviations of the values, shape (p,); NaN: not estimated."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return self.estimate.std
 
 
-def with_uncertainty(
+def identified(
     method: str,
-    build: Callable[[FloatArray], TransferFunction],
-    parameters: tuple[str, ...],
-    values: FloatArray,
-    covariance: FloatArray | None = None,
+    estimate: Estimate,
     quantile: float = NORMAL_95,
     fit: FitReport | None = None,
     warnings: tuple[str, ...] = (),
     fitted: FloatArray | None = None,
 ) -> Identification:
-    """Complete an identification: intervals of the parameters and of the ultimate point.
-
-    Gains and time constants get intervals of their logarithm, since they cannot change sign; a
-    dead time gets a linear one, cut at zero. K_u and w_u follow from the covariance to first
-    order: at a fixed frequency a parameter p changes log G by d, and the point moves by
-
-        dw = -d(arg G)/dp / (d(arg G)/dw),   d(log K_u) = -d(log|G|)/dp - d(log|G|)/dw dw.
+    """Complete an estimate by what follows from it: intervals, K_u and w_u.
 
     :param method: name in the registry.
-    :param build: the model as a function of the values.
-    :param parameters: names, p of them.
-    :param values: shape (p,).
-    :param covariance: shape (p, p); None: not estimated.
+    :param estimate: the model with the covariance of its parameters.
     :param quantile: half width of a 95 % interval in standard deviations.
     :param fit: quality of the fit.
     :param warnings: sentences for the user.
     :param fitted: the model's measurement at the samples; None: not computed.
     :raises IdentificationError: if a value is not finite.
     """
+    names, values = estimate.structure.names, estimate.values
     if not bool(np.all(np.isfinite(values))):
-        found = ", ".join(f"{n} = {v:g}" for n, v in zip(parameters, values, strict=True))
+        found = ", ".join(f"{n} = {v:g}" for n, v in zip(names, values, strict=True))
         raise IdentificationError(f"{method} gave no finite model: {found}")
-    p = len(parameters)
-    model = build(values)
-    cov = np.full((p, p), math.nan) if covariance is None else covariance
-    std = np.sqrt(np.diag(cov))
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        ratio = np.exp(np.minimum(quantile * std / np.abs(values), 700.0))
-        low, high = values / ratio, values * ratio
-    low, high = np.minimum(low, high), np.maximum(low, high)
-    for i, name in enumerate(parameters):
-        if not is_logarithmic(name):
-            low[i], high[i] = values[i] - quantile * std[i], values[i] + quantile * std[i]
-        if name == "dead_time" and np.isfinite(low[i]):
-            low[i] = max(low[i], 0.0)
-    wide = std * quantile > DETERMINED * np.abs(values)
-    undetermined = tuple(n for n, w in zip(parameters, wide, strict=True) if w)
-    point = ultimate_point(model)
+    low, high = estimate.intervals(quantile)
+    wide = estimate.std * quantile > DETERMINED * np.abs(values)
+    point = ultimate_point(estimate.model)
+    stds = (math.nan, math.nan)
     if point is None:
         warnings = (*warnings, "the model has no ultimate point: no gain makes it oscillate")
-    identified = Identification(
+    elif estimate.known:
+        stds = estimate.ultimate_std(point.gain, point.frequency)
+    return Identification(
         method,
-        model,
-        build,
-        parameters,
-        values,
-        cov,
+        estimate,
         low,
         high,
         ultimate_gain=math.nan if point is None else point.gain,
+        ultimate_gain_std=stds[0],
         ultimate_frequency=math.nan if point is None else point.frequency,
+        ultimate_frequency_std=stds[1],
         fit=fit or FitReport(),
         warnings=warnings,
-        undetermined=undetermined,
+        undetermined=tuple(n for n, w in zip(names, wide, strict=True) if w),
         fitted=np.empty(0) if fitted is None else fitted,
     )
-    if point is None or covariance is None:
-        return identified
-    gain_std, frequency_std = ultimate_std(identified, point.gain, point.frequency)
-    return replace(identified, ultimate_gain_std=gain_std, ultimate_frequency_std=frequency_std)
-
-
-def ultimate_std(found: Uncertain, gain: float, frequency: float) -> tuple[float, float]:
-    """Return the standard deviations of K_u and w_u to first order; see with_uncertainty.
-
-    :param found: a model with the covariance of its values.
-    :param gain: its K_u [u/y].
-    :param frequency: its w_u [rad/s].
-    """
-
-    def log_response(x: FloatArray, w: float) -> complex:
-        # At the ultimate point -K_u G is 1, so that its logarithm has no branch nearby.
-        return complex(np.log(-gain * found.build(x)(1j * w)))
-
-    step = 1e-6
-    values = found.values
-    by_frequency = (
-        log_response(values, frequency * (1.0 + step))
-        - log_response(values, frequency * (1.0 - step))
-    ) / (2.0 * step * frequency)
-    gradient_gain, gradient_frequency = [], []
-    for i, (name, value) in enumerate(zip(found.parameters, values, strict=True)):
-        # A dead time or a zero of next to nothing still acts by its part of the period.
-        least = 0.0 if is_logarithmic(name) else 1.0 / frequency
-        size = max(abs(value), least) or 1.0 / frequency
-        up, down = values.copy(), values.copy()
-        up[i], down[i] = value + step * size, value - step * size
-        if name == "dead_time":
-            down[i] = max(down[i], 0.0)
-        change = (log_response(up, frequency) - log_response(down, frequency)) / (up[i] - down[i])
-        dw = -change.imag / by_frequency.imag
-        gradient_frequency.append(dw)
-        gradient_gain.append(-gain * (change.real + by_frequency.real * dw))
-
-    def deviation(gradient: list[float]) -> float:
-        g = np.array(gradient)
-        return math.sqrt(max(float(g @ found.covariance @ g), 0.0))
-
-    return deviation(gradient_gain), deviation(gradient_frequency)

@@ -57,7 +57,7 @@ class RunningFit:
         chosen = self._chosen
         choosing = task.method == DEFAULT_METHOD and not facts.structure
         if choosing and chosen is not None and record.duration < _CHOSEN_ANEW * self._duration:
-            order = chosen.model.order if chosen.structure.startswith("lag_n") else 0
+            order = chosen.estimate.structure.given_order
             facts = replace(facts, structure=chosen.structure, order=order)
             again = self._analyse(record, task, facts, sought)
             if again.model is not None and not again.finding.width(sought) <= wanted:

@@ -23,7 +23,8 @@ from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.process.actuator import Actuator
-from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
+from relay_autotune.process.structures import FIELDS, TABLE, structure_named
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.quantities import Quantity
 
@@ -43,14 +44,20 @@ PARAMETERS = (
         "",
         "",
         "Named structure of the process, instead of the two polynomials.",
-        choices=("", *STRUCTURES[:-1]),
+        choices=("", *TABLE),
     ),
     Quantity("gain", 1.0, "y/u", "Gain of the structure."),
     Quantity("time_constants", (), "s", "Lags of the structure."),
     Quantity("zeros", (), "s", "Time constants of the structure's zeros."),
     Quantity("order", 0, "", "Number of equal lags, for lag_n and lag_n_zero.", 0, 50),
-    Quantity("zeta", 0.0, "", "Damping of the structure's complex pair."),
-    Quantity("w0", 0.0, "rad/s", "Natural frequency of the structure's complex pair.", 0.0),
+    Quantity("damping", 0.0, "", "Damping of the structure's complex pair."),
+    Quantity(
+        "natural_frequency",
+        0.0,
+        "rad/s",
+        "Natural frequency of the structure's complex pair.",
+        0.0,
+    ),
     Quantity("dead_time", 0.0, "s", "Dead time of the process.", 0.0),
     Quantity("sample_period", 0.1, "s", "Time between samples.", 1e-5),
     Quantity("noise_std", 0.0, "y", "Standard deviation of white noise.", 0.0),
@@ -168,16 +175,7 @@ def model_from(values: dict[str, Any]) -> TransferFunction:
         return TransferFunction.from_polynomials(
             values["numerator"], values["denominator"], dead_time=values["dead_time"]
         )
-    return TransferFunction.from_structure(
-        values["structure"],
-        gain=values["gain"],
-        time_constants=values["time_constants"],
-        zeros=values["zeros"],
-        dead_time=values["dead_time"],
-        order=values["order"],
-        natural_frequency=values["w0"],
-        damping=values["zeta"],
-    )
+    return structure_named(values["structure"]).of_fields(**{f: values[f] for f in FIELDS})
 
 
 class Sensor:

@@ -1,12 +1,53 @@
-"""What the constructors of transfer functions demand of their parameters."""
+"""The parameters of models: name, unit, scale and range of each, and checks of their values."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from relay_autotune.errors import ModelError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a model.
+
+    :param name: in results.
+    :param unit: of its value; of a gain without integrators.
+    :param logarithmic: True: it cannot change sign, so that its logarithm is fitted, drawn, and
+        has the interval.
+    :param least: smallest value.
+    :param field: where flags, messages and the parameters of plant_node carry it.
+    :param turned: True: it stands there with the other sign.
+    """
+
+    name: str
+    unit: str = "s"
+    logarithmic: bool = True
+    least: float = -math.inf
+    field: str = "time_constants"
+    turned: bool = False
+
+
+GAIN = Parameter("gain", "y/u", field="gain")
+INVERSE = Parameter("inverse_time_constant", field="zeros", turned=True)
+TIME_CONSTANT = Parameter("time_constant")
+TIME_CONSTANT_1 = Parameter("time_constant_1")
+TIME_CONSTANT_2 = Parameter("time_constant_2")
+TIME_CONSTANT_3 = Parameter("time_constant_3")
+NATURAL_FREQUENCY = Parameter("natural_frequency", "rad/s", field="natural_frequency")
+DAMPING = Parameter("damping", "", field="damping")
+ZERO = Parameter("zero", logarithmic=False, field="zeros")
+DEAD_TIME = Parameter("dead_time", logarithmic=False, least=0.0, field="dead_time")
+
+# In this order every structure has those that belong to it.
+PARAMETERS = (
+    *(GAIN, INVERSE, TIME_CONSTANT, TIME_CONSTANT_1, TIME_CONSTANT_2, TIME_CONSTANT_3),
+    *(NATURAL_FREQUENCY, DAMPING, ZERO, DEAD_TIME),
+)
 
 
 def positive(time_constant: float) -> float:

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from relay_autotune.errors import ModelError
 from relay_autotune.exchange.text import process_latex, process_text
 from relay_autotune.process.model_parameters import (
-    at_least_one,
     exactly,
     oscillating_pair,
     positive,
@@ -306,82 +305,3 @@ class TransferFunction:
         """Return ``K exp(-D s)/((tau1 s - 1)(tau2 s + 1))`` with tau1, tau2 > 0."""
         constants = (-positive(unstable), positive(stable))
         return cls(-gain, (), constants, 0, dead_time, "unstable_sopdt")
-
-    @classmethod
-    def from_structure(
-        cls,
-        structure: str,
-        *,
-        gain: float,
-        time_constants: Sequence[float] = (),
-        zeros: Sequence[float] = (),
-        dead_time: float = 0.0,
-        order: int = 0,
-        natural_frequency: float = 0.0,
-        damping: float = 0.0,
-    ) -> TransferFunction:
-        """Build a named structure from the parameters that plant_node and messages carry.
-
-        :param structure: one of ``STRUCTURES`` but "general".
-        :param gain: K of the structure's constructor.
-        :param time_constants: its tau's, in the constructor's order; one for equal lags; empty
-            with ``natural_frequency`` and ``damping`` where a structure has a complex pair.
-        :param zeros: time constants of ``(1 + z s)`` [s]; of "integrator_inverse": -tau1.
-        :raises ModelError: if the structure is unknown or the number of constants is wrong.
-        """
-        tau, d = tuple(time_constants), dead_time
-
-        def one() -> float:
-            return float(exactly(1, tau)[0].real)
-
-        def zero() -> float:
-            return float(exactly(1, zeros, "zeros")[0].real)
-
-        match structure:
-            case "fopdt":
-                return cls.fopdt(gain, one(), d)
-            case "lag_n":
-                return cls.lag_n(gain, one(), at_least_one(order), d)
-            case "lag_n_zero":
-                return cls.lag_n_zero(gain, one(), at_least_one(order), zero(), d)
-            case "sopdt" | "sopdt_zero":
-                z = zero() if structure == "sopdt_zero" else 0.0
-                pair = tau or oscillating_pair(natural_frequency, damping)
-                return cls.sopdt(gain, pair, d, z)
-            case "two_equal_one":
-                repeated, single = (c.real for c in exactly(2, tau))
-                return cls.two_equal_one(gain, repeated, single, d)
-            case "three_lags":
-                return cls.three_lags(gain, tau, d)
-            case "lag_complex":
-                return cls.lag_complex(gain, one(), natural_frequency, damping, d)
-            case "ipdt":
-                return cls.ipdt(gain, d)
-            case "integrator_lag":
-                return cls.integrator_lag(gain, one(), d)
-            case "integrator_inverse":
-                return cls.integrator_inverse(gain, -zero(), one(), d)
-            case "unstable_fopdt":
-                return cls.unstable_fopdt(gain, one(), d)
-            case "unstable_sopdt":
-                unstable, stable = (c.real for c in exactly(2, tau))
-                return cls.unstable_sopdt(gain, unstable, stable, d)
-        raise ModelError(f"unknown structure {structure!r}; known: {', '.join(STRUCTURES[:-1])}")
-
-
-STRUCTURES = (
-    "fopdt",
-    "lag_n",
-    "lag_n_zero",
-    "sopdt",
-    "sopdt_zero",
-    "two_equal_one",
-    "three_lags",
-    "lag_complex",
-    "ipdt",
-    "integrator_lag",
-    "integrator_inverse",
-    "unstable_fopdt",
-    "unstable_sopdt",
-    "general",
-)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from relay_autotune.analysis import Analysis
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.exchange.text import unit_of
 from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import Validation
@@ -222,12 +221,13 @@ def model_case(found: Identification, truth: TransferFunction | None) -> ModelCa
     :param truth: the process, where it was a simulated one.
     """
     low, high = found.ci95_low, found.ci95_high
+    structure = found.estimate.structure
     estimates = tuple(
         Estimate(
-            name, float(value), float(low[i]), float(high[i]), unit_of(name, found.model),
-            name not in found.undetermined, true_value(name, found.model, truth),
+            p.name, float(value), float(low[i]), float(high[i]), structure.unit(p),
+            p.name not in found.undetermined, true_value(p.name, found.model, truth),
         )
-        for i, (name, value) in enumerate(zip(found.parameters, found.values, strict=True))
+        for i, (p, value) in enumerate(zip(structure.parameters, found.values, strict=True))
     )  # fmt: skip
     return ModelCase(
         method=found.method,

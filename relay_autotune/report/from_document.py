@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import BagError, RelayAutotuneError
-from relay_autotune.identification import FitReport, Identification
+from relay_autotune.identification import Estimate, FitReport, Identification
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import DIFFERENCES, Validation
 from relay_autotune.identification.result import Rival
 from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.process.structures import GENERAL, GivenModel, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Outcome, RelaySettings
@@ -152,20 +153,16 @@ def _limit_cycle(c: dict[str, Any]) -> LimitCycle:
 
 def _identification(m: dict[str, Any]) -> Identification:
     model, names = _model(m), tuple(m["values"])
-    build = _builder(model, names)
-    size = (len(names), len(names))
-    covariance = np.full(size, math.nan)
+    structure = structure_of(model, names)
+    covariance = None
     # Where a parameter is tied to another one, only the method knows how.
-    if build is not None and m["covariance"] is not None:
-        covariance = np.array(m["covariance"], dtype=float).reshape(size)
+    if not isinstance(structure, GivenModel) and m["covariance"] is not None:
+        covariance = np.array(m["covariance"], dtype=float).reshape(len(names), len(names))
+    values = np.array([_number(v) for v in m["values"].values()])
     ends = np.array([[_number(end) for end in m["ci95"][n]] for n in names]).reshape(-1, 2)
     return Identification(
         method=str(m["method"]),
-        model=model,
-        build=build or (lambda _: model),
-        parameters=names,
-        values=np.array([_number(v) for v in m["values"].values()]),
-        covariance=covariance,
+        estimate=Estimate.of(structure, values, covariance),
         ci95_low=ends[:, 0],
         ci95_high=ends[:, 1],
         ultimate_gain=_number(m["ultimate_gain"]),
@@ -177,7 +174,7 @@ def _identification(m: dict[str, Any]) -> Identification:
         ),
         warnings=tuple(map(str, m["warnings"])),
         undetermined=tuple(map(str, m["undetermined"])),
-        rivals=tuple(Rival(_model(r), _number(r["support"])) for r in m["rivals"]),
+        rivals=tuple(_rival(r) for r in m["rivals"]),
         validation=_validation(m.get("validation")),
         points=tuple(_point(p) for p in m.get("points", ())),
         integrated_error=_number(m.get("integrated_error")),
@@ -186,34 +183,9 @@ def _identification(m: dict[str, Any]) -> Identification:
     )
 
 
-def _builder(
-    model: TransferFunction, names: tuple[str, ...]
-) -> Callable[[FloatArray], TransferFunction] | None:
-    """Return the transfer function for any values of its parameters.
-
-    :param model: the one for the values that were found.
-    :param names: of the parameters.
-    :return: None where these parameters alone do not make the structure.
-    """
-
-    def build(values: FloatArray) -> TransferFunction:
-        given = dict(zip(names, map(float, values), strict=True))
-        zeros = [given[n] for n in ("zero",) if n in given]
-        zeros += [-given[n] for n in ("inverse_time_constant",) if n in given]
-        return TransferFunction.from_structure(
-            model.structure,
-            gain=given["gain"],
-            time_constants=[v for n, v in given.items() if n.startswith("time_constant")],
-            zeros=zeros,
-            dead_time=given["dead_time"],
-            order=model.order,
-            natural_frequency=given.get("natural_frequency", 0.0),
-            damping=given.get("damping", 0.0),
-        )
-
-    if not {"gain", "dead_time"} <= set(names) or model.structure == "general":
-        return None
-    return build
+def _rival(r: dict[str, Any]) -> Rival:
+    alone = GivenModel.of(_model(r))
+    return Rival(Estimate.of(alone, np.empty(0)), _number(r["support"]))
 
 
 def _validation(v: dict[str, Any] | None) -> Validation | None:
@@ -234,7 +206,7 @@ def _model(m: dict[str, Any]) -> TransferFunction:
         [_number(c) for c in m["numerator"]],
         [_number(c) for c in m["denominator"]],
         _number(m["dead_time"]),
-        str(m.get("structure", "general")),
+        str(m.get("structure", GENERAL)),
     )
     constants = tuple(_complex(c) for c in m["time_constants"])
     zeros = tuple(_complex(c) for c in m["zeros"])

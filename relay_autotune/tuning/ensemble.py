@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
-from relay_autotune.identification.result import Identification, is_logarithmic
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.loop.margins import frequencies
 from relay_autotune.tuning.loop.stability import (
@@ -33,17 +33,13 @@ def ensemble(
 ) -> tuple[TransferFunction, ...]:
     """Draw models from the uncertainty of an identification.
 
-    Gains and time constants are drawn as logarithms, so that none changes sign; a dead time is
-    drawn as it is and cut at zero. Correlations are kept, which matters: a gain and a time
-    constant that are each uncertain often have a ratio that is not. Other structures that the
-    data do not rule out are there by their support.
+    Other structures that the data do not rule out are there by their support.
 
     :param identification: with a covariance; without one the ensemble is empty.
     :param count: models to draw.
     :param rng: the source.
     """
-    covariance, values = identification.covariance, identification.values
-    if not bool(np.all(np.isfinite(covariance))):
+    if not identification.estimate.known:
         return ()
     rivals = [
         rival.model
@@ -51,25 +47,7 @@ def ensemble(
         for _ in range(round(count * rival.support))
         if rival.model.process_sign == identification.model.process_sign
     ][: count // 2]
-    logarithmic = np.array([is_logarithmic(n) for n in identification.parameters])
-    delays = np.array([n == "dead_time" for n in identification.parameters])
-    scale = np.where(logarithmic, values, 1.0)
-    draws = rng.multivariate_normal(
-        np.zeros(values.size),
-        covariance / np.outer(scale, scale),
-        count - len(rivals),
-        # What is not determined has variances whose rounding is no small number.
-        check_valid="ignore",
-        method="eigh",
-    )
-    models = []
-    for draw in draws:
-        with np.errstate(over="ignore"):
-            factors = np.exp(np.clip(draw, -20.0, 20.0))
-        drawn = np.where(logarithmic, values * factors, values + draw)
-        drawn[delays] = np.maximum(drawn[delays], 0.0)
-        models.append(identification.build(drawn))
-    return (*models, *rivals)
+    return (*identification.estimate.draws(count - len(rivals), rng), *rivals)
 
 
 @dataclass(frozen=True)

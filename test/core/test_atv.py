@@ -22,9 +22,10 @@ from relay_autotune.identification.methods.atv import (
     two_time_constants,
     ultimate_estimate,
 )
-from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5, equal_lags
+from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -74,14 +75,14 @@ def test_errors_of_equations_1_and_2(figure):
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.1])
-@pytest.mark.parametrize(("model", "constants"), LAGS, ids=lambda v: str(v))
+@pytest.mark.parametrize(("model", "constants"), LAGS, ids=lambda v: getattr(v, "name", str(v)))
 def test_a_limit_cycle_of_the_describing_function_gives_the_process(model, constants, epsilon):
     dead_time, relay = 0.5, 0.7
     process = model.build(np.array((2.0, *constants, dead_time)))
     # Where -1/N crosses the frequency response: N's argument is asin(epsilon/a).
     amplitude, w = _describing_function(process, relay, epsilon)
     cycle = SymmetricCycle(2.0 * math.pi / w, amplitude, relay, epsilon, dead_time)
-    found = atv_from_numbers(cycle, Known(gain=2.0, structure=model.structure, order=model.order))
+    found = atv_from_numbers(cycle, Known(gain=2.0, structure=model.name, order=model.order))
     solutions = [found.values[1:-1]]
     if model == MODEL_5:
         k_u, _ = ultimate_estimate(cycle.period, amplitude, relay)

@@ -7,24 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.identification.result import Identification, Rival, with_uncertainty
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import Identification, Rival, identified
 from relay_autotune.identification.waveform.averaging import averaged_point
-from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, covariance_of_values
+from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
-from relay_autotune.identification.waveform.structures import SOPDT, SOPDT_ZERO, RationalStructure
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import FOPDT, SOPDT, SOPDT_ZERO, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 
 # 2 s of lag and 2 s of dead time, each gain and constant known to 1 %.
 _VALUES = np.array([1.0, 2.0, 2.0])
-_FOUND = with_uncertainty(
-    "waveform",
-    lambda v: TransferFunction.fopdt(*v),
-    ("gain", "time_constant", "dead_time"),
-    _VALUES,
-    np.diag((0.01 * _VALUES) ** 2),
-)
+_FOUND = identified("waveform", Estimate.of(FOPDT, _VALUES, np.diag((0.01 * _VALUES) ** 2)))
 
 
 def _second_order(small: float, std: float) -> Rival:
@@ -34,12 +29,7 @@ def _second_order(small: float, std: float) -> Rival:
     root = np.zeros((4, 4))
     root[0, 0], root[1, 1], root[3, 3] = known
     root[:, 2] = std * np.array([0.0, 0.0, 1.0, -1.0])
-
-    def build(v):
-        return TransferFunction.sopdt(v[0], (v[1], v[2]), v[3])
-
-    names = ("gain", "time_constant_1", "time_constant_2", "dead_time")
-    return Rival(build(values), 0.3, build, names, values, root)
+    return Rival(Estimate.of_root(SOPDT, values, root), 0.3)
 
 
 def test_a_rival_that_differs_widens_the_interval_by_its_distance():
@@ -65,7 +55,7 @@ def test_a_lag_too_small_to_be_seen_leaves_the_interval_as_it_is(std):
     assert frequency_std == pytest.approx(_FOUND.ultimate_frequency_std, rel=0.02)
 
 
-def _fit_of(structure: RationalStructure, theta: np.ndarray, noise: float) -> Identification:
+def _fit_of(structure: Structure, theta: np.ndarray, noise: float) -> Identification:
     """Return two lags of 3 s and 1 s of dead time as a structure has them at theta."""
     process, relay = TransferFunction.sopdt(2.0, (3.0, 3.0), 1.0), RelaySettings(0.0, 0.0, 1.0)
     end = simulate_relay(process, relay, cycles=5).command.times[-1]
@@ -74,12 +64,9 @@ def _fit_of(structure: RationalStructure, theta: np.ndarray, noise: float) -> Id
     error = noise * np.random.default_rng(4).standard_normal(run.time.size)
     problem = problem_of([(run.time, run.measurement + error, run.command)], structure)
     state = evaluate(problem, theta)
-    reading = structure.read(state.theta, state.coefficients)
-    assert reading is not None
-    covariance = covariance_of_values(problem, state, Fit(problem, state, (), 1.0), Noise(True))
-    return with_uncertainty(
-        "waveform", reading.build, reading.parameters, reading.values, covariance
-    )
+    estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise(True))
+    assert estimate is not None
+    return identified("waveform", estimate)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 1e-6, 1e-9])

@@ -10,6 +10,7 @@ import pytest
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.process.simulation import Plant
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import Record
@@ -58,15 +59,13 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
 @pytest.mark.parametrize(
     "model",
     [
-        TransferFunction.from_structure(
-            "sopdt_zero",
+        structure_named("sopdt_zero").of_fields(
             gain=0.186,
             zeros=[-0.771],
             time_constants=[1.248, 0.183],
             dead_time=0.071,
         ),
-        TransferFunction.from_structure(
-            "sopdt_zero",
+        structure_named("sopdt_zero").of_fields(
             gain=-0.271,
             zeros=[-0.702],
             time_constants=[1.968, 0.318],

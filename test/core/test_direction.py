@@ -10,17 +10,18 @@ from relay_autotune.analysis import analyse
 from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import identify
 from relay_autotune.identification.judgement.direction import other_direction
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
 
-SECOND_ORDER = TransferFunction.from_structure(
-    "sopdt_zero", gain=0.38, time_constants=[1.3, 0.32], zeros=[-1.2], dead_time=0.09
+SECOND_ORDER = structure_named("sopdt_zero").of_fields(
+    gain=0.38, time_constants=[1.3, 0.32], zeros=[-1.2], dead_time=0.09
 )
-SLOWER = TransferFunction.from_structure(
-    "sopdt_zero", gain=-2.1, time_constants=[1.1, 0.28], zeros=[-2.9], dead_time=0.47
+SLOWER = structure_named("sopdt_zero").of_fields(
+    gain=-2.1, time_constants=[1.1, 0.28], zeros=[-2.9], dead_time=0.47
 )
-INTEGRATOR = TransferFunction.from_structure(
-    "integrator_inverse", gain=0.4, time_constants=[0.38], zeros=[-1.4], dead_time=0.1
+INTEGRATOR = structure_named("integrator_inverse").of_fields(
+    gain=0.4, time_constants=[0.38], zeros=[-1.4], dead_time=0.1
 )
 
 

@@ -13,6 +13,7 @@ from relay_autotune.experiment.experiment import ExperimentParameters, RelayExpe
 from relay_autotune.experiment.faults.no_return import RunawayWatch, is_growing
 from relay_autotune.experiment.faults.sensor_watch import ClockWatch, FrozenWatch
 from relay_autotune.process.simulation import Plant
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome
@@ -295,7 +296,7 @@ def test_a_given_safe_command_follows_an_abort_but_not_a_completed_tune():
 
 
 def test_an_integrating_process_is_held_after_the_end():
-    model = TransferFunction.from_structure("ipdt", gain=0.5, dead_time=1.0)
+    model = structure_named("ipdt").of_fields(gain=0.5, dead_time=1.0)
     for stop in (False, True):
         plant, period = Plant(model), 0.05
         tune = experiment(policy=SafePolicy(hold=True), hysteresis=0.1)

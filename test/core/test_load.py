@@ -14,15 +14,13 @@ from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import Known, identify
 from relay_autotune.identification.judgement.disturbance import with_its_load
 from relay_autotune.identification.judgement.load import LoadStep, identify_with_load
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant
 
-FIRST_ORDER = TransferFunction.from_structure(
-    "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0
-)
-SECOND_ORDER = TransferFunction.from_structure(
-    "sopdt", gain=1.0, time_constants=[20.0, 8.0], dead_time=4.0
+FIRST_ORDER = structure_named("fopdt").of_fields(gain=1.65, time_constants=[20.0], dead_time=10.0)
+SECOND_ORDER = structure_named("sopdt").of_fields(
+    gain=1.0, time_constants=[20.0, 8.0], dead_time=4.0
 )
 PERIOD = 0.2
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from relay_autotune.errors import ModelError
-from relay_autotune.process.transfer_function import STRUCTURES, TransferFunction
+from relay_autotune.process.structures import STRUCTURES, structure_named
+from relay_autotune.process.transfer_function import TransferFunction
 
 W = np.logspace(-3, 3, 50)
 
@@ -38,7 +39,7 @@ def test_every_structure_has_an_example():
 
 @pytest.mark.parametrize("structure", EXAMPLES)
 def test_response_equals_the_ratio_of_its_polynomials(structure):
-    model = TransferFunction.from_structure(structure, **EXAMPLES[structure])
+    model = structure_named(structure).of_fields(**EXAMPLES[structure])
     assert model.structure == structure
     _, ratio = signal.freqs(model.numerator, model.denominator, W)
     np.testing.assert_allclose(model(1j * W), ratio * np.exp(-1j * W * model.dead_time), rtol=1e-9)
@@ -46,14 +47,14 @@ def test_response_equals_the_ratio_of_its_polynomials(structure):
 
 @pytest.mark.parametrize("structure", EXAMPLES)
 def test_polynomials_give_the_same_function_back(structure):
-    model = TransferFunction.from_structure(structure, **EXAMPLES[structure])
+    model = structure_named(structure).of_fields(**EXAMPLES[structure])
     again = TransferFunction.from_polynomials(model.numerator, model.denominator, model.dead_time)
     np.testing.assert_allclose(again(1j * W), model(1j * W), rtol=1e-9)
 
 
 @pytest.mark.parametrize("structure", EXAMPLES)
 def test_phase_is_continuous_and_agrees_with_the_angle(structure):
-    model = TransferFunction.from_structure(structure, **EXAMPLES[structure])
+    model = structure_named(structure).of_fields(**EXAMPLES[structure])
     phase = model.phase(W)
     angle = np.angle(model.process_sign * model(1j * W))
     np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * angle), atol=1e-9)
@@ -103,7 +104,7 @@ def test_what_cannot_be_is_refused(wrong, said):
 )
 def test_a_structure_with_wrong_parameters_is_refused(structure, wrong):
     with pytest.raises(ModelError):
-        TransferFunction.from_structure(structure, **wrong)
+        structure_named(structure).of_fields(**wrong)
 
 
 def test_polynomials_without_content_are_refused():

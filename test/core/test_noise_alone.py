@@ -7,12 +7,12 @@ import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.faults.noise_alone import why_noise_alone
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome
 
-PROCESS = TransferFunction.from_structure(
-    "lag_n", gain=-1.0, time_constants=[1.7], order=3, dead_time=0.1
+PROCESS = structure_named("lag_n").of_fields(
+    gain=-1.0, time_constants=[1.7], order=3, dead_time=0.1
 )
 PERIOD = 0.09
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from relay_autotune.analysis import Analysis
 from relay_autotune.control.gains import Gains
-from relay_autotune.identification.result import with_uncertainty
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import identified
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
 
 RECORD = Record(time=[0.0, 1.0], measurement=[0.0, 1.0], command=[0.0, 1.0])
@@ -26,13 +27,9 @@ def cells(analysis: Analysis) -> dict[str, str]:
 
 
 def test_model_and_gains_stand_in_a_table() -> None:
-    found = with_uncertainty(
-        "waveform",
-        lambda x: TransferFunction.fopdt(*x),
-        ("gain", "time_constant", "dead_time"),
-        np.array([1.65, 20.0, 10.0]),
-        np.diag([1e-4, 1e-2, 1e-3]),
-    )
+    covariance = np.diag([1e-4, 1e-2, 1e-3])
+    estimate = Estimate.of(FOPDT, np.array([1.65, 20.0, 10.0]), covariance)
+    found = identified("waveform", estimate)
     shown = cells(Analysis(RECORD, (), (found,), 0, (GAINS,), 0))
     assert shown["process"] == "1.650e−10.00s(1+20.00s) fopdt, waveform"  # noqa: RUF001
     assert shown["K_u"].startswith("2.307 ± ")

@@ -15,10 +15,10 @@ from relay_autotune.control.gains import Controller
 from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step, compare, describe, plan
 from relay_autotune.errors import TuningError
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import structure_named
 
 GAINS = Controller(kc=1.2, ti=2.0)
-PROCESS = TransferFunction.from_structure("fopdt", gain=1.5, time_constants=[2.0], dead_time=0.4)
+PROCESS = structure_named("fopdt").of_fields(gain=1.5, time_constants=[2.0], dead_time=0.4)
 
 
 def closed_loop(controller, plant, period, steps, *, setpoint=1.0, load=0.0, start=0):

@@ -12,17 +12,15 @@ from relay_autotune.experiment.experiment import ExperimentParameters, RelayExpe
 from relay_autotune.identification import Known, identify
 from relay_autotune.identification.judgement.disturbance import without_disturbance
 from relay_autotune.process.actuator import Actuator
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome
 
-PROCESS = TransferFunction.from_structure(
-    "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0
-)
+PROCESS = structure_named("fopdt").of_fields(gain=1.65, time_constants=[20.0], dead_time=10.0)
 # A slow heater: 2.5 degrees for a percent.
-HEATER = TransferFunction.from_structure("fopdt", gain=2.5, time_constants=[600.0], dead_time=40.0)
+HEATER = structure_named("fopdt").of_fields(gain=2.5, time_constants=[600.0], dead_time=40.0)
 PERIOD = 0.2
 # At the root w of 10 w + atan(20 w) = pi.
 ULTIMATE_GAIN = math.hypot(1.0, 20.0 * 0.183659720315) / 1.65
@@ -175,8 +173,8 @@ def test_a_set_point_next_to_a_command_limit():
 
 @pytest.mark.parametrize("scale", [50.0, 0.005])
 def test_from_a_tenth_of_a_hertz_to_a_kilohertz(scale):
-    model = TransferFunction.from_structure(
-        "fopdt", gain=1.65, time_constants=[20.0 * scale], dead_time=10.0 * scale
+    model = structure_named("fopdt").of_fields(
+        gain=1.65, time_constants=[20.0 * scale], dead_time=10.0 * scale
     )
     check(run(model, period=PERIOD * scale, noise_std=0.02))
 
@@ -190,7 +188,7 @@ def test_from_a_tenth_of_a_hertz_to_a_kilohertz(scale):
     ],
 )
 def test_integrating_unstable_and_reverse_acting(structure, shape, truth):
-    model = TransferFunction.from_structure(structure, **shape)
+    model = structure_named(structure).of_fields(**shape)
     sign = 1 if structure == "unstable_fopdt" else 0
     tune = run(model, noise_std=0.01, process_gain_sign=sign, bias_ratio=0.0, max_cycles=20)
     assert tune.outcome is Outcome.COMPLETED, tune.reason

@@ -11,14 +11,12 @@ import pytest
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.faults.repetition import Repetition, SilenceWatch
 from relay_autotune.identification import Known, identify
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome
 
-PROCESS = TransferFunction.from_structure(
-    "fopdt", gain=1.65, time_constants=[20.0], dead_time=10.0
-)
+PROCESS = structure_named("fopdt").of_fields(gain=1.65, time_constants=[20.0], dead_time=10.0)
 PERIOD = 0.2
 
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.waveform.factors import Denominator, Lag, Quadratic, UnstableLag
-from relay_autotune.identification.waveform.lags import FOPDT
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.partial_fractions import partial_fractions
 from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.rational import free_motion, responses
-from relay_autotune.identification.waveform.structures import lag_n
+from relay_autotune.identification.waveform.theta import columns_of
+from relay_autotune.process.factors import Denominator, Lag, Quadratic, UnstableLag
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
@@ -96,9 +96,9 @@ def test_poles_that_are_close_are_left_to_the_modes():
 
 def test_the_closed_form_of_a_lag_is_the_general_one():
     theta = np.array((1.6, 2.03))
-    for quick, general in zip(
-        FOPDT.columns(theta, TIME, INPUT), lag_n(1).columns(theta, TIME, INPUT), strict=True
-    ):
+    quick_one = columns_of(FOPDT, theta, TIME, INPUT)
+    general_one = responses(FOPDT.denominator, FOPDT.powers, theta, TIME, INPUT)
+    for quick, general in zip(quick_one, general_one, strict=True):
         np.testing.assert_allclose(quick, general, atol=1e-12)
 
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import IdentificationError, ParameterError
-from relay_autotune.identification import Known, estimate, identify
-from relay_autotune.identification.result import with_uncertainty
-from relay_autotune.identification.waveform.lags import FOPDT
+from relay_autotune.identification import Known, identify
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import identified
 from relay_autotune.identification.waveform.profiles import profile_ends
 from relay_autotune.identification.waveform.quantisation import quantisation_step
 from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
@@ -34,29 +35,23 @@ def _record(
 
 
 def _fopdt(covariance: np.ndarray):
-    return with_uncertainty(
-        "test",
-        lambda v: TransferFunction.fopdt(*v),
-        ("gain", "time_constant", "dead_time"),
-        np.array((2.0, 10.0, 3.0)),
-        covariance,
-    )
+    return identified("test", Estimate.of(FOPDT, np.array((2.0, 10.0, 3.0)), covariance))
 
 
 def test_the_interval_of_a_parameter_is_its_own():
     found = _fopdt(np.diag((0.1, 0.8, 0.2)) ** 2)
-    gain = estimate(found, lambda m: m.gain)
+    gain = found.estimate.quantity(lambda m: m.gain)
     assert gain.std == pytest.approx(0.1, rel=1e-4)
     assert (gain.low, gain.high) == pytest.approx(
         (found.ci95_low[0], found.ci95_high[0]), rel=1e-4
     )
-    delay = estimate(found, lambda m: m.dead_time)
+    delay = found.estimate.quantity(lambda m: m.dead_time)
     assert (delay.low, delay.high) == pytest.approx((3.0 - 0.392, 3.0 + 0.392), rel=1e-4)
 
 
 def test_the_interval_of_the_ultimate_gain_is_that_of_its_stated_deviation():
     found = _fopdt(np.diag((0.05, 0.3, 0.05)) ** 2)
-    gain = estimate(found, lambda m: identify_point(m))
+    gain = found.estimate.quantity(lambda m: identify_point(m))
     assert gain.value == pytest.approx(found.ultimate_gain)
     assert gain.std == pytest.approx(found.ultimate_gain_std, rel=1e-3)
 
@@ -73,7 +68,7 @@ def test_correlated_parameters_have_a_certain_ratio():
     spread = np.array([[0.09, 0.08995, 0.0], [0.08995, 0.09, 0.0], [0.0, 0.0, 0.0]])
     size = np.array((2.0, 10.0, 1.0))
     found = _fopdt(spread * np.outer(size, size))
-    ratio = estimate(found, lambda m: m.gain / m.time_constants[0].real)
+    ratio = found.estimate.quantity(lambda m: m.gain / m.time_constants[0].real)
     assert ratio.std / ratio.value == pytest.approx(0.01, rel=1e-3)
     assert (ratio.low, ratio.high) == pytest.approx(
         (0.2 * math.exp(-0.0196), 0.2 * math.exp(0.0196)), rel=1e-4
@@ -82,7 +77,7 @@ def test_correlated_parameters_have_a_certain_ratio():
 
 def test_what_has_no_covariance_has_no_interval():
     found = _fopdt(np.full((3, 3), math.nan))
-    answer = estimate(found, lambda m: m.gain)
+    answer = found.estimate.quantity(lambda m: m.gain)
     assert answer.value == 2.0
     assert math.isnan(answer.std)
     assert math.isnan(answer.low)
@@ -143,13 +138,14 @@ def test_rivals_carry_what_an_ensemble_draws_from_and_widen_the_ultimate_point()
     std = 0.1 * float(np.mean(np.abs(run.measurement)))
     record = run.record(noise_std=std, rng=np.random.default_rng(1))
     found = identify(record)
-    counted = [r for r in found.rivals if r.parameters]
+    counted = [r.estimate for r in found.rivals if r.estimate.known]
     assert counted
     assert 0.0 < found.support < 1.0
     assert found.support + sum(r.support for r in found.rivals) <= 1.0 + 1e-9
     for rival in counted:
         assert rival.covariance.shape == (rival.values.size,) * 2
-        assert rival.build(rival.values) == rival.model
+        assert rival.structure.build(rival.values) == rival.model
+        assert np.array_equal(rival.covariance, rival.root @ rival.root.T)
     known = Known(structure=found.structure, order=found.model.order)
     alone = identify(record, "waveform", known)
     assert alone.support == 1.0

@@ -19,7 +19,7 @@ from relay_autotune.cli import csv_to_bag, replay, tune_loop
 from relay_autotune.exchange.document import document
 from relay_autotune.identification import METHODS
 from relay_autotune.nodes.plant import MODES
-from relay_autotune.process.transfer_function import STRUCTURES
+from relay_autotune.process.structures import STRUCTURES
 from relay_autotune.tuning import RULES
 from tools.fill_docs import TABLES, filled
 

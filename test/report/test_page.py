@@ -14,7 +14,9 @@ from report_cases import MODEL, aborted, completed, fruitless, only
 
 from relay_autotune.exchange.document import document, model_fields, to_json
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.result import Rival, with_uncertainty
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import Rival, identified
+from relay_autotune.process.structures import FOPDT, GivenModel, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, case_of, true_value
 from relay_autotune.report.figures import PLATES
@@ -246,10 +248,12 @@ def test_the_models_within_the_uncertainty_are_those_of_the_document(build, para
     values = np.array([*parameters.values()])
     rng = np.random.default_rng(1)
     root = 0.1 * rng.standard_normal((values.size, values.size)) * values[:, None]
-    rival = Rival(TransferFunction.fopdt(math.copysign(1.0, values[0]), 2.0, 1.0), 0.1)
+    structure = structure_of(build(values), tuple(parameters))
+    assert structure.build(values) == build(values)
+    other = np.array((math.copysign(1.0, values[0]), 2.0, 1.0))
     found = replace(
-        with_uncertainty("waveform", build, tuple(parameters), values, root @ root.T),
-        rivals=(rival,),
+        identified("waveform", Estimate.of_root(structure, values, root)),
+        rivals=(Rival(Estimate.of(FOPDT, other), 0.1),),
     )
     analysis = replace(fruitless(), models=(found,), selected=0)
     direct = case_of(analysis, "bag").models_around
@@ -259,15 +263,12 @@ def test_the_models_within_the_uncertainty_are_those_of_the_document(build, para
 
 
 def test_without_a_covariance_a_document_gives_no_models_around() -> None:
-    known = with_uncertainty(
-        "atv", lambda v: TransferFunction.fopdt(*v), ("gain", "time_constant", "dead_time"),
-        np.array((2.0, 3.0, 0.2)),
-    )  # fmt: skip
+    known = identified("atv", Estimate.of(FOPDT, np.array((2.0, 3.0, 0.2))))
     # A method may tie the dead time to the lags, and only the method knows how.
-    tied = with_uncertainty(
-        "thyagarajan", lambda v: TransferFunction.lag_n(v[0], v[1], 2, 0.1 * v[1]),
-        ("gain", "time_constant"), np.array((2.0, 3.0)), np.eye(2) * 1e-4,
-    )  # fmt: skip
+    structure = GivenModel.of(TransferFunction.lag_n(2.0, 3.0, 2, 0.3), ("gain", "time_constant"))
+    tied = identified(
+        "thyagarajan", Estimate.of(structure, np.array((2.0, 3.0)), np.eye(2) * 1e-4)
+    )
     for found in (known, tied):
         case = from_json(replace(fruitless(), models=(found,), selected=0))
         assert case.models_around == ()

@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform import structures
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
-from relay_autotune.identification.waveform.lags import FOPDT
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
     Problem,
@@ -32,6 +30,7 @@ from relay_autotune.identification.waveform.starts import (
     two_lags,
 )
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import FOPDT, INTEGRATOR_INVERSE, SOPDT_ZERO
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Input, PiecewiseConstant, Record
 
@@ -125,15 +124,14 @@ def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, State]
     starts = Starts(problem, first)
     fast, dead_time = starts.tau, starts.dead_time
     tried = (
-        (structures.SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
-        (structures.INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
+        (SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
+        (INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
     )
     found = []
     for structure, thetas in tried:
         plain = replace(problem, structure=structure)
         state = refine_best(plain, thetas, tolerance=_TRIAL)
-        reading = structure.read(state.theta, state.coefficients)
-        model = None if reading is None else reading.model
+        model = structure.model_at(state.theta, state.coefficients)
         if model is not None:
             found.append((model, state))
     return found

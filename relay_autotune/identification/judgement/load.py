@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Identification
+from relay_autotune.identification import Estimate, Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import FloatArray, PiecewiseConstant, Record
@@ -99,7 +99,7 @@ class _Fit:
         self._measurement = record.measurement[::every]
         self._u = record.input()
         self._found = found
-        self._build = found.build
+        self._build = found.estimate.structure.build
         self._values = np.array(found.values, dtype=np.float64)
         self._span = record.duration
         self._begin = float(self._u.times[0]) if self._u.times.size else 0.0
@@ -190,7 +190,7 @@ class _Fit:
         gain, frequency = np.einsum("ik,kl,il->i", gradients, more, gradients).clip(0.0)
         return replace(
             found,
-            covariance=found.covariance + more,
+            estimate=Estimate(found.estimate.structure, found.values, found.covariance + more),
             ci95_low=found.values - wider * (found.values - found.ci95_low),
             ci95_high=found.values + wider * (found.ci95_high - found.values),
             ultimate_gain_std=math.hypot(found.ultimate_gain_std, math.sqrt(gain)),

@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lag_models import MODEL_4, LagModel, Solution
+from relay_autotune.identification.methods.lag_models import MODEL_4, Solution, model_text
 from relay_autotune.identification.methods.symmetric_method import (
     Found,
     SymmetricMethod,
@@ -31,6 +31,7 @@ from relay_autotune.identification.methods.symmetric_method import (
 )
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Record
 
 _LEAST_PHASE = 1e-6
@@ -198,7 +199,7 @@ def atv_from_numbers(cycle: SymmetricCycle, known: Known) -> Identification:
     return _with_estimate(from_numbers(ATV, cycle, known))
 
 
-def solve(model: LagModel, cycle: SymmetricCycle, gain: float) -> Solution:
+def solve(model: Structure, cycle: SymmetricCycle, gain: float) -> Solution:
     """Return the parameters of a model.
 
     :param model: which one.
@@ -210,14 +211,14 @@ def solve(model: LagModel, cycle: SymmetricCycle, gain: float) -> Solution:
     k_u, w_u = ultimate_estimate(period, cycle.amplitude, cycle.relay)
     phase = phase_of_lags(period, cycle.dead_time, cycle.amplitude, cycle.hysteresis)
     if math.isnan(gain):
-        if not model.equal:
+        if not model.equal_lags:
             raise IdentificationError(
-                f"{model.name} needs the gain of the process: its two time constants take both "
-                "the period and the amplitude; give the gain, or use the method li"
+                f"{model_text(model)} needs the gain of the process: its two time constants take "
+                "both the period and the amplitude; give the gain, or use the method li"
             )
         tau = time_constant_from_phase(order, period, phase)
         return Solution(math.hypot(1.0, w_u * tau) ** order / k_u, (tau,))
-    if model.equal:
+    if model.equal_lags:
         tau = 0.5 * (
             time_constant_from_phase(order, period, phase)
             + time_constant_from_magnitude(order, period, gain * k_u)
@@ -238,7 +239,7 @@ def _mismatch(order: int, cycle: SymmetricCycle, gain: float) -> float:
     return math.log(time_constant_from_phase(order, cycle.period, phase) / by_magnitude)
 
 
-def _remarks(model: LagModel, cycle: SymmetricCycle, gain: float) -> list[str]:
+def _remarks(model: Structure, cycle: SymmetricCycle, gain: float) -> list[str]:
     """Say what eqs 1 and 2 give literally, where a hysteresis makes them wrong."""
     if cycle.hysteresis == 0.0:
         return []

@@ -14,7 +14,7 @@ from relay_autotune.identification.methods.chang1992 import (
     two_equal_and_one,
     two_time_constants,
 )
-from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5, LagModel, Solution
+from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5, Solution, model_text
 from relay_autotune.identification.methods.symmetric_method import (
     SymmetricMethod,
     from_numbers,
@@ -22,6 +22,7 @@ from relay_autotune.identification.methods.symmetric_method import (
 )
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.structures import Structure
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
 
@@ -54,7 +55,7 @@ def chang_from_numbers(cycle: SymmetricCycle, known: Known) -> Identification:
 
 
 def solve(
-    model: LagModel, cycle: SymmetricCycle, gain: float, harmonics: int | None = None
+    model: Structure, cycle: SymmetricCycle, gain: float, harmonics: int | None = None
 ) -> Solution:
     """Return the parameters of a model.
 
@@ -69,17 +70,17 @@ def solve(
     """
     period, dead_time, h = cycle.period, cycle.dead_time, cycle.relay
     if math.isnan(gain):
-        if not model.equal:
+        if not model.equal_lags:
             raise IdentificationError(
-                f"{model.name} needs the gain of the process: its two time constants take both "
-                "the period and the amplitude; give the gain, or use the method li"
+                f"{model_text(model)} needs the gain of the process: its two time constants take "
+                "both the period and the amplitude; give the gain, or use the method li"
             )
         k, tau = gain_and_time_constant(
             model.order, period, cycle.amplitude, dead_time, h, cycle.level, harmonics
         )
         return Solution(k, (tau,))
     relative, level = cycle.amplitude / (gain * h), cycle.level / (gain * h)
-    if model.equal:
+    if model.equal_lags:
         return Solution(gain, (time_constant_from_period(model.order, period, dead_time, level),))
     if model == MODEL_4:
         return Solution(gain, two_time_constants(period, dead_time, relative, level, harmonics))
@@ -113,13 +114,13 @@ def mismatch(order: int, cycle: SymmetricCycle, gain: float) -> float:
 _EQUATIONS = {1: ("eq 8", "eq 21"), 2: ("eq 9", "eq 22"), 3: ("eq 10", "eq 23")}
 
 
-def _remarks(model: LagModel, cycle: SymmetricCycle, gain: float) -> list[str]:
+def _remarks(model: Structure, cycle: SymmetricCycle, gain: float) -> list[str]:
     """Say what the paper's equations, with their errata, give literally, where that differs."""
     unknown = math.isnan(gain)
     left_out = []
     if cycle.hysteresis > 0.0:
         left_out.append(f"the hysteresis of {cycle.hysteresis:.4g}")
-    if unknown or not model.equal:
+    if unknown or not model.equal_lags:
         left_out.append("the higher harmonics")
     if not left_out:
         return []

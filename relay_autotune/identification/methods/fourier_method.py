@@ -8,7 +8,6 @@ harmonics, and at the even ones where a biased relay excites them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,14 +17,22 @@ from scipy.optimize import least_squares
 from scipy.special import fdtrc
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.interpolation import Interpolation, interpolated, smooth
-from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.identification.shown.harmonics import measured_points, with_noise_about
 from relay_autotune.identification.shown.steady_state import static_gain, steady_state
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import (
+    FOPDT,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_N,
+    UNSTABLE_FOPDT,
+    Structure,
+)
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -45,33 +52,8 @@ _DIFFERENCE = 1e-4
 _AT_END = 1e-6
 
 
-@dataclass(frozen=True)
-class _Structure:
-    """A model with gain, at most one time constant, and dead time.
-
-    :param parameters: names of the values.
-    :param build: from the values to the model.
-    """
-
-    parameters: tuple[str, ...]
-    build: Callable[[FloatArray], TransferFunction]
-
-
-def _with_lag(constructor: Callable[[float, float, float], TransferFunction]) -> _Structure:
-    return _Structure(
-        ("gain", "time_constant", "dead_time"),
-        lambda v: constructor(float(v[0]), float(v[1]), float(v[2])),
-    )
-
-
-_STRUCTURES = {
-    "fopdt": _with_lag(TransferFunction.fopdt),
-    "ipdt": _Structure(
-        ("gain", "dead_time"), lambda v: TransferFunction.ipdt(float(v[0]), float(v[1]))
-    ),
-    "integrator_lag": _with_lag(TransferFunction.integrator_lag),
-    "unstable_fopdt": _with_lag(TransferFunction.unstable_fopdt),
-}
+# Beside equal lags: with a gain, at most one time constant, and a dead time.
+_STRUCTURES = {s.name: s for s in (FOPDT, IPDT, INTEGRATOR_LAG, UNSTABLE_FOPDT)}
 
 
 @dataclass(frozen=True)
@@ -114,7 +96,7 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
     harmonics = measured_points(test.whole)
     points = _with_static_gain(test, record, harmonics, structure)
     values, cost = fit.best(points)
-    if not any(t.real < 0.0 for t in structure.build(values).time_constants):
+    if not structure.unstable:
         harmonics = with_noise_about(structure.build(values), test.whole, harmonics)
         points = _with_static_gain(test, record, harmonics, structure)
         cost, x = fit.refined(fit.searched(values), points)
@@ -132,13 +114,8 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
         )
     between = smooth if unlikely else interpolated
     covariance, ultimate_std = fit.uncertainty(points, values, between)
-    found = with_uncertainty(
-        METHOD,
-        structure.build,
-        structure.parameters,
-        values,
-        covariance * (cost / freedom if unlikely else 1.0),
-    )
+    covariance = covariance * (cost / freedom if unlikely else 1.0)
+    found = identified(METHOD, Estimate.of(structure, values, covariance))
     point = between(found.model, points.frequency, points.value)
     if point is None:
         remarks.append("the points do not tell where the phase is -180 degrees")
@@ -167,16 +144,15 @@ def _with_static_gain(
     test: RelayTest,
     record: Record,
     points: tuple[FrequencyPoint, ...],
-    structure: _Structure,
+    structure: Structure,
 ) -> _Points:
     """Add the static gain as a point at w = 0, where the means tell it and the model has one."""
     frequency = [p.frequency for p in points]
     value = [p.value for p in points]
     std = [p.std for p in points]
     settings = test.whole.settings
-    bounded = not structure.build(np.ones(len(structure.parameters))).integrators
     rest = steady_state(record, settings)
-    if bounded and rest.measured:
+    if not structure.integrators and rest.measured:
         try:
             gain = static_gain(test, rest)
         except IdentificationError:
@@ -189,14 +165,13 @@ def _with_static_gain(
     return _Points(np.array(frequency), np.array(value), np.array(std))
 
 
-def _structure_asked_for(known: Known) -> _Structure:
-    if known.structure == "lag_n" or (not known.structure and known.order > 1):
-        order = known.order or 2
-        return _with_lag(lambda k, tau, d: TransferFunction.lag_n(k, tau, order, d))
-    name = known.structure or "fopdt"
+def _structure_asked_for(known: Known) -> Structure:
+    if known.structure == LAG_N.name or (not known.structure and known.order > 1):
+        return LAG_N.of_order(known.order or 2)
+    name = known.structure or FOPDT.name
     if name not in _STRUCTURES:
         raise IdentificationError(
-            f"{METHOD} has no structure {name!r}; it has lag_n, {', '.join(_STRUCTURES)}"
+            f"{METHOD} has no structure {name!r}; it has {LAG_N.name}, {', '.join(_STRUCTURES)}"
         )
     return _STRUCTURES[name]
 
@@ -210,7 +185,7 @@ class _Fit:
     :param sign: +1, or -1 for a reverse-acting relay.
     """
 
-    structure: _Structure
+    structure: Structure
     known: Known
     sign: int
 
@@ -225,7 +200,7 @@ class _Fit:
     def given(self) -> FloatArray:
         """What is known of the values; NaN: to be fitted."""
         facts = {"gain": self.known.gain, "dead_time": self.known.dead_time}
-        return np.array([facts.get(n, math.nan) for n in self.structure.parameters])
+        return np.array([facts.get(n, math.nan) for n in self.structure.names])
 
     @cached_property
     def free(self) -> NDArray[np.intp]:
@@ -235,7 +210,7 @@ class _Fit:
     @cached_property
     def delays(self) -> NDArray[np.bool_]:
         """Which of the fitted values are a dead time; the others are fitted as logarithms."""
-        return np.array([self.structure.parameters[i] == "dead_time" for i in self.free])
+        return np.asarray(~self.structure.logarithmic[self.free])
 
     def values(self, x: FloatArray) -> FloatArray:
         """Return the values of a point of the search."""
@@ -287,16 +262,16 @@ class _Fit:
             "time_constant": math.log(_LONGEST * unit),
             "dead_time": math.inf,
         }
-        high = np.array([ends[self.structure.parameters[i]] for i in self.free])
+        high = np.array([ends[self.structure.names[i]] for i in self.free])
         return np.where(self.delays, 0.0, -_LARGEST), high
 
     def best(self, points: _Points) -> tuple[FloatArray, float]:
         """Return the values of the nearest model, and its sum of squares."""
         first = int(np.flatnonzero(points.frequency > 0.0)[0])
         w, target = float(points.frequency[first]), complex(points.value[first])
-        names = self.structure.parameters
+        names = self.structure.names
         found = []
-        for lag in _LAGS if "time_constant" in names else _LAGS[:1]:
+        for lag in _LAGS if self.structure.factors else _LAGS[:1]:
             start = {"gain": float(self.sign), "time_constant": lag / w, "dead_time": 0.0}
             trial = self.structure.build(np.array([start[n] for n in names]))
             ratio = target / complex(trial(1j * w))

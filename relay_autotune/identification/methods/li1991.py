@@ -29,12 +29,13 @@ from relay_autotune.identification.methods.lag_models import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
-    LagModel,
     Solution,
-    equal_lags,
+    lags_of,
+    model_text,
 )
 from relay_autotune.identification.methods.square_wave import level, peak
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.structures import Structure, equal_lags
 
 FloatArray = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ def frequency_point(cycle: SymmetricCycle) -> tuple[float, complex]:
 
 
 def fit_jointly(
-    model: LagModel,
+    model: Structure,
     tests: Sequence[SymmetricCycle],
     dead_time: float = math.nan,
     *,
@@ -140,8 +141,8 @@ def fit_jointly(
             break
     if best is None:
         raise IdentificationError(
-            f"{model.name} has no such limit cycles at any dead time: the process is of another "
-            "structure, or the numbers are wrong"
+            f"{model_text(model)} has no such limit cycles at any dead time: the process is of "
+            "another structure, or the numbers are wrong"
         )
     gain, constants, delay = unpacked(best.x)
     if model == MODEL_4:
@@ -164,7 +165,7 @@ def fits_jointly(
     dead_time: float = math.nan,
     *,
     errors: Sequence[tuple[float, float]] = (),
-) -> list[tuple[LagModel, JointFit]]:
+) -> list[tuple[Structure, JointFit]]:
     """Fit models 1 to 5, and return those that agree with all tests, the simplest first.
 
     If none does, the one that comes nearest.
@@ -174,7 +175,7 @@ def fits_jointly(
     :param errors: as for :func:`fit_jointly`.
     :raises IdentificationError: if no model can be fitted.
     """
-    fits: list[tuple[LagModel, JointFit]] = []
+    fits: list[tuple[Structure, JointFit]] = []
     refusal: IdentificationError | None = None
     for model in (MODEL_1, equal_lags(2), equal_lags(3), MODEL_4, MODEL_5):
         try:
@@ -213,7 +214,7 @@ def require_difference(tests: Sequence[SymmetricCycle]) -> None:
 
 
 def _exact_residuals(
-    model: LagModel,
+    model: Structure,
     gain: float,
     constants: tuple[float, ...],
     dead_time: float,
@@ -221,7 +222,7 @@ def _exact_residuals(
     errors: Sequence[tuple[float, float]],
 ) -> FloatArray:
     """Return how far periods and amplitudes are from the model's, to first order."""
-    lags = model.lags(constants)
+    lags = lags_of(model, constants)
     found = []
     for test, (period_error, amplitude_error) in zip(tests, errors, strict=True):
 
@@ -241,7 +242,7 @@ def _exact_residuals(
 
 
 def _point_residuals(
-    model: LagModel,
+    model: Structure,
     gain: float,
     constants: tuple[float, ...],
     dead_time: float,
@@ -253,7 +254,7 @@ def _point_residuals(
     for test, (_, amplitude_error) in zip(tests, errors, strict=True):
         w, point = frequency_point(test)
         size, phase = gain, -w * dead_time
-        for tau in model.lags(constants):
+        for tau in lags_of(model, constants):
             size /= math.hypot(1.0, w * tau)
             phase -= math.atan(w * tau)
         wanted = -math.pi + math.remainder(cmath.phase(-point), 2.0 * math.pi)
@@ -263,7 +264,7 @@ def _point_residuals(
 
 
 def _starts(
-    model: LagModel, tests: Sequence[SymmetricCycle], longest: float, dead_time: float
+    model: Structure, tests: Sequence[SymmetricCycle], longest: float, dead_time: float
 ) -> list[FloatArray]:
     """Return points to begin from: each agrees with one test, for equal lags."""
     shares = _DEAD_TIMES if math.isnan(dead_time) else (math.nan,)
@@ -284,7 +285,7 @@ def _starts(
                 continue
             tail = [] if math.isnan(share) else [math.log(share / (1.0 - share))]
             log_tau = math.log(tau)
-            if model.equal:
+            if model.equal_lags:
                 starts.append(np.array([math.log(gain), log_tau, *tail]))
                 continue
             for spread in (_SPREAD, 1.0 / _SPREAD):

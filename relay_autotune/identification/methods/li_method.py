@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lag_models import LagModel, model_asked_for
+from relay_autotune.identification.methods.lag_models import model_asked_for, model_text
 from relay_autotune.identification.methods.li1991 import (
     AGREEMENT,
     JointFit,
@@ -21,7 +22,7 @@ from relay_autotune.identification.methods.li1991 import (
     require_difference,
 )
 from relay_autotune.identification.methods.symmetric_method import alike, shape_misfit
-from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
 from relay_autotune.identification.shown.symmetric_cycle import (
     CycleReader,
@@ -30,6 +31,7 @@ from relay_autotune.identification.shown.symmetric_cycle import (
     require_unbiased,
     skew_warning,
 )
+from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -78,13 +80,11 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
     candidates = _fits(cycles, known, errors)
     away = [_shape_misfit(tests, cycles, *candidate) for candidate in candidates]
     model, fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
+    values = fit.solution.values(-1 if settings[0].reverse_acting else 1, fit.dead_time)
     degrees = sum(len(test.singles) - 1 for test in tests)
-    return with_uncertainty(
+    return identified(
         METHOD,
-        model.build,
-        model.parameters,
-        fit.solution.values(-1 if settings[0].reverse_acting else 1, fit.dead_time),
-        _covariance(fit) if degrees > 0 else None,
+        Estimate.of(model, values, _covariance(fit) if degrees > 0 else None),
         float(stdtrit(max(degrees, 1), 0.975)),
         warnings=(*_warnings(tests), *_remarks(model, cycles, known, fit)),
     )
@@ -99,18 +99,16 @@ def li_from_numbers(cycles: Sequence[SymmetricCycle], known: Known) -> Identific
     :raises IdentificationError: if they do not differ, or no model agrees with them.
     """
     model, fit = _fits(cycles, known, ())[0]
-    return with_uncertainty(
+    return identified(
         METHOD,
-        model.build,
-        model.parameters,
-        fit.solution.values(1, fit.dead_time),
+        Estimate.of(model, fit.solution.values(1, fit.dead_time)),
         warnings=tuple(_remarks(model, cycles, known, fit)),
     )
 
 
 def _fits(
     cycles: Sequence[SymmetricCycle], known: Known, errors: Sequence[tuple[float, float]]
-) -> list[tuple[LagModel, JointFit]]:
+) -> list[tuple[Structure, JointFit]]:
     model = model_asked_for(METHOD, known)
     if model is None:
         return fits_jointly(cycles, known.dead_time, errors=errors)
@@ -120,7 +118,7 @@ def _fits(
 def _shape_misfit(
     tests: Sequence[RelayTest],
     cycles: Sequence[SymmetricCycle],
-    model: LagModel,
+    model: Structure,
     fit: JointFit,
 ) -> float:
     """Return how far the half cycles of all tests are from a model's, over their amplitudes."""
@@ -170,7 +168,7 @@ def _warnings(tests: Sequence[RelayTest]) -> list[str]:
 
 
 def _remarks(
-    model: LagModel, cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit
+    model: Structure, cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit
 ) -> list[str]:
     """Say how well the tests agree, and what the paper's describing function gives."""
     found = []
@@ -178,7 +176,7 @@ def _remarks(
         found.append("the gain given was not used: li finds it from the tests")
     if fit.misfit > AGREEMENT:
         found.append(
-            f"the tests do not agree with {model.name}: periods and amplitudes miss it by "
+            f"the tests do not agree with {model_text(model)}: periods and amplitudes miss it by "
             f"{fit.misfit:.2g} times their errors; the process is of another structure, or "
             "changed between the tests"
         )

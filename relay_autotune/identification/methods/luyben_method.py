@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.luyben2003 import from_step
-from relay_autotune.identification.result import FitReport, Identification, with_uncertainty
+from relay_autotune.identification.result import FitReport, Identification, identified
 from relay_autotune.process.response import response
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 FloatArray = NDArray[np.float64]
 
 METHOD = "luyben_step"
-STRUCTURE = "integrator_inverse"
-PARAMETERS = ("gain", "inverse_time_constant", "time_constant", "dead_time")
 
 _LEAST_SAMPLES = 20
 _MOST_POINTS = 2000
@@ -86,10 +85,7 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     :param known: a known dead time is not read from the record.
     :raises IdentificationError: if the record holds no such response.
     """
-    if known.structure not in ("", STRUCTURE):
-        raise IdentificationError(
-            f"{METHOD} has no structure {known.structure!r}; it has {STRUCTURE} only"
-        )
+    require_structure(known)
     test = step_test(record)
     until = _return_time(test, record.noise_std)
     curve, covariance = _fitted(test, until, known.dead_time)
@@ -107,16 +103,25 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
             "process is of another structure, or it was not in balance before the step; the "
             "method waveform uses all samples"
         )
-    return with_uncertainty(
+    return identified(
         METHOD,
-        _build,
-        PARAMETERS,
-        values,
-        covariance,
+        Estimate.of(INTEGRATOR_INVERSE, values, covariance),
         fit=fit,
         warnings=tuple(warnings),
         fitted=fitted,
     )
+
+
+def require_structure(known: Known) -> None:
+    """Refuse every structure but the one that the method has.
+
+    :param known: with the structure that is asked for.
+    :raises IdentificationError: if it is another one.
+    """
+    if known.structure not in ("", INTEGRATOR_INVERSE.name):
+        raise IdentificationError(
+            f"{METHOD} has no structure {known.structure!r}; it has {INTEGRATOR_INVERSE.name} only"
+        )
 
 
 def identify_step_numbers(
@@ -132,12 +137,8 @@ def identify_step_numbers(
     :raises IdentificationError: if no such process has these numbers.
     """
     gain, tau1, tau2 = from_step(t1, t2, extremum, step)
-    return with_uncertainty(METHOD, _build, PARAMETERS, np.array((gain, tau1, tau2, dead_time)))
-
-
-def _build(values: FloatArray) -> TransferFunction:
-    gain, tau1, tau2, dead_time = (float(v) for v in values)
-    return TransferFunction.integrator_inverse(gain, tau1, tau2, dead_time)
+    values = np.array((gain, tau1, tau2, dead_time))
+    return identified(METHOD, Estimate.of(INTEGRATOR_INVERSE, values))
 
 
 def step_test(record: Record) -> StepTest:
@@ -348,7 +349,9 @@ def _report(
 ) -> tuple[FitReport, FloatArray]:
     """Compare the model with the whole step response."""
     u = PiecewiseConstant(np.array([test.begin]), np.array([test.step]), 0.0)
-    modelled = float(curve.coefficients[-1]) + response(_build(values), test.time, u)
+    modelled = float(curve.coefficients[-1]) + response(
+        INTEGRATOR_INVERSE.build(values), test.time, u
+    )
     rms = math.sqrt(float(np.mean((test.y - modelled) ** 2)))
     spread = float(np.std(test.y))
     fitted = np.full(len(record), math.nan)

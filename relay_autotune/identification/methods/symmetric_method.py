@@ -15,19 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods.lag_models import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
-    LagModel,
     Solution,
     constants_text,
-    equal_lags,
+    lags_of,
     model_asked_for,
+    model_text,
 )
 from relay_autotune.identification.methods.square_wave import level
-from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import (
     NOT_SETTLED,
     RelayTest,
@@ -44,6 +45,7 @@ from relay_autotune.identification.shown.symmetric_cycle import (
     require_unbiased,
     skew_warning,
 )
+from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -72,10 +74,10 @@ class SymmetricMethod:
     """
 
     name: str
-    solve: Callable[[LagModel, SymmetricCycle, float], Solution]
+    solve: Callable[[Structure, SymmetricCycle, float], Solution]
     mismatch: Callable[[int, SymmetricCycle, float], float]
     agreement: float
-    remarks: Callable[[LagModel, SymmetricCycle, float], list[str]]
+    remarks: Callable[[Structure, SymmetricCycle, float], list[str]]
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Found:
     """
 
     identification: Identification
-    model: LagModel
+    model: Structure
     cycle: SymmetricCycle
     period_std: float = math.nan
     amplitude_std: float = math.nan
@@ -137,12 +139,9 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
         "" if whole.cycle.converged else NOT_SETTLED,
         *_remarks(method, model, cycle, gain, solution),
     ]
-    identification = with_uncertainty(
+    identification = identified(
         method.name,
-        model.build,
-        model.parameters,
-        solution.values(sign, dead_time.value),
-        covariance,
+        Estimate.of(model, solution.values(sign, dead_time.value), covariance),
         quantile,
         warnings=tuple(r for r in remarks if r),
     )
@@ -191,11 +190,9 @@ def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -
         model, remark = choose(method, cycle, gain)
     solution = method.solve(model, cycle, gain)
     remarks = [remark, *_remarks(method, model, cycle, gain, solution)]
-    identification = with_uncertainty(
+    identification = identified(
         method.name,
-        model.build,
-        model.parameters,
-        solution.values(sign, cycle.dead_time),
+        Estimate.of(model, solution.values(sign, cycle.dead_time)),
         warnings=tuple(r for r in remarks if r),
     )
     return Found(identification, model, cycle)
@@ -206,7 +203,7 @@ def choose(
     cycle: SymmetricCycle,
     gain: float,
     tolerance: Callable[[int], float] | None = None,
-) -> tuple[LagModel, str]:
+) -> tuple[Structure, str]:
     """Choose the simplest model that fits, where the gain is known.
 
     :param method: whose mismatch counts.
@@ -247,7 +244,7 @@ def _choice(
     read: Callable[[Stretch], SymmetricCycle],
     gain: float,
     known: Known,
-) -> tuple[LagModel, str]:
+) -> tuple[Structure, str]:
     cycle = read(test.whole)
     asked = model_asked_for(method.name, known)
     if asked is not None:
@@ -281,7 +278,7 @@ def _choice(
 
 def _choose_without_gain(
     method: SymmetricMethod, cycle: SymmetricCycle, whole: Stretch | None
-) -> tuple[LagModel, str]:
+) -> tuple[Structure, str]:
     """Choose among equal lags by the shape of the half cycles.
 
     Period and amplitude are then used up by gain and time constant.
@@ -310,8 +307,8 @@ def _choose_without_gain(
     why = "its simplicity" if whole is None else "the shape of its half cycles"
     model = equal_lags(order)
     return model, (
-        f"without the gain the structure is not checked: {model.name} was taken for {why}; give "
-        "the gain or the structure where they are known"
+        f"without the gain the structure is not checked: {model_text(model)} was taken for "
+        f"{why}; give the gain or the structure where they are known"
     )
 
 
@@ -325,12 +322,12 @@ def alike(misfit: float, least: float) -> bool:
 
 
 def shape_misfit(
-    whole: Stretch, model: LagModel, cycle: SymmetricCycle, solution: Solution
+    whole: Stretch, model: Structure, cycle: SymmetricCycle, solution: Solution
 ) -> float:
     """Return the root mean square of half cycles minus those of a solution [y]."""
     since, y = half_cycles(whole)
     stride = max(1, since.size // _SHAPE_SAMPLES)
-    lags = model.lags(solution.constants)
+    lags = lags_of(model, solution.constants)
     half = 0.5 * cycle.period
     squares = 0.0
     for time, seen in zip(since[::stride].tolist(), y[::stride].tolist(), strict=True):
@@ -344,25 +341,25 @@ def shape_misfit(
 
 def _remarks(
     method: SymmetricMethod,
-    model: LagModel,
+    model: Structure,
     cycle: SymmetricCycle,
     gain: float,
     solution: Solution,
 ) -> list[str]:
     remarks = []
-    if model.equal and not math.isnan(gain):
+    if model.equal_lags and not math.isnan(gain):
         difference = method.mismatch(model.order, cycle, gain)
         if abs(difference) > method.agreement:
             remarks.append(_mismatch_text(model, difference))
     remarks += [
-        f"{model.name} has two solutions, which period and amplitude do not tell apart: "
+        f"{model_text(model)} has two solutions, which period and amplitude do not tell apart: "
         f"{solution} was taken, {constants_text(other)} would do as well"
         for other in solution.others
     ]
     return remarks + method.remarks(model, cycle, gain)
 
 
-def _mismatch_text(model: LagModel, difference: float) -> str:
+def _mismatch_text(model: Structure, difference: float) -> str:
     if math.isinf(difference):
         apart = "cannot agree: by the period it has none"
     else:
@@ -370,13 +367,13 @@ def _mismatch_text(model: LagModel, difference: float) -> str:
             f"differ: the period's is {100.0 * math.expm1(difference):+.3g} % off the amplitude's"
         )
     return (
-        f"the two time constants of {model.name} {apart}; the process is of another structure, or "
-        "gain or dead time are not right"
+        f"the two time constants of {model_text(model)} {apart}; the process is of another "
+        "structure, or gain or dead time are not right"
     )
 
 
 def _by_shape(
-    whole: Stretch, model: LagModel, cycle: SymmetricCycle, solution: Solution
+    whole: Stretch, model: Structure, cycle: SymmetricCycle, solution: Solution
 ) -> Solution:
     """Put the one of several solutions first whose half cycles are most like the record's."""
     if not solution.others:

@@ -7,8 +7,9 @@ to switch; what the paper's own give is said in a warning.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from scipy.special import stdtrit
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.thyagarajan2003 import (
     HIGHER_ORDER,
@@ -29,11 +31,13 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     small_dead_time,
     unstable_fopdt,
 )
-from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, relay_test
 from relay_autotune.identification.shown.envelope import curvature_time, envelope
 from relay_autotune.identification.shown.shape import Reading, Shape, read_shape
 from relay_autotune.identification.shown.symmetric_cycle import require_unbiased, skew_warning
+from relay_autotune.process.model_parameters import DEAD_TIME, GAIN, TIME_CONSTANT, Parameter
+from relay_autotune.process.structures import FOPDT, IPDT, LAG_N, UNSTABLE_FOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
@@ -54,18 +58,41 @@ class Solver:
 
     :param name: the structure, for people.
     :param equations: their numbers in the paper.
-    :param parameters: names of the values.
+    :param structure: of the model.
     :param exact: from shape to values, shape (p,).
     :param literal: the same by the equations as they stand.
-    :param build: from values to the model.
     """
 
     name: str
     equations: str
-    parameters: tuple[str, ...]
+    structure: Structure
     exact: Callable[[Shape], FloatArray]
     literal: Callable[[Shape], FloatArray]
-    build: Callable[[FloatArray], TransferFunction]
+
+
+@dataclass(frozen=True)
+class _TiedLags(Structure):
+    """Equal lags whose dead time is known, or follows from the lag: it is no parameter.
+
+    :param given: dead time [s]; NaN: it follows from the lag.
+    :param ratio: dead time over time constant.
+    :param extra: dead time of the relay, which is in the others [s].
+    """
+
+    given: float = math.nan
+    ratio: float = 0.0
+    extra: float = 0.0
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Gain and time constant."""
+        return (GAIN, TIME_CONSTANT)
+
+    def build(self, values: Sequence[float] | FloatArray) -> TransferFunction:
+        """Return the transfer function of gain and time constant."""
+        gain, tau = values
+        dead_time = self.ratio * tau if math.isnan(self.given) else self.given
+        return LAG_N.of_order(self.order).build((gain, tau, max(dead_time - self.extra, 0.0)))
 
 
 def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identification:
@@ -86,7 +113,10 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
     require_unbiased(METHOD, settings)
     record = replace(record, settings=settings)
     reading = read_shape(record)
-    if known.structure in ("fopdt", "unstable_fopdt") and reading.shape.category in ("2", "3"):
+    if known.structure in (FOPDT.name, UNSTABLE_FOPDT.name) and reading.shape.category in (
+        "2",
+        "3",
+    ):
         # One lag has sharp peaks, though noise may hide them.
         reading = read_shape(record, sharp=True)
     extra = settings.extra_delay
@@ -132,15 +162,15 @@ def choose(reading: Reading, known: Known, categorised: str = "") -> tuple[Solve
         f"{shape.growth:.2f}, plateau {shape.plateau:.2f} of the half period)"
     )
     match known.structure:
-        case "fopdt":
+        case FOPDT.name:
             return (_flat() if found == "1b" else _sharp(dead_time)), why
-        case "unstable_fopdt":
+        case UNSTABLE_FOPDT.name:
             return _unstable(dead_time), why
-        case "lag_n" if known.order == 1:
+        case LAG_N.name if known.order == 1:
             return _sharp(dead_time), why
-        case "lag_n" if known.order:
+        case LAG_N.name if known.order:
             return _lags(known.order, dead_time), why
-        case "lag_n":
+        case LAG_N.name:
             return _lags(2 if found == "2" else HIGHER_ORDER, dead_time), why
         case "" if known.order > 1:
             return _lags(known.order, dead_time), why
@@ -180,9 +210,6 @@ def _by_peak(reading: Reading, shape: Shape, dead_time: float, why: str) -> tupl
     return _unstable(dead_time), f"{why}, and its peak comes before P/4: unstable FOPDT"
 
 
-_FOPDT = ("gain", "time_constant", "dead_time")
-
-
 def _peak_time(shape: Shape, dead_time: float) -> float:
     return shape.time_to_peak if math.isnan(dead_time) else dead_time
 
@@ -194,10 +221,9 @@ def _sharp(dead_time: float) -> Solver:
     return Solver(
         "FOPDT",
         "eqs 10 and 11",
-        _FOPDT,
+        FOPDT,
         lambda s: solve(s, s.level),
         lambda s: solve(s, 0.0),
-        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
     )
 
 
@@ -209,10 +235,9 @@ def _unstable(dead_time: float) -> Solver:
     return Solver(
         "unstable FOPDT",
         "eqs 16 and 17",
-        _FOPDT,
+        UNSTABLE_FOPDT,
         lambda s: solve(s, s.level),
         lambda s: solve(s, 0.0),
-        lambda v: TransferFunction.unstable_fopdt(float(v[0]), float(v[1]), float(v[2])),
     )
 
 
@@ -229,10 +254,9 @@ def _integrating() -> Solver:
     return Solver(
         "integrator with dead time",
         "the limit of eqs 10 and 11",
-        ("gain", "dead_time"),
+        IPDT,
         lambda s: solve(s, s.level),
         lambda s: solve(s, 0.0),
-        lambda v: TransferFunction.ipdt(float(v[0]), float(v[1])),
     )
 
 
@@ -243,10 +267,9 @@ def _flat() -> Solver:
     return Solver(
         "FOPDT",
         "eqs 20 to 22",
-        _FOPDT,
+        FOPDT,
         lambda s: solve(s, s.level),
         lambda s: solve(s, None),
-        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
     )
 
 
@@ -264,38 +287,29 @@ def _lags(order: int, dead_time: float) -> Solver:
             return np.array(small_dead_time(s.period, s.amplitude, 1.0)[:2])
         return np.array(higher_order(s.period, s.amplitude, 1.0, order))
 
-    def build(v: FloatArray) -> TransferFunction:
-        tau = float(v[1])
-        dead = dead_time if given else ratio * tau
-        return TransferFunction.lag_n(float(v[0]), tau, order, dead)
-
+    lags = LAG_N.of_order(order)
     return Solver(
         f"{order} equal lags",
         "eqs 23 and 24" if order == 2 else "eqs 26 and 27",
-        ("gain", "time_constant"),
+        _TiedLags(lags.name, lags.factors, given=dead_time, ratio=ratio),
         exact,
         literal,
-        build,
     )
 
 
 def _identified(
     solver: Solver, reading: Reading, relay: float, extra: float, warnings: list[str]
 ) -> Identification:
-    shape = reading.shape
+    shape, structure = reading.shape, solver.structure
+    if isinstance(structure, _TiedLags):
+        structure = replace(structure, extra=extra)
 
     def scaled(values: FloatArray) -> FloatArray:
         moved = values.copy()
         moved[0] /= relay
-        if solver.parameters[-1] == "dead_time":
+        if DEAD_TIME in structure.parameters:
             moved[-1] = max(moved[-1] - extra, 0.0)
         return moved
-
-    def build(values: FloatArray) -> TransferFunction:
-        model = solver.build(values)
-        if solver.parameters[-1] == "dead_time" or extra == 0.0:
-            return model
-        return replace(model, dead_time=max(model.dead_time - extra, 0.0))
 
     values = scaled(solver.exact(shape))
     covariance, quantile = None, NORMAL_95
@@ -304,8 +318,8 @@ def _identified(
         if slopes is not None:
             covariance = slopes @ reading.covariance @ slopes.T
         quantile = float(stdtrit(reading.cycles - 1, 0.975))
-    found = with_uncertainty(METHOD, build, solver.parameters, values, covariance, quantile)
-    remarks = (*_literal(solver, shape, scaled, build, found), *_sensitive(solver, shape))
+    found = identified(METHOD, Estimate.of(structure, values, covariance), quantile)
+    remarks = (*_literal(solver, shape, scaled, found), *_sensitive(solver, shape))
     return replace(found, warnings=(*found.warnings, *warnings, *remarks))
 
 
@@ -330,7 +344,6 @@ def _literal(
     solver: Solver,
     shape: Shape,
     scaled: Callable[[FloatArray], FloatArray],
-    build: Callable[[FloatArray], TransferFunction],
     found: Identification,
 ) -> list[str]:
     """Say what the paper's equations give, where that differs."""
@@ -345,9 +358,9 @@ def _literal(
         return []
     numbers = ", ".join(
         f"{name.replace('_', ' ')} {value:.4g}"
-        for name, value in zip(solver.parameters, values, strict=True)
+        for name, value in zip(found.parameters, values, strict=True)
     )
-    point = ultimate_point(build(values))
+    point = ultimate_point(found.estimate.structure.build(values))
     ultimate = f", K_u {point.gain:.4g}" if point else ""
     return [f"{begin}would give {numbers}{ultimate}"]
 
@@ -364,7 +377,7 @@ def _sensitive(solver: Solver, shape: Shape) -> list[str]:
             )
         except IdentificationError:
             return []
-        points.append(ultimate_point(TransferFunction.lag_n(gain, tau, 2, dead_time)))
+        points.append(ultimate_point(LAG_N.of_order(2).build((gain, tau, dead_time))))
     first, second = points
     if first is None or second is None:
         return []

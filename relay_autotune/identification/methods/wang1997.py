@@ -16,8 +16,6 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 
-PARAMETERS = ("gain", "time_constant", "dead_time")
-
 
 @dataclass(frozen=True)
 class FopdtCycle:

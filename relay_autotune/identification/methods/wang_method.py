@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.wang1997 import (
     INTEGRATOR_RATIO,
-    PARAMETERS,
     FopdtCycle,
     fopdt_from_biased,
     fopdt_from_unbiased,
     fopdt_with_gain,
 )
-from relay_autotune.identification.result import Identification, with_uncertainty
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
 from relay_autotune.identification.shown.fold import Fold, as_switched, fold
 from relay_autotune.identification.shown.steady_state import (
@@ -35,7 +35,7 @@ from relay_autotune.identification.shown.steady_state import (
     steady_state,
 )
 from relay_autotune.identification.shown.symmetric_cycle import require_unbiased
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.cycles import find_cycles
 from relay_autotune.record.record import Record
 
@@ -257,12 +257,9 @@ def _identified(
         for other in uncertain:
             covariance = covariance + _by(lambda known: values(whole, known), other, best)
     remarks = [remark, "" if test.whole.cycle.converged else NOT_SETTLED]
-    return with_uncertainty(
+    return identified(
         method,
-        lambda v: TransferFunction.fopdt(float(v[0]), float(v[1]), float(v[2])),
-        PARAMETERS,
-        best,
-        covariance,
+        Estimate.of(FOPDT, best, covariance),
         float(stdtrit(max(len(cycles) - 1, 1), 0.975)),
         warnings=tuple(r for r in remarks if r),
     )

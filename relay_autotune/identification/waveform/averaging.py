@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.identification.combinations import point_of
-from relay_autotune.identification.result import Identification, Rival, ultimate_std
-from relay_autotune.identification.uncertainty import is_logarithmic
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import Identification, Rival
+
+FloatArray = NDArray[np.float64]
 
 # How far a value of a rival may stray for the first order to stand for it: of a logarithm, and
 # of a dead time or a zero, in radians at the ultimate frequency.
@@ -41,12 +43,13 @@ def averaged_point(
     total = support
     sums = [support * std**2 for std in stds]
     for rival in rivals:
-        point = point_of(rival.model) if rival.parameters else (math.nan, math.nan)
+        root = rival.estimate.root
+        if root is None or not np.all(np.isfinite(root)):
+            continue
+        point = point_of(rival.model)
         if not math.isfinite(point[0]) or point[0] * own[0] < 0.0:
             continue
-        if not np.all(np.isfinite(rival.root)):
-            continue
-        theirs = ultimate_std(_within_reach(rival, point[1]), *point)
+        theirs = _within_reach(rival.estimate, root, point[1]).ultimate_std(*point)
         if not all(math.isfinite(s) for s in theirs):
             continue
         total += rival.support
@@ -57,8 +60,8 @@ def averaged_point(
     return math.sqrt(sums[0] / total), math.sqrt(sums[1] / total)
 
 
-def _within_reach(rival: Rival, frequency: float) -> Rival:
-    """Return a rival with the covariance of its values as far as the first order goes.
+def _within_reach(rival: Estimate, root: FloatArray, frequency: float) -> Estimate:
+    """Return an estimate with the covariance of its values as far as the first order goes.
 
     A lag or a zero far below the sampling period can hardly be told from dead time. To first
     order the two may then differ by more than the whole record, with a standard deviation S
@@ -67,14 +70,16 @@ def _within_reach(rival: Rival, frequency: float) -> Rival:
     leave of one that they show:  ``(S^-1 + L^-1)^-1 = L^1/2 U s^2/(1 + s^2) U' L^1/2`` with the
     singular values s of the root of S over that of L.
 
-    :param rival: with a covariance.
+    :param rival: the estimate.
+    :param root: of its covariance.
     :param frequency: w_u [rad/s].
     """
     phase = _FARTHEST_PHASE / frequency
     limits = [
-        _FARTHEST_RATIO * abs(value) if is_logarithmic(name) else phase
-        for name, value in zip(rival.parameters, rival.values, strict=True)
+        _FARTHEST_RATIO * abs(value) if parameter.logarithmic else phase
+        for parameter, value in zip(rival.structure.parameters, rival.values, strict=True)
     ]
     size = np.maximum(np.array(limits), 1e-12 * phase)
-    axes, std, _ = np.linalg.svd(rival.root / size[:, None], full_matrices=False)
-    return replace(rival, root=size[:, None] * axes * (std / np.sqrt(1.0 + std**2)))
+    axes, std, _ = np.linalg.svd(root / size[:, None], full_matrices=False)
+    root = size[:, None] * axes * (std / np.sqrt(1.0 + std**2))
+    return Estimate.of_root(rival.structure, rival.values, root)

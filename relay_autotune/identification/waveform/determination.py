@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.combinations import determined_combinations, is_determined
+from relay_autotune.identification.estimate import Quantity
 from relay_autotune.identification.judgement.advice import advice
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.uncertainty import Estimate, is_logarithmic
 from relay_autotune.identification.waveform.fit_covariance import (
     NEGLIGIBLE,
     Fit,
     Noise,
-    covariance_of_values,
+    estimate_of,
 )
 from relay_autotune.identification.waveform.profiles import profile_ends
 from relay_autotune.identification.waveform.separable import Problem, State, refine
@@ -46,13 +46,13 @@ def with_what_is_determined(
     if not found.undetermined:
         return found
     point = tuple(
-        Estimate(value, std, value - NORMAL_95 * std, value + NORMAL_95 * std)
+        Quantity(value, std, value - NORMAL_95 * std, value + NORMAL_95 * std)
         for value, std in (
             (found.ultimate_gain, found.ultimate_gain_std),
             (found.ultimate_frequency, found.ultimate_frequency_std),
         )
     )
-    combinations = determined_combinations(found, (point[0], point[1]))
+    combinations = determined_combinations(found.estimate, (point[0], point[1]))
     found = replace(found, combinations=combinations)
     return replace(found, advice=advice(found, records))
 
@@ -62,11 +62,8 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
     if fit.loss != "squares" or fit.state.cost <= fit.state.residual.size * NEGLIGIBLE**2:
         return found
     wide = {i for i, name in enumerate(found.parameters) if name in found.undetermined}
-    wide |= {
-        i
-        for i, name in enumerate(found.parameters)
-        if name == "dead_time" and found.ci95_low[i] == 0.0
-    }
+    parameters = found.estimate.structure.parameters
+    wide |= {i for i, p in enumerate(parameters) if found.ci95_low[i] == p.least}
     if not wide:
         return found
     few = fit.problem.thinned(_MOST_FOR_PROFILES)
@@ -75,25 +72,25 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
     # Fewer samples rise less: the curve of all is so many times as steep.
     fewer = few.time.size / fit.problem.time.size
     low, high = found.ci95_low.copy(), found.ci95_high.copy()
-    white = covariance_of_values(fit.problem, fit.state, fit, Noise(False))
+    white = estimate_of(fit.problem, fit.state, fit, Noise(False))
+    assert white is not None
     for i in sorted(wide):
-        name, value = found.parameters[i], float(found.values[i])
+        parameter, value = parameters[i], float(found.values[i])
         std = float(found.std[i])
         if not (math.isfinite(std) and std > 0.0):
             continue
-        inflation = fewer * found.covariance[i, i] / max(white[i, i], 1e-300)
-        logarithmic = is_logarithmic(name)
+        inflation = fewer * found.covariance[i, i] / max(white.covariance[i, i], 1e-300)
         ends = profile_ends(
             few,
             state,
-            _Parameter(few, state, fit.scale, i, logarithmic),
-            min(std / abs(value), _WIDE) if logarithmic else std,
+            _Parameter(few, state, fit.scale, i, parameter.logarithmic),
+            min(std / abs(value), _WIDE) if parameter.logarithmic else std,
             quantile,
-            farthest=_FARTHEST if logarithmic else _FARTHEST * std,
-            least=0.0 if name == "dead_time" else -math.inf,
+            farthest=_FARTHEST if parameter.logarithmic else _FARTHEST * std,
+            least=parameter.least,
             inflation=inflation,
         )
-        if logarithmic:
+        if parameter.logarithmic:
             near, far = (math.exp(min(e, 700.0)) if math.isfinite(e) else _limit(e) for e in ends)
             ends = (near, far) if value > 0.0 else (-far, -near)
         low[i], high[i] = min(ends[0], value), max(ends[1], value)
@@ -121,10 +118,10 @@ class _Parameter:
         self._number, self._logarithmic = number, logarithmic
 
     def __call__(self, theta: FloatArray, coefficients: FloatArray) -> float:
-        reading = self._structure.read(theta, self._scale * coefficients, like=self._like)
-        if reading is None:
+        read = self._structure.read(theta, self._scale * coefficients, like=self._like)
+        if read is None:
             return math.nan
-        value = float(reading.values[self._number])
+        value = float(read[1][self._number])
         if not self._logarithmic:
             return value
         return math.log(abs(value)) if value != 0.0 else math.nan

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
 from relay_autotune.identification.result import (
     FitReport,
     Identification,
     Rival,
-    with_uncertainty,
+    identified,
 )
 from relay_autotune.identification.waveform.averaging import averaged_point
 from relay_autotune.identification.waveform.choice import support
@@ -25,15 +26,13 @@ from relay_autotune.identification.waveform.fit_covariance import (
     NEGLIGIBLE,
     Fit,
     Noise,
-    covariance_of_values,
+    estimate_of,
     noise_of,
     raw_residual,
-    root_of_covariance,
 )
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.selection import Candidate
 from relay_autotune.identification.waveform.separable import Problem, State, evaluate, refine
-from relay_autotune.identification.waveform.structures import Reading
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -62,7 +61,12 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     exact = rms <= scale * NEGLIGIBLE
     whiteness = math.nan if exact else ljung_box(state.residual)
     noise = noise_of(records, rms, not math.isnan(whiteness) and whiteness < _WHITE)
-    reading = _read(problem, state, scale)
+    estimate = estimate_of(problem, state, fit, noise)
+    if estimate is None:
+        raise IdentificationError(
+            f"the fit of a {problem.structure.name} model left its structure; name another "
+            "structure"
+        )
     spread = scale * math.sqrt(
         sum(float(np.sum((problem.y[p] - problem.y[p].mean()) ** 2)) for p in problem.experiments)
         / n
@@ -76,13 +80,10 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     )
     quantile = float(stdtrit(max(n - state.parameters, 1), 0.975))
     warnings = (*fit.warnings, *_warnings(records, quality, noise, fit, residual))
-    found = with_uncertainty(
+    found = identified(
         "waveform",
-        reading.build,
-        reading.parameters,
-        reading.values,
-        covariance_of_values(problem, state, fit, noise),
-        quantile=quantile,
+        estimate,
+        quantile,
         fit=quality,
         warnings=warnings,
         fitted=_fitted(records[0], problem, residual, scale),
@@ -92,16 +93,6 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(notes)))
     found = _beside_rivals(found, fit, noise)
     return with_what_is_determined(found, records, fit, quantile)
-
-
-def _read(problem: Problem, state: State, scale: float) -> Reading:
-    reading = problem.structure.read(state.theta, scale * state.coefficients)
-    if reading is None:
-        raise IdentificationError(
-            f"the fit of a {problem.structure.name} model left its structure; name another "
-            "structure"
-        )
-    return reading
 
 
 def _fitted(record: Record, problem: Problem, residual: FloatArray, scale: float) -> FloatArray:
@@ -158,16 +149,15 @@ def _beside_rivals(found: Identification, fit: Fit, noise: Noise) -> Identificat
 def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) -> Rival | None:
     """Return a rival; with its covariance where the noise is given."""
     problem, state = candidate.problem, candidate.state
-    reading = problem.structure.read(state.theta, fit.scale * state.coefficients)
-    if reading is None:
-        return None
-    model = reading.build(reading.values)
     if noise is None:
-        return Rival(model, share)
-    root = root_of_covariance(problem, state, replace(fit, loss="squares"), noise)
+        read = problem.structure.read(state.theta, fit.scale * state.coefficients)
+        return None if read is None else Rival(Estimate.of(*read), share)
+    found = estimate_of(problem, state, replace(fit, loss="squares"), noise)
+    if found is None or found.root is None:
+        return None
     # It was fitted to some of the samples, where they are many.
-    root = root * math.sqrt(problem.time.size / fit.problem.time.size)
-    return Rival(model, share, reading.build, reading.parameters, reading.values, root)
+    root = found.root * math.sqrt(problem.time.size / fit.problem.time.size)
+    return Rival(Estimate.of_root(found.structure, found.values, root), share)
 
 
 def _prediction(records: Sequence[Record], problem: Problem, state: State) -> float:

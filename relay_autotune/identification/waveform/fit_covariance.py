@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.waveform.quantisation import quantisation_step
 from relay_autotune.identification.waveform.residuals import covariance_meat
 from relay_autotune.identification.waveform.robust import mean_slope, scale_of, weights
@@ -81,38 +82,22 @@ def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
     return Noise(coloured, larger * samples / held, step)
 
 
-def covariance_of_values(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
-    """Return the covariance of the parameters of the field, to first order, shape (p, p).
-
-    NaN: what is not determined is so large that numbers do not hold it.
+def estimate_of(problem: Problem, state: State, fit: Fit, noise: Noise) -> Estimate | None:
+    """Return the parameters of the field with their covariance to first order.
 
     :param problem: what was fitted.
     :param state: its fit.
     :param fit: where scale and loss are told.
     :param noise: what the residual is like.
+    :return: None if the fit is not of its structure.
     """
-    root = root_of_covariance(problem, state, fit, noise)
-    with np.errstate(over="ignore", invalid="ignore"):
-        covariance = root @ root.T
-    if not np.all(np.isfinite(covariance)):
-        return np.full_like(covariance, math.nan)
-    return np.asarray(covariance)
-
-
-def root_of_covariance(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
-    """Return B of the covariance B B' of the parameters of the field, shape (p, k).
-
-    It has twice the digits for what parameters leave open together that are hardly told apart.
-    Not finite: what is not determined is so large that numbers do not hold it.
-
-    :param problem: what was fitted.
-    :param state: its fit.
-    :param fit: where scale and loss are told.
-    :param noise: what the residual is like.
-    """
+    read = problem.structure.read(state.theta, fit.scale * state.coefficients)
+    if read is None:
+        return None
     gradient = _gradient(problem, state, fit.scale)
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(gradient @ _root(problem, state, fit, noise))
+        root = gradient @ _root(problem, state, fit, noise)
+    return Estimate.of_root(*read, root)
 
 
 def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
@@ -172,8 +157,8 @@ def _gradient(problem: Problem, state: State, scale: float) -> FloatArray:
         for side in (h, -h):
             moved = point.copy()
             moved[i] += side
-            reading = structure.read(moved[k:], scale * moved[:k], like=state.theta)
-            assert reading is not None
-            ends.append(reading.values)
+            read = structure.read(moved[k:], scale * moved[:k], like=state.theta)
+            assert read is not None
+            ends.append(read[1])
         columns.append((ends[0] - ends[1]) / (2.0 * h))
     return np.stack(columns, axis=1)

@@ -24,7 +24,6 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.choice import choose
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit, raw_residual
-from relay_autotune.identification.waveform.lags import FOPDT
 from relay_autotune.identification.waveform.robust import scale_of, weights
 from relay_autotune.identification.waveform.selection import (
     Candidate,
@@ -39,7 +38,8 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import changes_within
-from relay_autotune.process.transfer_function import STRUCTURES
+from relay_autotune.identification.waveform.theta import unit_steps
+from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.record import Input, Record
 
 FloatArray = NDArray[np.float64]
@@ -81,10 +81,9 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     :raises IdentificationError: if a record holds too little, they are of processes of different
         direction, or there is no response to the command.
     """
-    if known.structure and known.structure not in STRUCTURES[:-1]:
+    if known.structure and known.structure not in TABLE:
         raise IdentificationError(
-            f"the waveform fit has no structure {known.structure!r}; it has "
-            f"{', '.join(STRUCTURES[:-1])}"
+            f"the waveform fit has no structure {known.structure!r}; it has {', '.join(TABLE)}"
         )
     inputs = [record.drive() for record in records]
     for record, u in zip(records, inputs, strict=True):
@@ -229,7 +228,7 @@ def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
         scale = max(scale_of(residual), NEGLIGIBLE)
         problem = replace(problem, weight=own * np.sqrt(weights(residual, scale, loss)))
         earlier, state = state, refine(problem, state.theta, tolerance=_SETTLED)
-        change = np.abs(state.theta - earlier.theta) / problem.structure.scale(state.theta)
+        change = np.abs(state.theta - earlier.theta) / unit_steps(problem.structure, state.theta)
         if float(change.max()) <= _SETTLED:
             break
     return replace(fit, problem=problem, state=state, base=own, loss=loss)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.waveform.factors import Denominator, Lag, UnstableLag
 from relay_autotune.identification.waveform.partial_fractions import follow, partial_fractions
+from relay_autotune.process.factors import Denominator, Lag, UnstableLag
 from relay_autotune.process.modes import Modes
 from relay_autotune.process.response import coordinates_at_changes
 from relay_autotune.record.record import Input, PiecewiseLinear
@@ -79,8 +79,8 @@ def free_motion(
     own = denominator.split(theta[:-1])
     first = 0
     for factor, part in zip(denominator.factors, own, strict=True):
-        place = slice(first, first + factor.parameters)
-        first += factor.parameters
+        place = slice(first, first + len(factor.parameters))
+        first = place.stop
         if growing_only and not factor.unstable:
             continue
         if isinstance(factor, UnstableLag):

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.waveform import structures as known_structures
-from relay_autotune.identification.waveform.lags import FOPDT
 from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
@@ -30,12 +28,23 @@ from relay_autotune.identification.waveform.starts import (
     start_fopdt,
     time_scales,
 )
-from relay_autotune.identification.waveform.structures import (
-    RationalStructure,
-    Reading,
-    lag_n,
-    lag_n_zero,
+from relay_autotune.process.structures import (
+    FOPDT,
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    SOPDT,
+    SOPDT_ZERO,
+    THREE_LAGS,
+    TWO_EQUAL_ONE,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+    Structure,
+    equal_lags,
 )
+from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.float64]
 
@@ -66,17 +75,17 @@ class Candidate:
 
     :param problem: what was fitted.
     :param state: the fit.
-    :param reading: the fit in the terms of the field.
+    :param model: the fit in the terms of the field.
     :param criterion: Bayesian information criterion; smaller is better.
     """
 
     problem: Problem
     state: State
-    reading: Reading
+    model: TransferFunction
     criterion: float
 
     @property
-    def structure(self) -> RationalStructure:
+    def structure(self) -> Structure:
         """The structure."""
         return self.problem.structure
 
@@ -115,7 +124,7 @@ class Selection:
         if enough >= first.cost / whole.time.size:
             return
         # A long first swing from rest shows small lags, which a FOPDT lacks.
-        third = replace(self._problem, structure=known_structures.THREE_LAGS)
+        third = replace(self._problem, structure=THREE_LAGS)
         flexible = refine_best(third, Starts(third, self._fopdt).third(), tolerance=_TRIAL)
         if flexible.cost / third.time.size > enough:
             self._problem, self._fopdt = later, second
@@ -123,12 +132,11 @@ class Selection:
     def candidate(self, problem: Problem, state: State) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure."""
         structure = problem.structure
-        reading = structure.read(state.theta, state.coefficients)
-        if reading is None and structure.name == "three_lags":
-            problem = replace(problem, structure=known_structures.LAG_COMPLEX)
-            reading = problem.structure.read(state.theta, state.coefficients)
-        model = None if reading is None else reading.model
-        if reading is None or model is None:
+        model = structure.model_at(state.theta, state.coefficients)
+        if model is None and structure == THREE_LAGS:
+            problem = replace(problem, structure=LAG_COMPLEX)
+            model = LAG_COMPLEX.model_at(state.theta, state.coefficients)
+        if model is None:
             return None
         if self._sign and model.process_sign != self._sign:
             return None
@@ -139,7 +147,7 @@ class Selection:
         criterion = information_criterion(
             state.cost, problem.time.size, state.parameters, self._floor
         )
-        return Candidate(problem, state, reading, criterion)
+        return Candidate(problem, state, model, criterion)
 
     def with_nuisances(self, found: Candidate) -> Candidate:
         """Add drift and a free initial state to a fit where the data ask for them.
@@ -151,7 +159,7 @@ class Selection:
             for relaxation in (False, True):
                 if (drift, relaxation) == (found.problem.drift, found.problem.relaxation):
                     continue
-                if relaxation and not found.structure.denominator.factors:
+                if relaxation and not found.structure.factors:
                     # The free state of an integrator is the offset.
                     continue
                 problem = replace(found.problem, drift=drift, relaxation=relaxation)
@@ -261,30 +269,30 @@ class Selection:
                 return [self._best(FOPDT, [self._fopdt.theta])]
             case "lag_n":
                 orders = [order] if order else range(2, MOST_LAGS + 1)
-                return [self._best(lag_n(n), [starts.lag_n(n)]) for n in orders]
+                return [self._best(equal_lags(n), [starts.lag_n(n)]) for n in orders]
             case "lag_n_zero":
                 orders = [order] if order else range(2, _MOST_LAGS_WITH_ZERO + 1)
-                return [self._best(lag_n_zero(n), starts.lag_n_zero(n)) for n in orders]
+                return [self._best(LAG_N_ZERO.of_order(n), starts.lag_n_zero(n)) for n in orders]
             case "sopdt":
-                return [self._best(known_structures.SOPDT, starts.sopdt())]
+                return [self._best(SOPDT, starts.sopdt())]
             case "sopdt_zero":
                 thetas = [*starts.sopdt(), self._two_equal_lags()]
-                return [self._best(known_structures.SOPDT_ZERO, thetas)]
+                return [self._best(SOPDT_ZERO, thetas)]
             case "two_equal_one":
-                return [self._best(known_structures.TWO_EQUAL_ONE, starts.two_equal_one())]
+                return [self._best(TWO_EQUAL_ONE, starts.two_equal_one())]
             case "three_lags" | "lag_complex":
-                return [self._best(known_structures.THREE_LAGS, starts.third())]
+                return [self._best(THREE_LAGS, starts.third())]
             case "ipdt":
-                return [self._best(known_structures.IPDT, [starts.integrator()])]
+                return [self._best(IPDT, [starts.integrator()])]
             case "integrator_lag":
-                return [self._best(known_structures.INTEGRATOR_LAG, starts.integrator_lag())]
+                return [self._best(INTEGRATOR_LAG, starts.integrator_lag())]
             case "integrator_inverse":
-                return [self._best(known_structures.INTEGRATOR_INVERSE, starts.integrator_lag())]
+                return [self._best(INTEGRATOR_INVERSE, starts.integrator_lag())]
             case "unstable_fopdt":
-                return [self._continued(known_structures.UNSTABLE_FOPDT, self._unstable())]
+                return [self._continued(UNSTABLE_FOPDT, self._unstable())]
             case "unstable_sopdt":
                 chosen = starts.unstable_second(self._unstable()[0].theta)
-                return [self._best(known_structures.UNSTABLE_SOPDT, chosen)]
+                return [self._best(UNSTABLE_SOPDT, chosen)]
         return []
 
     def _two_equal_lags(self) -> FloatArray:
@@ -292,25 +300,25 @@ class Selection:
 
         From a FOPDT, which answers the right way at once, not every inverse response is found.
         """
-        problem = replace(self._problem, structure=lag_n_zero(2))
+        problem = replace(self._problem, structure=LAG_N_ZERO.of_order(2))
         best = go_on(problem, begin(problem, self._starts.lag_n_zero(2)))[0]
         return np.array((best.theta[0], 0.0, best.theta[1]))
 
     def _unstable(self) -> list[State]:
         """Return the beginning of an unstable FOPDT's fit, from which two structures go on."""
         if self._begun is None or self._begun[0] is not self._problem:
-            problem = replace(self._problem, structure=known_structures.UNSTABLE_FOPDT)
+            problem = replace(self._problem, structure=UNSTABLE_FOPDT)
             self._begun = self._problem, begin(problem, self._starts.unstable(problem))
         return self._begun[1]
 
-    def _best(self, structure: RationalStructure, thetas: list[FloatArray]) -> Candidate | None:
+    def _best(self, structure: Structure, thetas: list[FloatArray]) -> Candidate | None:
         problem = replace(self._problem, structure=structure)
         if _SAMPLES_EACH * (structure.order + 4) > problem.time.size and structure.order > 1:
             # So few samples tell no more than a first order.
             return None
         return self._continued(structure, begin(problem, thetas))
 
-    def _continued(self, structure: RationalStructure, begun: list[State]) -> Candidate | None:
+    def _continued(self, structure: Structure, begun: list[State]) -> Candidate | None:
         """Return the best fit that a beginning leads to; None where it is hopeless."""
         problem = replace(self._problem, structure=structure)
         asked = structure.name in _ALWAYS

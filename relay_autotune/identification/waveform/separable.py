@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.identification.waveform.structures import RationalStructure
+from relay_autotune.identification.waveform.rational import free_motion
+from relay_autotune.identification.waveform.theta import columns_of, stepped, unit_steps
+from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Input
 
 FloatArray = NDArray[np.float64]
@@ -55,7 +57,7 @@ class Problem:
     time: FloatArray
     y: FloatArray
     inputs: tuple[Input, ...]
-    structure: RationalStructure
+    structure: Structure
     index: NDArray[np.int64]
     bounds: tuple[int, ...] = (0,)
     drift: bool = False
@@ -112,11 +114,11 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return one experiment's responses, free motion and straight line, with derivatives."""
         time = self.time[part]
-        common, by_theta = self.structure.columns(theta, time, self.inputs[number])
+        common, by_theta = columns_of(self.structure, theta, time, self.inputs[number])
         own, own_by_theta = np.zeros((0, time.size)), np.zeros((theta.size, 0, time.size))
         if self.relaxation or self.structure.unstable:
-            own, own_by_theta = self.structure.relaxation(
-                theta, time, growing_only=not self.relaxation
+            own, own_by_theta = free_motion(
+                self.structure.denominator, theta, time, growing_only=not self.relaxation
             )
         rest = np.ones((1 + self.drift, time.size))
         if self.drift:
@@ -151,7 +153,7 @@ class Problem:
 
 def problem_of(
     records: Sequence[tuple[FloatArray, FloatArray, Input]],
-    structure: RationalStructure,
+    structure: Structure,
 ) -> Problem:
     """Return the problem of fitting a structure to one or several experiments.
 
@@ -265,7 +267,7 @@ def refine(
         predicted = float(step @ (2.0 * gradient - normal @ step))
         if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
             break
-        trial = evaluate(problem, problem.structure.move(state.theta, step, longest))
+        trial = evaluate(problem, stepped(problem.structure, state.theta, step, longest))
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         idle = 0 if state.cost - trial.cost > tolerance * state.cost else idle + 1
         if rough and idle == _PATIENCE:
@@ -304,7 +306,7 @@ def promised(problem: Problem, state: State) -> float:
 
 def _linearised(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the units of steps, and the normal equations' matrix and right side in them."""
-    scale = problem.structure.scale(state.theta)
+    scale = unit_steps(problem.structure, state.theta)
     jacobian = state.derivative * scale[:, None]
     jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
     return scale, jacobian @ jacobian.T, jacobian @ state.residual

@@ -14,6 +14,7 @@ from relay_autotune.identification.waveform.separable import (
     promised,
     refine,
 )
+from relay_autotune.identification.waveform.theta import columns_of, unit_steps
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Input, PiecewiseConstant
@@ -140,7 +141,7 @@ def _apart_from_each_other(problem: Problem, states: list[State], limit: float) 
     states = sorted(states, key=lambda s: s.cost)
     chosen: list[State] = []
     for state in states:
-        size = problem.structure.scale(state.theta)
+        size = unit_steps(problem.structure, state.theta)
         near = (np.abs((state.theta - c.theta) / size).max() < _SAME for c in chosen)
         if state.cost <= limit * states[0].cost and not any(near):
             chosen.append(state)
@@ -206,7 +207,7 @@ def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> F
         # A dead time only moves the response, so that one pass over moved samples gives all.
         moved = (problem.time[part] - dead_times[:, None]).ravel()
         order = np.argsort(moved, kind="stable")
-        columns, _ = problem.structure.columns(theta, moved[order], u)
+        columns, _ = columns_of(problem.structure, theta, moved[order], u)
         r = np.empty(moved.size)
         r[order] = columns[0]
         table = r.reshape(dead_times.size, -1)

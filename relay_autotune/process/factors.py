@@ -1,4 +1,4 @@
-"""Factors of a denominator, with the derivatives by their parameters that a fit needs."""
+"""Factors of a denominator: poles, parameters, and the derivatives that a fit needs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.process.model_parameters import (
+    DAMPING,
+    NATURAL_FREQUENCY,
+    TIME_CONSTANT,
+    TIME_CONSTANT_1,
+    TIME_CONSTANT_2,
+    Parameter,
+    oscillating_pair,
+    positive,
+)
+
 FloatArray = NDArray[np.float64]
 Polynomial = NDArray[np.float64]
+
+TWO_LAGS = (TIME_CONSTANT_1, TIME_CONSTANT_2)
+PAIR = (NATURAL_FREQUENCY, DAMPING)
 
 
 @dataclass(frozen=True)
@@ -18,10 +32,11 @@ class Lag:
     """``(1 + tau s)^n`` with the parameter log tau.
 
     :param multiplicity: n.
+    :param parameters: tau.
     """
 
     multiplicity: int = 1
-    parameters = 1
+    parameters: tuple[Parameter] = (TIME_CONSTANT,)
     unstable = False
 
     def polynomial(self, theta: FloatArray) -> Polynomial:
@@ -39,13 +54,27 @@ class Lag:
         """Return the time constants of one power of the factor [s]."""
         return [complex(math.exp(theta[0]))]
 
+    def values(self, theta: FloatArray) -> tuple[float, ...]:
+        """Return the parameters that theta stands for: tau [s]."""
+        return (math.exp(theta[0]),)
+
+    def poles(self, values: Sequence[float]) -> tuple[complex, ...]:
+        """Return the time constants of all powers for a value of tau [s].
+
+        :raises ModelError: unless it is positive.
+        """
+        return (positive(values[0]),) * self.multiplicity
+
 
 @dataclass(frozen=True)
 class UnstableLag:
-    """``tau s - 1`` with the parameter log tau."""
+    """``tau s - 1`` with the parameter log tau.
 
+    :param parameters: tau.
+    """
+
+    parameters: tuple[Parameter] = (TIME_CONSTANT,)
     multiplicity = 1
-    parameters = 1
     unstable = True
 
     def polynomial(self, theta: FloatArray) -> Polynomial:
@@ -63,6 +92,17 @@ class UnstableLag:
         """Return the time constant in ``1 + T s`` [s], which is -tau."""
         return [complex(-math.exp(theta[0]))]
 
+    def values(self, theta: FloatArray) -> tuple[float, ...]:
+        """Return the parameters that theta stands for: tau [s]."""
+        return (math.exp(theta[0]),)
+
+    def poles(self, values: Sequence[float]) -> tuple[complex, ...]:
+        """Return the time constant for a value of tau [s].
+
+        :raises ModelError: unless it is positive.
+        """
+        return (-positive(values[0]),)
+
 
 @dataclass(frozen=True)
 class Quadratic:
@@ -70,10 +110,12 @@ class Quadratic:
 
     One smooth parametrisation from underdamped to overdamped; where two lags merge into a pair
     nothing happens.
+
+    :param parameters: ``TWO_LAGS`` or ``PAIR``, as which it is reported.
     """
 
+    parameters: tuple[Parameter, Parameter] = TWO_LAGS
     multiplicity = 1
-    parameters = 2
     unstable = False
 
     def polynomial(self, theta: FloatArray) -> Polynomial:
@@ -102,6 +144,19 @@ class Quadratic:
         root = math.sqrt(1.0 - zeta * zeta)
         return [complex(t * zeta, t * root), complex(t * zeta, -t * root)]
 
+    def values(self, theta: FloatArray) -> tuple[float, ...]:
+        """Return the parameters that theta stands for, of two lags the larger first."""
+        if self.parameters == PAIR:
+            return math.exp(-theta[0]), math.exp(theta[1])
+        return tuple(c.real for c in self.constants(theta))
+
+    def poles(self, values: Sequence[float]) -> tuple[complex, ...]:
+        """Return the two time constants for values of the parameters [s].
+
+        :raises ModelError: if the natural frequency is not positive.
+        """
+        return oscillating_pair(*values) if self.parameters == PAIR else tuple(values)
+
 
 Factor = Lag | UnstableLag | Quadratic
 
@@ -120,7 +175,7 @@ class Denominator:
     @property
     def parameters(self) -> int:
         """Number of parameters of all factors."""
-        return sum(f.parameters for f in self.factors)
+        return sum(len(f.parameters) for f in self.factors)
 
     @property
     def order(self) -> int:
@@ -137,8 +192,9 @@ class Denominator:
         """
         parts, first = [], 0
         for factor in self.factors:
-            parts.append(theta[first : first + factor.parameters])
-            first += factor.parameters
+            last = first + len(factor.parameters)
+            parts.append(theta[first:last])
+            first = last
         return parts
 
     def constants(self, theta: FloatArray) -> tuple[complex, ...]:

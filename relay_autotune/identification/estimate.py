@@ -1,0 +1,246 @@
+"""A model by the values of its parameters, how sure they are, and what follows from both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.confidence import NORMAL_95
+from relay_autotune.errors import ModelError
+from relay_autotune.process.structures import Structure
+from relay_autotune.process.transfer_function import TransferFunction
+
+FloatArray = NDArray[np.float64]
+
+# Logarithms may go so far from the estimate, and steps for derivatives are so long.
+_FAR = 50.0
+_STEPS = (1e-7, 1e-2)
+_SHARE = 1e-3
+# Logarithms of a model that is drawn.
+_FARTHEST_DRAWN = 20.0
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity with its uncertainty.
+
+    :param value: the quantity.
+    :param std: its standard deviation to first order; NaN: not estimated.
+    :param low: lower end of its 95 % interval; NaN: not estimated.
+    :param high: upper end; NaN: not estimated.
+    """
+
+    value: float
+    std: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The parameters of a model and their covariance.
+
+    :param structure: of the model.
+    :param values: of its parameters, in their order, shape (p,).
+    :param covariance: of the values, shape (p, p); NaN: not estimated.
+    :param root: B of the covariance B B', shape (p, k), where it is known: it has twice the
+        digits for what parameters leave open together that are hardly told apart; None: it is
+        not.
+    """
+
+    structure: Structure
+    values: FloatArray
+    covariance: FloatArray
+    root: FloatArray | None = None
+
+    @classmethod
+    def of(
+        cls, structure: Structure, values: FloatArray, covariance: FloatArray | None = None
+    ) -> Estimate:
+        """Return values with their covariance, or without.
+
+        :param structure: of the model.
+        :param values: of its parameters, shape (p,).
+        :param covariance: shape (p, p); None: not estimated.
+        """
+        if covariance is None:
+            covariance = np.full((values.size, values.size), math.nan)
+        return cls(structure, values, covariance)
+
+    @classmethod
+    def of_root(cls, structure: Structure, values: FloatArray, root: FloatArray) -> Estimate:
+        """Return values with the covariance B B'.
+
+        :param structure: of the model.
+        :param values: of its parameters, shape (p,).
+        :param root: B, shape (p, k); what is so large that numbers do not hold its square leaves
+            the covariance NaN.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            covariance = root @ root.T
+        if not np.all(np.isfinite(covariance)):
+            covariance = np.full_like(covariance, math.nan)
+        return cls(structure, values, np.asarray(covariance), root)
+
+    @cached_property
+    def model(self) -> TransferFunction:
+        """The transfer function of the values."""
+        return self.structure.build(self.values)
+
+    @property
+    def known(self) -> bool:
+        """True if a covariance was estimated."""
+        return bool(np.all(np.isfinite(self.covariance)))
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the values, shape (p,); NaN: not estimated."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def intervals(self, quantile: float = NORMAL_95) -> tuple[FloatArray, FloatArray]:
+        """Return the ends of the 95 % intervals of the values, each of shape (p,).
+
+        What cannot change sign, as a gain or a time constant, has the interval of its logarithm;
+        all else has a linear one, cut at the parameter's least value.
+
+        :param quantile: half width in standard deviations.
+        """
+        values, reach = self.values, quantile * self.std
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            ratio = np.exp(np.minimum(reach / np.abs(values), 700.0))
+            ends = values / ratio, values * ratio
+        logarithmic, least = self.structure.logarithmic, self.structure.least
+        low = np.where(logarithmic, np.minimum(*ends), values - reach)
+        high = np.where(logarithmic, np.maximum(*ends), values + reach)
+        cut = ~logarithmic & np.isfinite(low)
+        return np.where(cut, np.maximum(low, least), low), high
+
+    @cached_property
+    def _spread(self) -> FloatArray:
+        """Covariance with all that cannot change sign by its logarithm, shape (p, p)."""
+        size = np.where(self.structure.logarithmic, self.values, 1.0)
+        return np.asarray(self.covariance / np.outer(size, size))
+
+    def _moved(self, change: FloatArray, farthest: float) -> FloatArray:
+        """Return the values after a change, of logarithms where a value cannot change sign."""
+        logarithmic = self.structure.logarithmic
+        with np.errstate(over="ignore"):
+            factors = np.exp(np.clip(change, -farthest, farthest))
+        moved = np.where(logarithmic, self.values * factors, self.values + change)
+        return np.where(logarithmic, moved, np.maximum(moved, self.structure.least))
+
+    def quantity(
+        self, function: Callable[[TransferFunction], float], quantile: float = NORMAL_95
+    ) -> Quantity:
+        """Return a function of the model with its 95 % interval.
+
+        With z the parameters, gains and time constants by their logarithms, S their covariance
+        and g the gradient of the function f by z, the variance is g' S g, and the interval
+
+            f(z - q S g/sqrt(g' S g))  to  f(z + q S g/sqrt(g' S g)),
+
+        which is exact for any monotone function of a linear one: it is the usual one for a dead
+        time, and that of the logarithm for a gain or a ratio.
+
+        :param function: of the model, such as ``lambda m: abs(m(1j * 0.3))``; NaN: it has none.
+        :param quantile: half width of the interval of a normal variable in standard deviations.
+        """
+        value = float(function(self.model))
+        if not math.isfinite(value) or not self.known:
+            return Quantity(value)
+        spread, structure = self._spread, self.structure
+
+        def at(change: FloatArray) -> float:
+            try:
+                return float(function(structure.build(self._moved(change, _FAR))))
+            except (ModelError, OverflowError):
+                return math.nan
+
+        gradient = np.zeros(self.values.size)
+        for i, deviation in enumerate(np.sqrt(np.maximum(np.diag(spread), 0.0))):
+            h = min(max(_SHARE * deviation, _STEPS[0]), _STEPS[1])
+            below = h
+            if not structure.logarithmic[i]:
+                h = max(_SHARE * deviation, _STEPS[0] * (abs(self.values[i]) or 1.0))
+                # At a dead time of zero there is one side only.
+                below = min(h, float(self.values[i] - structure.least[i]))
+            step = np.zeros(self.values.size)
+            step[i] = h
+            gradient[i] = (at(step) - at(-step * (below / h))) / (h + below)
+        variance = float(gradient @ spread @ gradient)
+        if not variance >= 0.0:
+            return Quantity(value)
+        std = math.sqrt(variance)
+        if std == 0.0:
+            return Quantity(value, 0.0, value, value)
+        along = quantile * (spread @ gradient) / std
+        ends = [at(-along), at(along)]
+        if not all(math.isfinite(e) for e in ends):
+            ends = [value - quantile * std, value + quantile * std]
+        return Quantity(value, std, min(*ends, value), max(*ends, value))
+
+    def ultimate_std(self, gain: float, frequency: float) -> tuple[float, float]:
+        """Return the standard deviations of K_u and w_u to first order.
+
+        At a fixed frequency a parameter p changes log G by d, and the ultimate point moves by
+
+            dw = -d(arg G)/dp / (d(arg G)/dw),   d(log K_u) = -d(log|G|)/dp - d(log|G|)/dw dw.
+
+        :param gain: K_u of the model [u/y].
+        :param frequency: its w_u [rad/s].
+        """
+        structure, values = self.structure, self.values
+
+        def log_response(x: FloatArray, w: float) -> complex:
+            # At the ultimate point -K_u G is 1, so that its logarithm has no branch nearby.
+            return complex(np.log(-gain * structure.build(x)(1j * w)))
+
+        step = 1e-6
+        by_frequency = (
+            log_response(values, frequency * (1.0 + step))
+            - log_response(values, frequency * (1.0 - step))
+        ) / (2.0 * step * frequency)
+        gradient_gain, gradient_frequency = [], []
+        for i, (parameter, value) in enumerate(zip(structure.parameters, values, strict=True)):
+            # A dead time or a zero of next to nothing still acts by its part of the period.
+            least = 0.0 if parameter.logarithmic else 1.0 / frequency
+            size = max(abs(value), least) or 1.0 / frequency
+            up, down = values.copy(), values.copy()
+            up[i] = value + step * size
+            down[i] = max(value - step * size, parameter.least)
+            change = log_response(up, frequency) - log_response(down, frequency)
+            change /= up[i] - down[i]
+            dw = -change.imag / by_frequency.imag
+            gradient_frequency.append(dw)
+            gradient_gain.append(-gain * (change.real + by_frequency.real * dw))
+
+        def deviation(gradient: list[float]) -> float:
+            g = np.array(gradient)
+            return math.sqrt(max(float(g @ self.covariance @ g), 0.0))
+
+        return deviation(gradient_gain), deviation(gradient_frequency)
+
+    def draws(self, count: int, rng: np.random.Generator) -> Iterator[TransferFunction]:
+        """Draw models from the uncertainty.
+
+        Correlations are kept, which matters: a gain and a time constant that are each uncertain
+        often have a ratio that is not.
+
+        :param count: models to draw.
+        :param rng: the source.
+        """
+        changes = rng.multivariate_normal(
+            np.zeros(self.values.size),
+            self._spread,
+            count,
+            # What is not determined has variances whose rounding is no small number.
+            check_valid="ignore",
+            method="eigh",
+        )
+        for change in changes:
+            yield self.structure.build(self._moved(change, _FARTHEST_DRAWN))

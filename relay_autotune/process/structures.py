@@ -1,0 +1,355 @@
+"""The structures of processes: one row each, from which all that they have in common follows."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import ModelError
+from relay_autotune.process.factors import (
+    PAIR,
+    TWO_LAGS,
+    Denominator,
+    Factor,
+    Lag,
+    Quadratic,
+    UnstableLag,
+)
+from relay_autotune.process.model_parameters import (
+    DEAD_TIME,
+    GAIN,
+    INVERSE,
+    PARAMETERS,
+    TIME_CONSTANT_1,
+    TIME_CONSTANT_2,
+    TIME_CONSTANT_3,
+    ZERO,
+    Parameter,
+    at_least_one,
+    exactly,
+)
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.registry import look_up
+
+FloatArray = NDArray[np.float64]
+
+GENERAL = "general"
+
+# Below this damping two lags are reported as a pair; at 1, where they merge, neither is smooth.
+_DAMPING_OF_A_PAIR = 1.02
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A structure by its factors: ``gain (1 + z s) exp(-D s)/(s^integrators product)``.
+
+    A fit has a theta for it: the logarithms of the factors' parameters, then the dead time. The
+    coefficients of the numerator are linear: K, and with a zero K z.
+
+    :param name: of the structure.
+    :param factors: of the denominator, in the order of theta.
+    :param integrators: poles at s = 0.
+    :param zero: its zero; None: it has none.
+    :param either: True: two lags may be a pair that oscillates, with other parameters.
+    :param any_order: True: the number of equal lags belongs to the model, see :meth:`of_order`.
+    """
+
+    name: str
+    factors: tuple[Factor, ...] = ()
+    integrators: int = 0
+    zero: Parameter | None = None
+    either: bool = False
+    any_order: bool = False
+
+    @cached_property
+    def denominator(self) -> Denominator:
+        """The denominator."""
+        return Denominator(self.factors, self.integrators)
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """Powers of s in the numerator."""
+        return (0,) if self.zero is None else (0, 1)
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return self.denominator.order
+
+    @property
+    def given_order(self) -> int:
+        """Number of equal lags where it has to be told with the name; else 0."""
+        return self.order if self.any_order else 0
+
+    @property
+    def unstable(self) -> bool:
+        """True if a pole lies in the right half plane."""
+        return any(f.unstable for f in self.factors)
+
+    @property
+    def equal_lags(self) -> bool:
+        """True if it is one lag, or several equal ones, and dead time."""
+        plain = self.zero is None and not self.integrators and len(self.factors) == 1
+        return plain and isinstance(self.factors[0], Lag)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters, in the order of the values."""
+        own = {GAIN, DEAD_TIME, self.zero, *(p for f in self.factors for p in f.parameters)}
+        return tuple(p for p in PARAMETERS if p in own)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def logarithmic(self) -> NDArray[np.bool_]:
+        """Which of the parameters cannot change sign, shape (p,)."""
+        return np.array([p.logarithmic for p in self.parameters], dtype=bool)
+
+    @cached_property
+    def least(self) -> FloatArray:
+        """Smallest value of each parameter, shape (p,)."""
+        return np.array([p.least for p in self.parameters])
+
+    def unit(self, parameter: Parameter) -> str:
+        """Return the unit of a parameter in this structure."""
+        if parameter != GAIN or self.integrators <= 0:
+            return parameter.unit
+        return "y/(u s)" if self.integrators == 1 else f"y/(u s^{self.integrators})"
+
+    def of_order(self, order: int) -> Structure:
+        """Return the structure with so many equal lags.
+
+        :raises ModelError: if there is less than one.
+        """
+        (parameters,) = [f.parameters for f in self.factors if isinstance(f, Lag)]
+        return replace(self, factors=(Lag(at_least_one(order), parameters),))
+
+    def form(self, pair: bool) -> Structure:
+        """Return the structure with its quadratic factor as a pair or as two lags.
+
+        :param pair: True: natural frequency and damping in the place of two lags.
+        """
+        wanted = Quadratic(PAIR if pair else TWO_LAGS)
+        factors = [wanted if isinstance(f, Quadratic) else f for f in self.factors]
+        return replace(self, factors=tuple(factors)) if self.either else self
+
+    def build(self, values: Sequence[float] | FloatArray) -> TransferFunction:
+        """Return the transfer function of some values.
+
+        :param values: of :attr:`parameters`, in their order, shape (p,).
+        :raises ModelError: if a time constant or a natural frequency is not positive, the gain
+            zero, the dead time negative, or a value not finite.
+        """
+        given = dict(zip(self.parameters, map(float, values), strict=True))
+        gain = -given[GAIN] if self.unstable else given[GAIN]
+        zeros: tuple[float, ...] = ()
+        if self.zero is not None:
+            value = given[self.zero]
+            zeros = (-value if self.zero.turned else value,)
+            if self.zero.logarithmic and not value > 0.0:
+                raise ModelError(f"a time constant here must be > 0 s, found {value:g} s")
+        constants: list[complex] = []
+        for factor in sorted(self.factors, key=lambda f: PARAMETERS.index(f.parameters[0])):
+            constants += factor.poles([given[p] for p in factor.parameters])
+        dead_time = given[DEAD_TIME]
+        return TransferFunction(
+            gain, zeros, tuple(constants), self.integrators, dead_time, self.name
+        )
+
+    def read(
+        self, theta: FloatArray, coefficients: FloatArray, like: FloatArray | None = None
+    ) -> tuple[Structure, FloatArray] | None:
+        """Return the values that a fit stands for, with the structure whose parameters they are.
+
+        :param theta: shape (m,).
+        :param coefficients: of the numerator first, shape (k,).
+        :param like: a theta beside which the reading takes the same form; default: ``theta``.
+        :return: None if the fit is not of this structure: without gain, a pair where lags are
+            meant, a zero of the other sign.
+        """
+        gain = float(coefficients[0])
+        form = self._form_at(theta if like is None else like)
+        if gain == 0.0 or form is None:
+            return None
+        given = {GAIN: gain, DEAD_TIME: float(theta[-1])}
+        lags: list[Parameter] = []
+        for factor, own in zip(form.factors, self.denominator.split(theta[:-1]), strict=True):
+            given.update(zip(factor.parameters, factor.values(own), strict=True))
+            if not factor.unstable and factor.multiplicity == 1 and factor.parameters != PAIR:
+                lags += factor.parameters
+        # Lags that may change places are told by size.
+        given.update(zip(lags, sorted((given[p] for p in lags), reverse=True), strict=True))
+        if self.zero is not None:
+            zero = float(coefficients[1]) / gain
+            given[self.zero] = -zero if self.zero.turned else zero
+            if self.zero.logarithmic and not given[self.zero] > 0.0:
+                return None
+        return form, np.array([given[p] for p in form.parameters])
+
+    def model_at(self, theta: FloatArray, coefficients: FloatArray) -> TransferFunction | None:
+        """Return the model that a fit stands for; None where it is not of this structure.
+
+        :param theta: shape (m,).
+        :param coefficients: of the numerator first, shape (k,).
+        """
+        found = self.read(theta, coefficients)
+        if found is None or not np.all(np.isfinite(found[1])):
+            return None
+        return found[0].build(found[1])
+
+    def _form_at(self, theta: FloatArray) -> Structure | None:
+        """Return the structure as two lags or as a pair, by the damping; None: not this one."""
+        for factor, own in zip(self.factors, self.denominator.split(theta[:-1]), strict=True):
+            if isinstance(factor, Quadratic):
+                pair = not math.exp(own[1]) >= _DAMPING_OF_A_PAIR
+                same = pair is (factor.parameters == PAIR)
+                return self if same else self.form(pair) if self.either else None
+        return self
+
+    def of_fields(
+        self,
+        *,
+        gain: float,
+        time_constants: Sequence[float] = (),
+        zeros: Sequence[float] = (),
+        dead_time: float = 0.0,
+        order: int = 0,
+        natural_frequency: float = 0.0,
+        damping: float = 0.0,
+    ) -> TransferFunction:
+        """Return a model by the fields that flags, messages and plant_node's parameters have.
+
+        :param gain: K [y/u, y/(u s)].
+        :param time_constants: in the order of the parameters [s]; one for equal lags; empty with
+            ``natural_frequency`` and ``damping`` where the structure may have a complex pair.
+        :param zeros: time constants of ``(1 + z s)`` [s].
+        :param dead_time: D [s].
+        :param order: number of equal lags.
+        :param natural_frequency: w0 of a complex pair [rad/s].
+        :param damping: zeta of a complex pair.
+        :raises ModelError: if their number is not that of the structure's parameters, or a value
+            is out of range.
+        """
+        found = self.of_order(order) if self.any_order else self
+        found = found.form(pair=not time_constants)
+        fields = {
+            "gain": [gain],
+            "dead_time": [dead_time],
+            "natural_frequency": [natural_frequency],
+            "damping": [damping],
+        }
+        count = Counter(p.field for p in found.parameters)
+        for name, given in (("time_constants", time_constants), ("zeros", zeros)):
+            if count[name]:
+                fields[name] = [c.real for c in exactly(count[name], given, name)]
+        values = [fields[p.field].pop(0) * (-1.0 if p.turned else 1.0) for p in found.parameters]
+        return found.build(values)
+
+
+@dataclass(frozen=True)
+class GivenModel(Structure):
+    """A model of which only the transfer function is known, as one that was read.
+
+    :param given: the parameters whose values are told with it.
+    :param model: the transfer function.
+    """
+
+    given: tuple[Parameter, ...] = ()
+    model: TransferFunction = field(default_factory=lambda: TransferFunction(1.0))
+
+    @classmethod
+    def of(cls, model: TransferFunction, names: Sequence[str] = ()) -> GivenModel:
+        """Return the structure of a model.
+
+        :param model: the transfer function.
+        :param names: of the parameters whose values are told with it.
+        """
+        by_name = {p.name: p for p in PARAMETERS}
+        given = tuple(by_name[name] for name in names)
+        return cls(model.structure, (), model.integrators, given=given, model=model)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters whose values are told."""
+        return self.given
+
+    def build(self, values: Sequence[float] | FloatArray) -> TransferFunction:
+        """Return the model, which has these values.
+
+        :param values: those that were told with it.
+        """
+        assert len(values) == len(self.given)
+        return self.model
+
+
+_ONE, _TWO, _THREE = (TIME_CONSTANT_1,), (TIME_CONSTANT_2,), (TIME_CONSTANT_3,)
+
+FOPDT = Structure("fopdt", (Lag(),))
+LAG_N = Structure("lag_n", (Lag(2),), any_order=True)
+LAG_N_ZERO = Structure("lag_n_zero", (Lag(2),), zero=ZERO, any_order=True)
+SOPDT = Structure("sopdt", (Quadratic(),), either=True)
+SOPDT_ZERO = Structure("sopdt_zero", (Quadratic(),), zero=ZERO, either=True)
+TWO_EQUAL_ONE = Structure("two_equal_one", (Lag(2, _ONE), Lag(1, _TWO)))
+THREE_LAGS = Structure("three_lags", (Quadratic(), Lag(1, _THREE)))
+LAG_COMPLEX = Structure("lag_complex", (Quadratic(PAIR), Lag()))
+IPDT = Structure("ipdt", (), 1)
+INTEGRATOR_LAG = Structure("integrator_lag", (Lag(),), 1)
+INTEGRATOR_INVERSE = Structure("integrator_inverse", (Lag(),), 1, INVERSE)
+UNSTABLE_FOPDT = Structure("unstable_fopdt", (UnstableLag(),))
+UNSTABLE_SOPDT = Structure("unstable_sopdt", (UnstableLag(_ONE), Lag(1, _TWO)))
+
+# All that there are, by name, the simple ones first.
+TABLE = {
+    structure.name: structure
+    for structure in (
+        *(FOPDT, LAG_N, LAG_N_ZERO, SOPDT, SOPDT_ZERO, TWO_EQUAL_ONE, THREE_LAGS, LAG_COMPLEX),
+        *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
+    )
+}
+
+# The fields of a model beside its structure.
+FIELDS = (
+    *("gain", "time_constants", "zeros", "dead_time"),
+    *("order", "natural_frequency", "damping"),
+)
+
+# Names that models have; the last one stands for any other transfer function.
+STRUCTURES = (*TABLE, GENERAL)
+
+
+def structure_named(name: str) -> Structure:
+    """Return a structure by its name.
+
+    :raises ModelError: if there is none; the message lists those there are.
+    """
+    return look_up(TABLE, name, "structure", ModelError)
+
+
+def structure_of(model: TransferFunction, names: Sequence[str]) -> Structure:
+    """Return the structure of a model that has the parameters named.
+
+    :param model: with the name of its structure.
+    :param names: of its parameters, in their order.
+    :return: where no structure has these, that of the model alone.
+    """
+    found = TABLE.get(model.structure)
+    if found is not None:
+        found = found.of_order(model.order) if found.any_order and model.order else found
+        for form in (found.form(False), found.form(True)):
+            if form.names == tuple(names):
+                return form
+    return GivenModel.of(model, names)
+
+
+def equal_lags(order: int) -> Structure:
+    """Return n equal lags with dead time; one of them is a FOPDT."""
+    return FOPDT if order == 1 else LAG_N.of_order(order)
