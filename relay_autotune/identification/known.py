@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.process.transfer_function import STRUCTURES
+from relay_autotune.process.structures import TABLE
 from relay_autotune.quantities import check, quantity
 
 LOSSES = ("squares", "huber", "tukey")
@@ -33,7 +33,7 @@ class Known:
         "",
         "",
         "Structure of the model; empty: chosen by the method.",
-        choices=("", *STRUCTURES[:-1]),
+        choices=("", *TABLE),
     )
     order: int = quantity(
         0, "", "Number of equal lags, for lag_n; 0: to be found.", lower=0, upper=_MOST_LAGS
