@@ -112,7 +112,7 @@ def outcome(title: str, model: TransferFunction, ratio: float, seed: tuple[int, 
 def described(found: Identification) -> str:
     """Return the structure and its parameters."""
     values = ", ".join(f"{v:.3g}" for v in found.values)
-    order = f" of order {found.model.order}" if found.structure.startswith("lag_n") else ""
+    order = f" of order {order}" if (order := found.estimate.structure.given_order) else ""
     return f"{found.structure}{order} ({values})"
 
 

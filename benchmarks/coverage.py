@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification import Identification, Known, identify
-from relay_autotune.identification.result import ultimate_std
+from relay_autotune.process.structures import TABLE
 
 RECORDS = 2_000
 RATIO = 0.1
@@ -32,8 +32,8 @@ AFTER_CHOICE = 100
 
 def known(process: Process) -> Known:
     """Return the structure of a process as a fact."""
-    equal = process.model.structure.startswith("lag_n")
-    return Known(structure=process.model.structure, order=process.model.order if equal else 0)
+    row = TABLE[process.model.structure]
+    return Known(structure=row.name, order=process.model.order if row.any_order else 0)
 
 
 def covers(found: Identification, truth: Identification) -> NDArray[np.bool_]:
@@ -89,7 +89,7 @@ def after_choice(process: Process, records: int) -> tuple[int, ...]:
     for seed in range(records):
         model = identify(process.record(RATIO, seed))
         point = (model.ultimate_gain, model.ultimate_frequency)
-        alone = ultimate_std(model, *point)
+        alone = model.estimate.ultimate_std(*point)
         averaged = (model.ultimate_gain_std, model.ultimate_frequency_std)
         errors = np.abs(np.array((point[0] - truth.gain, point[1] - truth.frequency) * 2))
         found += errors <= NORMAL_95 * np.array((*alone, *averaged))

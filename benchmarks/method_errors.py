@@ -66,7 +66,7 @@ def methods(process: Process) -> tuple[str, ...]:
 def known(process: Process, method: str) -> Known:
     """Return what a method is told of a process."""
     model = process.model
-    order = model.order if model.structure.startswith("lag_n") else 0
+    order = model.order if TABLE[model.structure].any_order else 0
     if method == "waveform" or (method == "fourier" and model.structure in _ONE_LAG):
         return Known(structure=model.structure, order=order)
     if method in ("chang", "atv"):

@@ -69,7 +69,7 @@ def choices(process: Process, records: int) -> Choices:
             tally.good += 1
             continue
         tally.good += abs(tally.errors[-1][0]) <= EQUIVALENT
-        lags = f" {found.model.order}" if found.structure.startswith("lag_n") else ""
+        lags = f" {order}" if (order := found.estimate.structure.given_order) else ""
         tally.others[found.structure + lags] += 1
     return tally
 
