@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification, Known, identify, identify_jointly
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import TABLE
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 FloatArray = NDArray[np.float64]

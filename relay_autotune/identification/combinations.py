@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from relay_autotune.identification.estimate import Estimate, Quantity
+from relay_autotune.identification.estimate import Estimate, Uncertain
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 
@@ -45,15 +45,15 @@ def is_determined(value: float, low: float, high: float) -> bool:
 
 
 def determined_combinations(
-    found: Estimate, point: tuple[Quantity, Quantity]
+    found: Estimate, point: tuple[Uncertain, Uncertain]
 ) -> tuple[Combination, ...]:
     """Return the combinations that the data hold, of a model that is not determined as a whole.
 
     :param found: the model with its covariance.
     :param point: K_u and w_u, whose uncertainty is known better than to first order.
     """
-    asked: list[tuple[str, str, Quantity]] = [
-        (name, unit, found.quantity(function)) for name, unit, function in _asked(found.model)
+    asked: list[tuple[str, str, Uncertain]] = [
+        (name, unit, found.uncertain(function)) for name, unit, function in _asked(found.model)
     ]
     if math.isfinite(point[0].value):
         asked += [

@@ -26,7 +26,7 @@ _FARTHEST_DRAWN = 20.0
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Uncertain:
     """A quantity with its uncertainty.
 
     :param value: the quantity.
@@ -134,9 +134,9 @@ class Estimate:
         moved = np.where(logarithmic, self.values * factors, self.values + change)
         return np.where(logarithmic, moved, np.maximum(moved, self.structure.least))
 
-    def quantity(
+    def uncertain(
         self, function: Callable[[TransferFunction], float], quantile: float = NORMAL_95
-    ) -> Quantity:
+    ) -> Uncertain:
         """Return a function of the model with its 95 % interval.
 
         With z the parameters, gains and time constants by their logarithms, S their covariance
@@ -152,7 +152,7 @@ class Estimate:
         """
         value = float(function(self.model))
         if not math.isfinite(value) or not self.known:
-            return Quantity(value)
+            return Uncertain(value)
         spread, structure = self._spread, self.structure
 
         def at(change: FloatArray) -> float:
@@ -174,15 +174,15 @@ class Estimate:
             gradient[i] = (at(step) - at(-step * (below / h))) / (h + below)
         variance = float(gradient @ spread @ gradient)
         if not variance >= 0.0:
-            return Quantity(value)
+            return Uncertain(value)
         std = math.sqrt(variance)
         if std == 0.0:
-            return Quantity(value, 0.0, value, value)
+            return Uncertain(value, 0.0, value, value)
         along = quantile * (spread @ gradient) / std
         ends = [at(-along), at(along)]
         if not all(math.isfinite(e) for e in ends):
             ends = [value - quantile * std, value + quantile * std]
-        return Quantity(value, std, min(*ends, value), max(*ends, value))
+        return Uncertain(value, std, min(*ends, value), max(*ends, value))
 
     def ultimate_std(self, gain: float, frequency: float) -> tuple[float, float]:
         """Return the standard deviations of K_u and w_u to first order.

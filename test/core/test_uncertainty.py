@@ -40,18 +40,18 @@ def _fopdt(covariance: np.ndarray):
 
 def test_the_interval_of_a_parameter_is_its_own():
     found = _fopdt(np.diag((0.1, 0.8, 0.2)) ** 2)
-    gain = found.estimate.quantity(lambda m: m.gain)
+    gain = found.estimate.uncertain(lambda m: m.gain)
     assert gain.std == pytest.approx(0.1, rel=1e-4)
     assert (gain.low, gain.high) == pytest.approx(
         (found.ci95_low[0], found.ci95_high[0]), rel=1e-4
     )
-    delay = found.estimate.quantity(lambda m: m.dead_time)
+    delay = found.estimate.uncertain(lambda m: m.dead_time)
     assert (delay.low, delay.high) == pytest.approx((3.0 - 0.392, 3.0 + 0.392), rel=1e-4)
 
 
 def test_the_interval_of_the_ultimate_gain_is_that_of_its_stated_deviation():
     found = _fopdt(np.diag((0.05, 0.3, 0.05)) ** 2)
-    gain = found.estimate.quantity(lambda m: identify_point(m))
+    gain = found.estimate.uncertain(lambda m: identify_point(m))
     assert gain.value == pytest.approx(found.ultimate_gain)
     assert gain.std == pytest.approx(found.ultimate_gain_std, rel=1e-3)
 
@@ -68,7 +68,7 @@ def test_correlated_parameters_have_a_certain_ratio():
     spread = np.array([[0.09, 0.08995, 0.0], [0.08995, 0.09, 0.0], [0.0, 0.0, 0.0]])
     size = np.array((2.0, 10.0, 1.0))
     found = _fopdt(spread * np.outer(size, size))
-    ratio = found.estimate.quantity(lambda m: m.gain / m.time_constants[0].real)
+    ratio = found.estimate.uncertain(lambda m: m.gain / m.time_constants[0].real)
     assert ratio.std / ratio.value == pytest.approx(0.01, rel=1e-3)
     assert (ratio.low, ratio.high) == pytest.approx(
         (0.2 * math.exp(-0.0196), 0.2 * math.exp(0.0196)), rel=1e-4
@@ -77,7 +77,7 @@ def test_correlated_parameters_have_a_certain_ratio():
 
 def test_what_has_no_covariance_has_no_interval():
     found = _fopdt(np.full((3, 3), math.nan))
-    answer = found.estimate.quantity(lambda m: m.gain)
+    answer = found.estimate.uncertain(lambda m: m.gain)
     assert answer.value == 2.0
     assert math.isnan(answer.std)
     assert math.isnan(answer.low)

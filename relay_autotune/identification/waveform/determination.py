@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.combinations import determined_combinations, is_determined
-from relay_autotune.identification.estimate import Quantity
+from relay_autotune.identification.estimate import Uncertain
 from relay_autotune.identification.judgement.advice import advice
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.fit_covariance import (
@@ -46,7 +46,7 @@ def with_what_is_determined(
     if not found.undetermined:
         return found
     point = tuple(
-        Quantity(value, std, value - NORMAL_95 * std, value + NORMAL_95 * std)
+        Uncertain(value, std, value - NORMAL_95 * std, value + NORMAL_95 * std)
         for value, std in (
             (found.ultimate_gain, found.ultimate_gain_std),
             (found.ultimate_frequency, found.ultimate_frequency_std),
