@@ -26,6 +26,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/launch", files("launch")),
         (f"share/{PACKAGE}/config", files("config")),
+        (f"share/{PACKAGE}/config/security", files("config/security")),
     ],
     python_requires=">=3.11",
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import ctypes
+import logging
 import multiprocessing
+import os
+import signal
 import uuid
+from asyncio import CancelledError as TaskCancelledError
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from typing import Any
 
 from relay_autotune.cli.replay_bag import Done, Job, died, work
 from relay_autotune.errors import BagError
 
 _CONNECT_S = 10.0
+# Of Linux's prctl: the signal that this process gets when its parent ends.
+_PR_SET_PDEATHSIG = 1
 _PRELOADED = [
     f"relay_autotune.{name}"
     for name in ("threads", "autotune", "bag.reader", "cli.replay_bag", "document")
@@ -61,7 +69,20 @@ def _pool(count: int) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("forkserver")
     # What every job needs is loaded once, in the process that they are forked from.
     context.set_forkserver_preload(_PRELOADED)
-    return ProcessPoolExecutor(count, mp_context=context)
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_the_command)
+
+
+def _end_with_the_command() -> None:
+    """Let the kernel end this process when the one that it was forked from ends.
+
+    That one ends with the command, whichever signal ended that; a worker alone would wait for
+    work for ever.
+    """
+    parent = os.getppid()
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0 or os.getppid() != parent:
+        # It has ended already, or this system cannot tell.
+        os._exit(1)
 
 
 def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[tuple[int, Done]]:
@@ -72,7 +93,8 @@ def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[t
     :param jobs: what to do; the workers must see the recordings under the same paths.
     :param address: of the scheduler, such as ``tcp://host:8786``.
     :param do: does one job.
-    :raises BagError: if there is no dask.distributed, or no scheduler.
+    :raises BagError: if there is no dask.distributed, or no scheduler, or it ends before all is
+        done; what is left then has no result.
     """
     try:
         import distributed
@@ -81,6 +103,9 @@ def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[t
             "--scheduler needs the Python package distributed; "
             "install it with: pip install distributed"
         ) from None
+    for name in ("client", "core", "utils"):
+        # What they would show as tracebacks is raised here as one sentence.
+        logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
@@ -91,11 +116,25 @@ def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[t
             client.submit(do, job, key=f"replay-{run}-{number}", pure=False): number
             for number, job in enumerate(jobs)
         }
+        left = set(futures.values())
         for future in distributed.as_completed(futures):
             number = futures[future]
-            if future.status == "finished":
-                yield number, future.result()
-            else:
-                yield number, died(jobs[number], f"failed on the cluster: {future.exception()}")
+            try:
+                # Of a future that was finished the result may be lost on the way.
+                yield number, _result(future, jobs[number])
+            except (CancelledError, TaskCancelledError, OSError) as error:
+                raise BagError(
+                    f"the scheduler {address} is gone: {len(left)} of {len(jobs)} bags are not "
+                    f"done; start it again and repeat the command, which goes on where this one "
+                    f"ended if it has --output"
+                ) from error
+            left.discard(number)
             # Its result is not kept on the cluster until all are done.
             future.release()
+
+
+def _result(future: Any, job: Job) -> Done:
+    if future.status == "error":
+        return died(job, f"failed on the cluster: {future.exception()}")
+    done: Done = future.result()
+    return done

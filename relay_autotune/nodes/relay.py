@@ -17,6 +17,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.exchange.messages import finding_from_message
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, SafePolicy
 from relay_autotune.experiment.parameters import ExperimentParameters
@@ -291,23 +292,22 @@ class RelayNode(ServedNode):
 
     def _on_result(self, name: str, message: Any) -> None:
         session = self._session
-        running = session is not None and message.experiment_id == session.id
+        running = session if session is not None and message.experiment_id == session.id else None
         now = int(self.get_clock().now().nanoseconds)
-        taken = self._results.take(name, message, running)
+        taken = self._results.take(
+            name, message, None if running is None else running.experiment, self._on_setpoint
+        )
         for topic, found in taken:
             self._action.note(topic, found)
             self._recordings.message(found.experiment_id, topic, now, found)
-        if session is None or not running or not taken:
+        if running is None or not taken:
             return
-        finding = self._results.finding(message, session.experiment, self._on_setpoint)
-        if finding is None:
+        self._action.tell(running.experiment)
+        if running.early is None:
             return
-        self._action.tell(session.experiment)
-        if session.early is None:
-            return
-        if reason := session.early.judge(session.experiment, finding):
-            self._send_safe(command := session.experiment.conclude(reason))
-            self._leave(session, command)
+        if reason := running.early.judge(running.experiment, finding_from_message(message)):
+            self._send_safe(command := running.experiment.conclude(reason))
+            self._leave(running, command)
 
     # Ending.
 

@@ -23,7 +23,6 @@ from relay_autotune.exchange.messages import (
     record_from_message,
     transfer_function_from_message,
 )
-from relay_autotune.experiment.early_end import Finding
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
@@ -31,6 +30,7 @@ from relay_autotune.record.record import Record
 # Experiments that are remembered, and reasons that are logged; somebody may send any number.
 _MOST = 8
 _MOST_REASONS = 50
+MODEL = "transfer_function"
 _TOO_SOON = "the experiment still runs, so that nothing final can be said of it"
 _NUMBER = re.compile(r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|\binf\b|\bnan\b)", re.IGNORECASE)
 
@@ -181,43 +181,43 @@ class OwnResults(Results):
     def __init__(self, node: Node) -> None:
         super().__init__(node)
         # Gains that came before their model.
-        self._early: Any = None
+        self._early: tuple[str, Any] | None = None
 
-    def take(self, name: str, message: Any, running: bool) -> list[tuple[str, Any]]:
+    def take(
+        self, name: str, message: Any, running: RelayExperiment | None, on_setpoint: bool
+    ) -> list[tuple[str, Any]]:
         """Return the messages that may be stored, each with the name of its topic.
 
         :param name: of the message's topic, ``transfer_function`` or ``pi_gains``.
         :param message: the message.
-        :param running: True if its experiment still runs.
-        """
-        told = message.experiment_id
-        if name == "transfer_function":
-            if running and message.final:
-                self.refusals.say("the model", told, ModelError(_TOO_SOON))
-            elif self.model(message) is not None:
-                early, self._early = self._early, None
-                found = [(name, message)]
-                if early is not None and message.final:
-                    found += self.take("pi_gains", early, running)
-                return found
-        elif running:
-            self.refusals.say("gains", told, TuningError(_TOO_SOON))
-        elif message.final and told in self._evidence and told not in self._models:
-            self._early = message
-        elif self.gains(message) is not None:
-            return [(name, message)]
-        return []
-
-    def finding(
-        self, message: Any, experiment: RelayExperiment, on_setpoint: bool
-    ) -> Finding | None:
-        """Return what a model says of a running experiment, None if it is refused.
-
-        :param message: the `TransferFunction`.
-        :param experiment: that runs.
-        :param on_setpoint: True if its relay moves a set-point, so that its levels and its sign
+        :param running: its experiment, if that still runs.
+        :param on_setpoint: True if the relay moves a set-point, so that its levels and its sign
             are not those of the command.
         """
+        told = message.experiment_id
+        if running is not None:
+            why = self._why_not_running(name, message, running, on_setpoint)
+            if why is not None:
+                self.refusals.say("the model" if name == MODEL else "gains", told, why)
+                return []
+        if name == MODEL:
+            if self.model(message) is None:
+                return []
+            found, early = [(name, message)], self._early
+            if early is not None and message.final:
+                self._early = None
+                found += self.take(early[0], early[1], running, on_setpoint)
+            return found
+        if message.final and told in self._evidence and told not in self._models:
+            self._early = name, message
+            return []
+        return [(name, message)] if self.gains(message) is not None else []
+
+    def _why_not_running(
+        self, name: str, message: Any, experiment: RelayExperiment, on_setpoint: bool
+    ) -> RelayAutotuneError | None:
+        if name != MODEL or message.final:
+            return TuningError(_TOO_SOON)
         sign, amplitude, relay = experiment.process_gain_sign, math.nan, math.nan
         cycles, settings = experiment.cycles, experiment.settings
         if on_setpoint:
@@ -229,9 +229,8 @@ class OwnResults(Results):
             found = finding_from_message(message)
             check_finding(found, sign=sign, amplitude=amplitude, relay=relay)
         except RelayAutotuneError as error:
-            self.refusals.say("the model", message.experiment_id, error)
-            return None
-        return found
+            return error
+        return None
 
 
 def _keep(known: dict[str, Any], name: str, value: Any) -> None:

@@ -6,9 +6,15 @@ import csv
 import functools
 import json
 import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
 
 import pytest
-from fleet_work import die_of_bag_3, die_once, mark
+from fleet_work import die_of_bag_3, die_once, mark, wait_for_ever
 from made_bags import REPOSITORY
 
 from relay_autotune.bag.reader import Selection
@@ -73,6 +79,77 @@ def test_a_cluster_of_which_a_worker_is_killed_loses_nothing_and_does_nothing_tw
     assert (tmp_path / "died").exists()
     assert sorted(number for number, _ in found) == list(range(30))
     assert all(done.name == f"bag{number}" and done.status == 0 for number, done in found)
+
+
+def until(condition, what):
+    deadline = time.monotonic() + 120.0
+    while not (value := condition()):
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+    return value
+
+
+def is_running(number):
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def test_the_bags_of_a_scheduler_that_dies_are_not_done(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("relay_autotune.cli.fleet._CONNECT_S", 5.0)
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY / "test" / "support"), prepend=os.pathsep)
+    where, flag = tmp_path / "scheduler.json", tmp_path / "bag1.pid"
+    begin = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard"]
+    begin += ["--host", "tcp://127.0.0.1", "--port", "0", "--scheduler-file", str(where)]
+    join = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-nanny", "--no-dashboard"]
+    join += ["--nthreads", "1", "--scheduler-file", str(where), "--death-timeout", "60"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    processes = [subprocess.Popen(begin, **quiet)]
+    try:
+        until(lambda: where.exists() and where.read_text().endswith("}"), "the scheduler")
+        address = json.loads(where.read_text())["address"]
+        processes.append(subprocess.Popen(join, **quiet))
+        found = []
+
+        def kill():
+            until(lambda: found and flag.exists(), "a job")
+            processes[0].kill()
+
+        threading.Thread(target=kill, daemon=True).start()
+        with pytest.raises(BagError, match="is gone: 2 of 3 bags are not done"):
+            found.extend(on_cluster(jobs(3, tmp_path), address, wait_for_ever))
+        assert [done.name for _, done in found] == ["bag0"]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_worker_is_left_when_the_command_is_ended(tmp_path, number):
+    code = (
+        "import sys\n"
+        f"sys.path[:0] = {[str(REPOSITORY / 'test' / 'support'), str(Path(__file__).parent)]}\n"
+        "from test_fleet import jobs\n"
+        "from fleet_work import wait_for_ever\n"
+        "from relay_autotune.cli.fleet import in_processes\n"
+        f"list(in_processes(jobs(3, {str(tmp_path)!r}), 2, wait_for_ever))\n"
+    )
+    command = subprocess.Popen([sys.executable, "-c", code])
+    try:
+        flags = [tmp_path / f"bag{k}.pid" for k in (1, 2)]
+        numbers = [
+            until(lambda flag=flag: flag.exists() and flag.read_text(), "a job") for flag in flags
+        ]
+        assert all(map(is_running, numbers))
+        command.send_signal(number)
+        command.wait()
+        until(lambda: not any(map(is_running, numbers)), "the end of the workers")
+    finally:
+        command.kill()
+        command.wait()
 
 
 def test_no_scheduler_is_said_in_one_line(capsys, monkeypatch):

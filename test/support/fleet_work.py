@@ -31,3 +31,12 @@ def die_once(job: Job, number: int) -> Done:
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(0.02)
     return mark(job)
+
+
+def wait_for_ever(job: Job) -> Done:
+    """Do the first job, tell which process works on the next, and never come back."""
+    if job.name == "bag0":
+        return mark(job)
+    (Path(job.paths[0]) / f"{job.name}.pid").write_text(str(os.getpid()))
+    while True:
+        time.sleep(0.05)
