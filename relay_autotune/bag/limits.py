@@ -30,5 +30,9 @@ LARGEST_SUMMARY = 256 << 20
 # Messages of a topic for which memory is set aside because the file says that it has them.
 MOST_EXPECTED = 1 << 27
 
+# Records of a file that declare something, and what is said to be amiss in one file.
+MOST_DECLARATIONS = 50_000
+MOST_NOTES = 20
+
 # No quantity of a process is beyond it, in whatever unit; its square is still a number.
 LARGEST_VALUE = 1e100

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +15,6 @@ from relay_autotune.bag.mcap_records import (
     MESSAGE_HEAD_SIZE,
     MESSAGE_INDEX,
     RECORD,
-    DamageError,
-    unsigned,
 )
 from relay_autotune.record.record import IntArray
 
@@ -32,6 +31,9 @@ _HEAD = np.dtype(
     ]
 )
 _LENGTH = struct.Struct("<Q")
+# A message index: its channel, the bytes of its entries, and these.
+_INDEX_HEAD = struct.Struct("<HI")
+_INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 # Records of one size that must follow each other before a longer run of them is looked for.
 _RUN = 4
@@ -74,13 +76,61 @@ def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> N
     return np.ndarray((count,), kind, content, shift, (1,))
 
 
-def record_offsets(content: Content) -> tuple[IntArray, int]:
-    """Return where each record begins, and where the last whole one ends."""
+class _Hints:
+    """Places at which records are said to begin; each is checked before it is used.
+
+    :param content: the records.
+    :param places: in any order, wrong ones among them; shape (n,).
+    """
+
+    def __init__(self, content: Content, places: IntArray) -> None:
+        inside = (places >= 0) & (places <= len(content) - RECORD.size)
+        at = np.unique(places[inside])
+        room = len(content) - RECORD.size - at
+        length = every_byte(content, "<u8", 1)[at] if at.size else np.empty(0, np.uint64)
+        fits = (length <= room.astype(np.uint64)) & (_opcodes(content, at) != 0)
+        self._at = at[fits]
+        self._after = self._at + RECORD.size + length[fits].astype(np.int64)
+        # A run ends where the next place is not the one that its last record leads to.
+        self._ends = np.append(np.flatnonzero(self._after[:-1] != self._at[1:]), self._at.size - 1)
+        self.next = int(self._at[0]) if self._at.size else len(content)
+
+    def run(self, position: int, size: int) -> tuple[IntArray, int]:
+        """Return records that follow each other from a place on, and where the last one ends.
+
+        :param position: where a record begins; `next` is not beyond it.
+        :param size: of the content.
+        """
+        first = int(np.searchsorted(self._at, position))
+        found = self._at[first:first]
+        if first < self._at.size and self._at[first] == position:
+            last = int(self._ends[np.searchsorted(self._ends, first)])
+            found, position = self._at[first : last + 1], int(self._after[last])
+            first = int(np.searchsorted(self._at, position))
+        self.next = int(self._at[first]) if first < self._at.size else size
+        return found, position
+
+
+def record_offsets(content: Content, places: IntArray | None = None) -> tuple[IntArray, int]:
+    """Return where each record begins, and where the last whole one ends.
+
+    :param content: the records.
+    :param places: where records are said to begin, which saves time and changes nothing else.
+    """
     size, unpack = len(content), _LENGTH.unpack_from
+    hints = None if places is None else _Hints(content, places)
+    expected = size if hints is None else hints.next
     parts: list[IntArray] = []
     found: list[int] = []
     position, previous, repeats, needed = 0, -1, 0, _RUN
     while position + RECORD.size <= size:
+        if hints is not None and expected <= position:
+            run, position = hints.run(position, size)
+            expected = hints.next
+            if run.size:
+                parts += [np.array(found, dtype=np.int64), run]
+                found = []
+                continue
         (length,) = unpack(content, position + 1)
         if length > size - position - RECORD.size or content[position] == 0:
             break
@@ -121,81 +171,81 @@ def _equal_records(content: Content, position: int, length: int) -> int:
     return held
 
 
-def indexed_offsets(index: bytes, channel: int, size: int) -> IntArray:
-    """Return where the messages of a channel begin, by the index record after their chunk.
+def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
+    """Return where the messages of each channel are said to begin in their chunk.
 
-    :param index: the record with opcode and length.
-    :param channel: to which it must belong.
-    :param size: of the chunk's content.
-    :raises DamageError: if the index makes no sense.
+    :param indexes: the records of message indexes that follow the chunk; what makes no sense in
+        them is left out.
     """
-    if len(index) < RECORD.size:
-        raise DamageError("a message index is cut")
-    opcode, length = RECORD.unpack_from(index)
-    if opcode != MESSAGE_INDEX or length > len(index) - RECORD.size:
-        raise DamageError("the index does not lead to a message index")
-    if unsigned(index, RECORD.size, "<H") != channel:
-        raise DamageError("a message index belongs to another channel")
-    bytes_of_entries = unsigned(index, RECORD.size + 2, "<I")
-    if bytes_of_entries % 16 or bytes_of_entries > length - 6:
-        raise DamageError("a message index of impossible length")
-    count = bytes_of_entries // 16
-    offsets = np.ndarray((count,), "<u8", index, RECORD.size + 6 + 8, (16,)).astype(np.int64)
-    if not bool((offsets[1:] > offsets[:-1]).all()):
-        # An index is in the order of the log times.
-        offsets = np.unique(offsets)
-        if offsets.size < count:
-            raise DamageError("a message index leads to one message twice")
-    if count and (offsets[0] < 0 or offsets[-1] > size - _HEAD.itemsize):
-        raise DamageError("a message index leads out of its chunk")
-    return offsets
+    offsets, _ = record_offsets(indexes)
+    found: dict[int, IntArray] = {}
+    for at in offsets.tolist():
+        opcode, length = RECORD.unpack_from(indexes, at)
+        if opcode != MESSAGE_INDEX or length < 6:
+            continue
+        channel, listed = _INDEX_HEAD.unpack_from(indexes, at + RECORD.size)
+        count = min(listed, length - 6) // _INDEX_ENTRY.itemsize
+        begin = at + RECORD.size + _INDEX_HEAD.size
+        entries = np.frombuffer(indexes, _INDEX_ENTRY, count, begin)
+        places = nanoseconds(entries["offset"])
+        found[channel] = np.append(found[channel], places) if channel in found else places
+    return found
 
 
-def messages_at(
-    content: Content, offsets: IntArray, channel: int, limit: IntArray | None = None
-) -> Messages:
-    """Return the messages at some places.
+@dataclass(frozen=True)
+class Sorted:
+    """The records of some content by what they are.
 
-    :param content: the records.
-    :param offsets: where messages of the channel are said to begin, shape (n,).
-    :param channel: their channel.
-    :param limit: where each must have ended, shape (n,); None: at the end of the content.
-    :raises DamageError: if one of the places holds something else.
+    :param places: where the messages of each wanted channel begin, shape (n,) each.
+    :param others: where the records begin that are no messages, shape (m,).
+    :param unknown: where messages of channels begin that are not declared, shape (k,).
+    :param short: number of messages that are too short to be one.
     """
-    heads = _heads(content, offsets)
-    length = heads["length"].astype(np.int64)
-    body = offsets + RECORD.size
-    wrong = (
-        (heads["opcode"] != MESSAGE)
-        | (heads["channel"] != channel)
-        # A length beyond the signed range is negative here.
-        | (length < MESSAGE_HEAD_SIZE)
-        | (length > (len(content) if limit is None else limit) - body)
-    )
-    if bool(wrong.any()):
-        raise DamageError("an index does not lead to a message of its channel")
-    times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
-    return Messages(content, offsets, *times, body + MESSAGE_HEAD_SIZE, body + length)
+
+    places: dict[int, IntArray]
+    others: IntArray
+    unknown: IntArray
+    short: int
 
 
-def messages_by_channel(
-    content: Content, offsets: IntArray
-) -> tuple[dict[int, IntArray], IntArray]:
-    """Sort the records of some content.
+def sorted_records(
+    content: Content, offsets: IntArray, wanted: Collection[int] | None, declared: Collection[int]
+) -> Sorted:
+    """Tell messages by their channels, and from other records.
 
     :param content: the records.
     :param offsets: where each begins.
-    :return: where the messages of each channel begin, and where all other records do.
+    :param wanted: the channels whose messages are wanted; None: all of them.
+    :param declared: the channels that there are.
     """
-    opcodes = every_byte(content, "u1")[offsets]
-    is_message = opcodes == MESSAGE
-    others = offsets[~is_message]
-    places = offsets[is_message]
-    lengths = every_byte(content, "<u8", 1)[places]
-    # One shorter than its head is none.
-    places = places[lengths >= MESSAGE_HEAD_SIZE]
+    is_message = _opcodes(content, offsets) == MESSAGE
+    others, places = offsets[~is_message], offsets[is_message]
+    if not places.size:
+        return Sorted({}, others, places, 0)
+    whole = every_byte(content, "<u8", 1)[places] >= MESSAGE_HEAD_SIZE
+    short = int(places.size - np.count_nonzero(whole))
+    places = places[whole]
     channels = every_byte(content, "<u2", RECORD.size)[places]
-    return {int(c): places[channels == c] for c in np.unique(channels)}, others
+    known = np.zeros(1 << 16, dtype=np.bool_)
+    known[list(declared)] = True
+    unknown = places[~known[channels]]
+    chosen = np.unique(channels).tolist() if wanted is None else sorted(wanted)
+    found = {number: places[channels == number] for number in chosen}
+    return Sorted({n: at for n, at in found.items() if at.size}, others, unknown, short)
+
+
+def messages_at(content: Content, offsets: IntArray) -> Messages:
+    """Return the messages at some places.
+
+    :param content: the records.
+    :param offsets: where messages begin, as `sorted_records` found them, shape (n,).
+    """
+    # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
+    heads = every_byte(content, f"V{_HEAD.itemsize}")[offsets].view(_HEAD)
+    body = offsets + RECORD.size
+    times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
+    end = body + heads["length"].astype(np.int64)
+    return Messages(content, offsets, *times, body + MESSAGE_HEAD_SIZE, end)
 
 
 def nanoseconds(values: NDArray[np.uint64]) -> IntArray:
@@ -207,7 +257,6 @@ def nanoseconds(values: NDArray[np.uint64]) -> IntArray:
     return signed
 
 
-def _heads(content: Content, offsets: IntArray) -> NDArray[Any]:
-    # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
-    opaque = every_byte(content, f"V{_HEAD.itemsize}")[offsets]
-    return opaque.view(_HEAD)
+def _opcodes(content: Content, offsets: IntArray) -> NDArray[np.uint8]:
+    found: NDArray[np.uint8] = every_byte(content, "u1")[offsets]
+    return found

@@ -5,7 +5,6 @@ A file without its footer, as a killed recorder leaves it, is read from its fron
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +13,18 @@ from typing import Self
 import numpy as np
 
 from relay_autotune.bag.compressed_messages import Expander, are_compressed
-from relay_autotune.bag.limits import LARGEST_CHUNK
+from relay_autotune.bag.limits import LARGEST_CHUNK, MOST_NOTES
 from relay_autotune.bag.locate import (
     Content,
     Messages,
+    Sorted,
     indexed_offsets,
     messages_at,
-    messages_by_channel,
     record_offsets,
+    sorted_records,
 )
 from relay_autotune.bag.mcap_layout import Segment, damage_note, is_chunk_there, segment_content
-from relay_autotune.bag.mcap_records import Channel, DamageError
+from relay_autotune.bag.mcap_records import RECORD, Channel, DamageError
 from relay_autotune.bag.mcap_scan import scan
 from relay_autotune.bag.mcap_summary import layout_by_summary
 from relay_autotune.bag.source import Source
@@ -37,6 +37,8 @@ _SMALLEST_RECORD = 9
 # one on a thousand.
 _BATCH = 256 << 10
 
+_NOWHERE: IntArray = np.empty(0, dtype=np.int64)
+
 
 @dataclass(frozen=True)
 class _Piece:
@@ -44,16 +46,13 @@ class _Piece:
 
     :param segment: where it lies.
     :param content: its records.
-    :param wanted: the channels that are wanted.
-    :param places: where their messages begin in the content, by channel, shape (n,) each.
-    :param by_index: whether the file says so; else they were found there.
+    :param listed: where its message indexes say that messages begin in the content, by channel,
+        shape (n,) each; this saves time, and is checked.
     """
 
     segment: Segment
     content: Content
-    wanted: frozenset[int]
-    places: dict[int, IntArray]
-    by_index: bool
+    listed: dict[int, IntArray]
 
 
 class McapFile:
@@ -78,7 +77,6 @@ class McapFile:
         self.notes = [*self._source.notes, *layout.notes]
         self._layout = layout
         self._refused: set[int] = set()
-        self._counts = layout.declared.message_counts
 
     def __enter__(self) -> Self:
         return self
@@ -97,7 +95,7 @@ class McapFile:
 
     def message_count(self, channel: int) -> int:
         """Return how many messages of a channel the file says it has; 0: it does not say."""
-        return self._counts.get(channel, 0)
+        return (self._layout.declared.message_counts or {}).get(channel, 0)
 
     def segments(self, channels: Collection[int]) -> list[Segment]:
         """Return the segments that may hold messages of some channels, in the order of the file.
@@ -105,9 +103,13 @@ class McapFile:
         :param channels: their ids.
         """
         wanted = frozenset(channels)
-        chosen = self._layout.holding(wanted)
-        if self._layout.index is None:
-            return chosen
+        index = self._layout.index
+        if index is None:
+            return self._layout.holding(wanted)
+        counts = self._layout.declared.message_counts
+        # An index that leads to fewer messages than there are, or to more, chooses no chunk.
+        trusted = counts is not None and index.lists(wanted, counts)
+        chosen = index.holding(wanted if trusted else None)
         self._source.announce((segment.start, segment.index_end) for segment in chosen)
         # Only the chunks that are read are looked at before: on a disk each look takes its time.
         if all(is_chunk_there(self._source, segment) for segment in chosen):
@@ -126,13 +128,30 @@ class McapFile:
         :return: the channel; the number of bytes that came before the run, so that messages of
             different channels can be put into the order of the file; the messages.
         """
-        before = 0
-        for pieces in self._batches(frozenset(channels)):
-            for size, found in self._messages(pieces):
+        wanted, before = frozenset(channels), 0
+        counts = dict.fromkeys(wanted, 0)
+        for pieces in self._batches(wanted):
+            for size, found in self._messages(pieces, wanted):
                 for channel, messages in found.items():
+                    counts[channel] += messages.begin.size
                     for part in self._expanded(channel, messages):
                         yield channel, before, part
                 before += size + _SMALLEST_RECORD
+        self._compare(counts)
+
+    def _compare(self, counts: dict[int, int]) -> None:
+        """Say where the file has more or fewer messages of a channel than its statistics say."""
+        declared = self._layout.declared.message_counts
+        for contradiction in self._layout.declared.contradictions:
+            self._note(f"{self.path.name} contradicts itself: {contradiction}; the first counts")
+        if declared is None:
+            return
+        for channel, count in counts.items():
+            if count != declared.get(channel, 0) and channel in self.channels:
+                self._note(
+                    f"{self.path.name} says that it has {declared.get(channel, 0)} messages of "
+                    f"{self._name(channel)}; it has {count}"
+                )
 
     def _expanded(self, channel: int, messages: Messages) -> Iterator[Messages]:
         """Yield messages as they were before rosbag2 compressed them, if it did."""
@@ -143,11 +162,10 @@ class McapFile:
         yield from expander.expand(messages)
         if expander.first_refusal and channel not in self._refused:
             self._refused.add(channel)
-            declared = self.channels.get(channel)
             self._note(
-                f"{self.path.name} has compressed messages of "
-                f"{declared.topic if declared else channel} that cannot be expanded, the first "
-                f"of them because {expander.first_refusal}; they are left out"
+                f"{self.path.name} has compressed messages of {self._name(channel)} that cannot "
+                f"be expanded, the first of them because {expander.first_refusal}; they are left "
+                f"out"
             )
 
     def _batches(self, wanted: frozenset[int]) -> Iterator[list[_Piece]]:
@@ -163,7 +181,8 @@ class McapFile:
             if batch and size + len(content) > _BATCH:
                 yield batch
                 batch, size = [], 0
-            batch.append(self._piece(segment, content, wanted))
+            indexes = self._source.read(segment.end, segment.index_end)
+            batch.append(_Piece(segment, content, indexed_offsets(indexes)))
             size += len(content)
             if size >= _BATCH:
                 # Not held while the next one is read: a chunk may be large.
@@ -172,84 +191,74 @@ class McapFile:
         if batch:
             yield batch
 
-    def _piece(self, segment: Segment, content: Content, wanted: frozenset[int]) -> _Piece:
-        if segment.index:
-            try:
-                places = self._by_index(segment, len(content), wanted)
-                return _Piece(segment, content, wanted, places, by_index=True)
-            except DamageError as damage:
-                self._note_bad_index(segment, damage)
-        return self._searched(segment, content, wanted)
-
-    def _by_index(
-        self, segment: Segment, size: int, wanted: frozenset[int]
-    ) -> dict[int, IntArray]:
-        """Return where messages begin, by the message indexes behind their chunk."""
-        return {
-            channel: indexed_offsets(self._source.read(begin, end), channel, size)
-            for channel, (begin, end) in segment.index.items()
-            if channel in wanted
-        }
-
-    def _searched(self, segment: Segment, content: Content, wanted: frozenset[int]) -> _Piece:
-        """Find messages by going through the records."""
-        offsets, end = record_offsets(content)
-        if segment.whole and end != len(content):
-            damage = DamageError(f"a record of impossible length at {end}")
-            self._note(damage_note(self._source, segment, damage))
-        places, _ = messages_by_channel(content, offsets)
-        places = {channel: places[channel] for channel in places.keys() & wanted}
-        return _Piece(segment, content, wanted, places, by_index=False)
-
-    def _messages(self, pieces: Sequence[_Piece]) -> list[tuple[int, dict[int, Messages]]]:
+    def _messages(
+        self, pieces: Sequence[_Piece], wanted: frozenset[int]
+    ) -> list[tuple[int, dict[int, Messages]]]:
         """Return the messages of each run of records, after the size of that."""
-        if len(pieces) > 1:
-            # Where an index leads astray, below is found out which one.
-            with contextlib.suppress(DamageError):
-                return [_joined(pieces)]
-        return [self._alone(piece) for piece in pieces]
+        content = pieces[0].content if len(pieces) == 1 else b"".join(p.content for p in pieces)
+        begins = np.cumsum([0, *(len(piece.content) for piece in pieces)])
+        listed = [
+            places + begin
+            for piece, begin in zip(pieces, begins[:-1], strict=True)
+            for places in piece.listed.values()
+        ]
+        hints = np.concatenate(listed) if listed else None
+        offsets, end = record_offsets(content, hints)
+        if len(pieces) > 1 and not bool(np.isin(begins, np.append(offsets, end)).all()):
+            # One of them does not end with a record.
+            return [found for piece in pieces for found in self._messages([piece], wanted)]
+        if end != len(content) and pieces[0].segment.whole:
+            damage = DamageError(f"a record of impossible length at {end}")
+            self._note(damage_note(self._source, pieces[0].segment, damage))
+        found = sorted_records(content, offsets, wanted, self.channels)
+        self._check(content, found)
+        for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
+            self._check_index(piece, found, wanted, int(begin), int(stop))
+        return [(len(content), {c: messages_at(content, at) for c, at in found.places.items()})]
 
-    def _alone(self, piece: _Piece) -> tuple[int, dict[int, Messages]]:
+    def _check(self, content: Content, found: Sorted) -> None:
+        """Say what in some records cannot be used, or contradicts what is known."""
+        name = self.path.name
         try:
-            return _joined([piece])
+            self._layout.declared.take_all(content, found.others)
         except DamageError as damage:
-            if not piece.by_index:
-                raise
-            self._note_bad_index(piece.segment, damage)
-        return _joined([self._searched(piece.segment, piece.content, piece.wanted)])
+            self._note(f"{name} holds a declaration that makes no sense: {damage}")
+        if found.unknown.size:
+            at = int(found.unknown[0]) + RECORD.size
+            channel = int.from_bytes(content[at : at + 2], "little")
+            self._note(
+                f"{name} holds messages of channels that it does not declare, such as {channel}; "
+                f"they are left out"
+            )
+        if found.short:
+            self._note(f"{name} holds messages shorter than their own head; they are left out")
 
-    def _note_bad_index(self, segment: Segment, damage: DamageError) -> None:
-        self._note(
-            f"{self.path.name} has a bad message index at byte {segment.end}: {damage}; "
-            f"the chunk before it is searched instead"
-        )
+    def _check_index(
+        self, piece: _Piece, found: Sorted, wanted: frozenset[int], begin: int, stop: int
+    ) -> None:
+        """Say if the message indexes of a chunk do not list what it holds."""
+        if piece.segment.index_end <= piece.segment.end:
+            return
+        for channel in wanted:
+            there = found.places.get(channel, _NOWHERE)
+            there = there[np.searchsorted(there, begin) : np.searchsorted(there, stop)]
+            listed = piece.listed.get(channel, _NOWHERE) + begin
+            if np.array_equal(there, listed) or np.array_equal(there, np.sort(listed)):
+                continue
+            self._note(
+                f"{self.path.name} has a bad message index at byte {piece.segment.end}: of "
+                f"{there.size} messages of {self._name(channel)} it lists "
+                f"{np.isin(there, listed).sum()}, and {np.count_nonzero(~np.isin(listed, there))} "
+                f"places without one; the chunk before it was gone through instead"
+            )
+
+    def _name(self, channel: int) -> str:
+        declared = self.channels.get(channel)
+        return declared.topic if declared else f"channel {channel}"
 
     def _note(self, note: str) -> None:
-        if note not in self.notes:
-            self.notes.append(note)
-
-
-def _joined(pieces: Sequence[_Piece]) -> tuple[int, dict[int, Messages]]:
-    """Return the messages of segments as one run of records, after the size of that.
-
-    :raises DamageError: if a place holds something else than a message of its channel.
-    """
-    if len(pieces) == 1:
-        content, places = pieces[0].content, pieces[0].places
-        found = {channel: messages_at(content, at, channel) for channel, at in places.items()}
-        return len(content), found
-    joined = b"".join(piece.content for piece in pieces)
-    listed: dict[int, list[IntArray]] = {}
-    limits: dict[int, list[IntArray]] = {}
-    begin = 0
-    for piece in pieces:
-        end = begin + len(piece.content)
-        for channel, at in piece.places.items():
-            listed.setdefault(channel, []).append(at + begin)
-            limits.setdefault(channel, []).append(np.full(at.size, end))
-        begin = end
-    found = {
-        channel: messages_at(joined, np.concatenate(at), channel, np.concatenate(limits[channel]))
-        for channel, at in listed.items()
-    }
-    return len(joined), found
+        if note in self.notes or len(self.notes) > MOST_NOTES:
+            return
+        if len(self.notes) == MOST_NOTES:
+            note = f"{self.path.name} has more that is amiss, which is not listed"
+        self.notes.append(note)

@@ -25,7 +25,7 @@ class Segment:
     :param whole: whether all of it is there.
     :param is_chunk: whether it is a chunk.
     :param channels: those of its messages; None: not known.
-    :param index: where the message index of a channel begins and ends in the file.
+    :param index_end: where the message indexes that follow it end; 0: there are none.
     """
 
     start: int
@@ -33,12 +33,7 @@ class Segment:
     whole: bool
     is_chunk: bool
     channels: frozenset[int] | None = None
-    index: dict[int, tuple[int, int]] = field(default_factory=dict)
-
-    @property
-    def index_end(self) -> int:
-        """Where the last of the message indexes ends; without any, the segment itself."""
-        return max((self.end, *(end for _, end in self.index.values())))
+    index_end: int = 0
 
 
 @dataclass(frozen=True)
@@ -51,7 +46,7 @@ class ChunkIndex:
     :param count: number of its message indexes; 0: which messages it holds is not known;
         shape (n,).
     :param channel: channel of each message index, those of a chunk together, shape (m,).
-    :param place: where it begins in the file, shape (m,).
+    :param listed: number of messages that it can list, shape (m,).
     """
 
     start: IntArray
@@ -59,43 +54,36 @@ class ChunkIndex:
     index_end: IntArray
     count: IntArray
     channel: IntArray
-    place: IntArray
+    listed: IntArray
 
-    def holding(self, channels: frozenset[int]) -> list[Segment]:
+    def holding(self, channels: frozenset[int] | None) -> list[Segment]:
         """Return the chunks that may hold messages of some channels, in the order of the file.
 
-        :param channels: their ids; message indexes of others are left out.
+        :param channels: their ids; None: all chunks.
         """
-        wanted = np.isin(self.channel, list(channels))
-        owner = np.repeat(np.arange(self.start.size), self.count)
-        chosen = self.count == 0
-        chosen[owner[wanted]] = True
-        # A message index ends where the next one of its chunk begins.
-        of_chosen = np.flatnonzero(chosen[owner])
-        of_chosen = of_chosen[np.argsort(self.place[of_chosen], kind="stable")]
-        begin = self.place[of_chosen]
-        end = np.minimum(
-            np.append(begin[1:], np.iinfo(np.int64).max), self.index_end[owner[of_chosen]]
-        )
-        indexes: dict[int, dict[int, tuple[int, int]]] = {}
-        listed = wanted[of_chosen]
-        for number, channel, first, last in zip(
-            owner[of_chosen][listed].tolist(),
-            self.channel[of_chosen][listed].tolist(),
-            begin[listed].tolist(),
-            end[listed].tolist(),
-            strict=True,
-        ):
-            indexes.setdefault(number, {})[channel] = (first, last)
+        wanted = np.isin(self.channel, list(channels or ()))
+        chosen = (self.count == 0) | (channels is None)
+        chosen[np.repeat(np.arange(self.start.size), self.count)[wanted]] = True
         return [
-            Segment(start, end, whole=True, is_chunk=True, index=indexes.get(number, {}))
-            for number, start, end in zip(
-                np.flatnonzero(chosen).tolist(),
+            Segment(start, end, whole=True, is_chunk=True, index_end=index_end)
+            for start, end, index_end in zip(
                 self.start[chosen].tolist(),
                 self.end[chosen].tolist(),
+                self.index_end[chosen].tolist(),
                 strict=True,
             )
         ]
+
+    def lists(self, channels: frozenset[int], counts: dict[int, int]) -> bool:
+        """Return whether it leads to as many messages as the file says that there are.
+
+        :param channels: the ids of those that are wanted.
+        :param counts: number of messages of each channel, by the statistics.
+        """
+        return all(
+            int(self.listed[self.channel == channel].sum()) == counts.get(channel, 0)
+            for channel in channels
+        )
 
 
 @dataclass

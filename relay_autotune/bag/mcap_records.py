@@ -6,7 +6,12 @@ Layout: https://mcap.dev/spec. Every length is checked against what is there bef
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from relay_autotune.bag.limits import MOST_DECLARATIONS
+from relay_autotune.record import IntArray
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 0x07, 0x08, 0x0B
@@ -79,39 +84,81 @@ class Channel:
     metadata: dict[str, str]
 
 
+_DECLARING = (SCHEMA, CHANNEL, METADATA, STATISTICS)
+
+
 class Declarations:
-    """What the records of a file declare: its channels, metadata and number of messages."""
+    """What the records of a file declare: its channels, metadata and number of messages.
+
+    What is declared twice is expected to be the same; if it is not, the first one counts, and
+    `contradictions` says so.
+    """
 
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
-        self.message_counts: dict[int, int] = {}
+        self.message_counts: dict[int, int] | None = None
+        self.contradictions: list[str] = []
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self._taken: set[tuple[int, bytes]] = set()
+
+    def take_all(self, content: bytes | memoryview, offsets: IntArray) -> None:
+        """Take in those of the records inside of a chunk that declare channels.
+
+        :param content: the records.
+        :param offsets: where each begins, shape (n,).
+        :raises DamageError: if one contradicts itself, or there are too many; the others are
+            taken in.
+        """
+        opcodes = np.ndarray((len(content),), "u1", content)[offsets]
+        damage: DamageError | None = None
+        for at in offsets[(opcodes == SCHEMA) | (opcodes == CHANNEL)].tolist():
+            opcode, length = RECORD.unpack_from(content, at)
+            begin = at + RECORD.size
+            try:
+                self.take(opcode, bytes(content[begin : begin + length]))
+            except DamageError as error:
+                damage = damage or error
+        if damage is not None:
+            raise damage
 
     def take(self, opcode: int, body: bytes) -> None:
         """Take in a record, if it declares anything.
 
-        :raises DamageError: if it contradicts itself.
+        :raises DamageError: if it contradicts itself, or there are too many.
         """
+        if opcode not in _DECLARING:
+            return
+        if (opcode, body) in self._taken:
+            return
+        if len(self._taken) >= MOST_DECLARATIONS:
+            raise DamageError(f"more than {MOST_DECLARATIONS} schemas, channels and metadata")
+        self._taken.add((opcode, body))
         if opcode == SCHEMA:
             number = unsigned(body, 0, "<H")
             name, at = text(body, 2)
             encoding, at = text(body, at)
             definition, _ = sized_bytes(body, at)
-            self._schemas[number] = (name, encoding, definition)
+            schema = (name, encoding, definition)
+            if self._schemas.setdefault(number, schema) != schema:
+                self.contradictions.append(f"two different types have the number {number}")
         elif opcode == CHANNEL:
-            number, schema = unsigned(body, 0, "<H"), unsigned(body, 2, "<H")
+            number, schema_number = unsigned(body, 0, "<H"), unsigned(body, 2, "<H")
             topic, at = text(body, 4)
             encoding, at = text(body, at)
             metadata, _ = map_of_text(body, at)
-            name, schema_encoding, definition = self._schemas.get(schema, ("", "", b""))
-            self.channels[number] = Channel(
-                number, topic, name, encoding, schema_encoding, definition, metadata
-            )
+            name, schema_encoding, definition = self._schemas.get(schema_number, ("", "", b""))
+            channel = Channel(number, topic, name, encoding, schema_encoding, definition, metadata)
+            first = self.channels.setdefault(number, channel)
+            if replace(first, metadata=metadata) != channel:
+                self.contradictions.append(
+                    f"channel {number} is declared as {first.topic} ({first.type}) and, "
+                    f"differently, as {topic} ({name})"
+                )
         elif opcode == METADATA:
             name, at = text(body, 0)
             self.metadata.append((name, map_of_text(body, at)[0]))
-        elif opcode == STATISTICS:
+        elif self.message_counts is None:
             counts, _ = sized_bytes(body, 42)
             if len(counts) % 10:
                 raise DamageError("statistics of impossible length")

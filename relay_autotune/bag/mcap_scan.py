@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import struct
+from dataclasses import replace
 
 import numpy as np
 
 from relay_autotune.bag.locate import (
     Content,
     every_byte,
-    messages_by_channel,
+    indexed_offsets,
+    nanoseconds,
     record_offsets,
+    sorted_records,
 )
 from relay_autotune.bag.mcap_layout import Layout, Segment, damage_note, segment_content
 from relay_autotune.bag.mcap_records import (
@@ -24,10 +26,12 @@ from relay_autotune.bag.mcap_records import (
     METADATA,
     RECORD,
     SCHEMA,
+    STATISTICS,
     DamageError,
     unsigned,
 )
 from relay_autotune.bag.source import MAGIC, Source, file_records, record_body
+from relay_autotune.record import IntArray
 
 # Records outside of chunks are read in pieces of this size.
 _PIECE = 4 << 20
@@ -37,7 +41,7 @@ _INSIDE = (SCHEMA, CHANNEL, MESSAGE)
 
 
 class _Scan:
-    """Goes through a file, and remembers the chunk that it has just passed."""
+    """Goes through a file, and looks into each chunk once its message indexes have passed."""
 
     def __init__(self, source: Source, largest: int) -> None:
         self.source = source
@@ -47,7 +51,6 @@ class _Scan:
         self.first: int | None = None
         self.last = 0
         self._chunk: Segment | None = None
-        self._indexed = 0
 
     def run(self) -> Layout:
         source = self.source
@@ -70,7 +73,8 @@ class _Scan:
                 torn = position if opcode == CHUNK else -1
                 break
             if opcode == MESSAGE_INDEX:
-                self._index(position, begin, end)
+                if self._chunk is not None:
+                    self._chunk = replace(self._chunk, index_end=end)
             else:
                 self._settle()
                 if opcode == CHUNK:
@@ -83,7 +87,7 @@ class _Scan:
                     self._declared_again(end)
                     break
             position = end
-        self._settle(complete=not unfinished)
+        self._settle()
         if unfinished and torn >= 0:
             self._look_inside(Segment(torn, source.size, whole=False, is_chunk=True))
         if unfinished:
@@ -91,10 +95,10 @@ class _Scan:
         return self.layout
 
     def _declared_again(self, position: int) -> None:
-        """Take channels from the end of the file, in case those among the data are damaged."""
+        """Take channels and statistics from the end of the file, beside those of the data."""
         with contextlib.suppress(DamageError):
             for opcode, begin, end in file_records(self.source, position, self.source.size):
-                if opcode in (SCHEMA, CHANNEL):
+                if opcode in (SCHEMA, CHANNEL, STATISTICS):
                     self.layout.declared.take(opcode, record_body(self.source, begin, end))
 
     def _tell_tear(self) -> None:
@@ -106,70 +110,37 @@ class _Scan:
             f"it holds {self.count} messages{until}"
         )
 
-    def _index(self, position: int, begin: int, end: int) -> None:
-        """Take note of a message index behind the chunk that it belongs to."""
-        if self._chunk is None or end - begin < 6:
-            return
-        ends = self.source.read(begin, begin + 14) + self.source.read(end - 16, end - 8)
-        if end - begin < 22 or len(ends) < 22:
-            # A channel without messages in the chunk, or a file that shrank.
-            return
-        channel, _, first, last = struct.unpack("<HIQQ", ends)
-        self._chunk.index[channel] = (position, end)
-        self._chunk = Segment(
-            self._chunk.start,
-            self._chunk.end,
-            whole=True,
-            is_chunk=True,
-            channels=frozenset(self._chunk.index),
-            index=self._chunk.index,
-        )
-        self._seen((end - begin - 6) // 16, first, last)
-        self._indexed += (end - begin - 6) // 16
-
-    def _settle(self, *, complete: bool = True) -> None:
-        """Take the chunk before this place, whose message indexes have all been seen.
-
-        :param complete: False where the file ends, and some of them may be missing.
-        """
+    def _settle(self) -> None:
+        """Take the chunk before this place, whose message indexes have all been seen."""
         chunk, self._chunk = self._chunk, None
-        if chunk is None:
-            return
-        known = self.layout.declared.channels.keys()
-        if complete and chunk.channels is not None and chunk.channels <= known:
-            self.layout.segments.append(chunk)
-        else:
-            self.count -= self._indexed
-            self._look_inside(Segment(chunk.start, chunk.end, whole=True, is_chunk=True))
-        self._indexed = 0
+        if chunk is not None:
+            self._look_inside(chunk)
 
     def _look_inside(self, segment: Segment) -> None:
         """Learn what a chunk declares, and the channels of its messages."""
         channels: frozenset[int] = frozenset()
         try:
             content = segment_content(self.source, segment, self.largest)
-            channels = self._declare(content)
+            listed = indexed_offsets(self.source.read(segment.end, segment.index_end))
+            places = np.concatenate([*listed.values()]) if listed else None
+            channels = self._declare(content, record_offsets(content, places)[0])
         except DamageError as damage:
             if not segment.whole:
                 return
             self.layout.notes.append(damage_note(self.source, segment, damage))
-        self.layout.segments.append(
-            Segment(segment.start, segment.end, segment.whole, True, channels)
-        )
+        self.layout.segments.append(replace(segment, channels=channels))
 
-    def _declare(self, content: Content) -> frozenset[int]:
-        offsets, _ = record_offsets(content)
-        places, others = messages_by_channel(content, offsets)
-        for at in others.tolist():
-            opcode, length = RECORD.unpack_from(content, at)
-            body = bytes(content[at + RECORD.size : at + RECORD.size + length])
-            with contextlib.suppress(DamageError):
-                self.layout.declared.take(opcode, body)
-        for found in places.values():
-            times = every_byte(content, "<u8", RECORD.size + 6)[found]
-            if found.size:
-                self._seen(found.size, int(times.min()), int(times.max()))
-        return frozenset(places)
+    def _declare(self, content: Content, offsets: IntArray) -> frozenset[int]:
+        found = sorted_records(content, offsets, None, ())
+        with contextlib.suppress(DamageError):
+            self.layout.declared.take_all(content, found.others)
+        for places in found.places.values():
+            times = nanoseconds(every_byte(content, "<u8", RECORD.size + 6)[places])
+            self.count += places.size
+            first = int(times.min())
+            self.first = first if self.first is None else min(self.first, first)
+            self.last = max(self.last, int(times.max()))
+        return frozenset(found.places)
 
     def _loose(self, position: int) -> int:
         """Take a piece of records outside of chunks; return where the next one begins."""
@@ -194,14 +165,9 @@ class _Scan:
 
     def _take_loose(self, piece: bytes, position: int, end: int) -> int:
         if len(piece) == end - position:
-            channels = self._declare(piece)
+            channels = self._declare(piece, record_offsets(piece)[0])
             self.layout.segments.append(Segment(position, end, True, False, channels))
         return end
-
-    def _seen(self, count: int, first: int, last: int) -> None:
-        self.count += count
-        self.first = first if self.first is None else min(self.first, first)
-        self.last = max(self.last, last)
 
 
 def scan(source: Source, largest: int) -> Layout:

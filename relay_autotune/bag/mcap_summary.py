@@ -30,6 +30,8 @@ _LIST = 36
 _START, _LENGTH, _LIST_LENGTH = 16, 24, 32
 # One entry of the list: a channel, and the place of its message index.
 _ENTRY = 10
+# A message index has its channel and the length of its list before places of so many bytes.
+_PLACES, _PLACE = 6, 16
 
 
 def layout_by_summary(source: Source) -> Layout | None:
@@ -112,16 +114,16 @@ def _chunks(summary: bytes, offsets: IntArray, data_end: int) -> ChunkIndex:
     index_end = end + indexed.astype(np.int64)
     order = np.argsort(start, kind="stable")
     body, listed, index_end, end = body[order], listed[order], index_end[order], end[order]
-    channel, place = _entries(summary, body + _LIST, listed // _ENTRY, end, index_end)
+    channel, room = _entries(summary, body + _LIST, listed // _ENTRY, end, index_end)
     begin = start[order].astype(np.int64)
     _demand(begin[1:] >= index_end[:-1], otherwise="chunks that overlap")
-    return ChunkIndex(begin, end, index_end, listed // _ENTRY, channel, place)
+    return ChunkIndex(begin, end, index_end, listed // _ENTRY, channel, room // _PLACE)
 
 
 def _entries(
     summary: bytes, lists: IntArray, count: IntArray, end: IntArray, index_end: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Return channel and place of the message indexes of all chunks.
+    """Return channel and room for entries [bytes] of the message indexes of all chunks.
 
     :param summary: the records at the end of the file.
     :param lists: where the list of each chunk begins in it, shape (n,).
@@ -139,7 +141,12 @@ def _entries(
         place < np.repeat(index_end, count).astype(np.uint64),
         otherwise="a message index that does not follow its chunk",
     )
-    return channel, place.astype(np.int64)
+    # A message index ends where the next one of its chunk begins.
+    begin, room = place.astype(np.int64), np.empty(place.size, dtype=np.int64)
+    order = np.argsort(begin, kind="stable")
+    ends = np.append(begin[order][1:], np.iinfo(np.int64).max)
+    room[order] = np.minimum(ends, np.repeat(index_end, count)[order]) - begin[order]
+    return channel, np.maximum(room - RECORD.size - _PLACES, 0)
 
 
 def _u64(summary: bytes, at: IntArray) -> NDArray[np.uint64]:
