@@ -20,6 +20,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -157,7 +158,19 @@ def read(path: Path, number: int) -> str:
     return "read, with a note" if found.notes else "read"
 
 
-def worker(connection: Connection, path: Path) -> None:
+@dataclass(frozen=True)
+class Trial:
+    """What is made of a number, and what came of it; both are found by name in a new process.
+
+    :param make: returns the bag of a number, from the seeds.
+    :param judge: reads a file with the bag of a number, and returns one of ``EXPECTED``.
+    """
+
+    make: Callable[[int, list[bytes]], bytes]
+    judge: Callable[[Path, int], str]
+
+
+def worker(connection: Connection, path: Path, trial: Trial) -> None:
     """Read one bag after the other; tell what came of each, and the memory taken so far."""
     # A warning of numpy would be a line on a command's standard error that nobody understands.
     warnings.simplefilter("error", RuntimeWarning)
@@ -165,9 +178,9 @@ def worker(connection: Connection, path: Path) -> None:
     read_experiments_once(path, bags)
     while True:
         number = connection.recv()
-        path.write_bytes(mutated(number, bags))
+        path.write_bytes(trial.make(number, bags))
         try:
-            said = read(path, number)
+            said = trial.judge(path, number)
         except BaseException as error:  # noqa: BLE001  any error that is not ours is a find
             said = f"{type(error).__name__}: {error}"
         used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -184,14 +197,16 @@ def read_experiments_once(path: Path, bags: list[bytes]) -> None:
 class Watched:
     """A process that reads bags, and is replaced when it does not answer."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, trial: Trial) -> None:
         self._path = folder / "bag.mcap"
+        self._trial = trial
         self._context = multiprocessing.get_context("spawn")
         self._begin()
 
     def _begin(self) -> None:
         self._mine, theirs = self._context.Pipe()
-        self._process = self._context.Process(target=worker, args=(theirs, self._path))
+        given = (theirs, self._path, self._trial)
+        self._process = self._context.Process(target=worker, args=given)
         self._process.daemon = True
         self._process.start()
         theirs.close()
@@ -221,7 +236,17 @@ EXPECTED = ("read", "read, with a note", "refused")
 
 def main() -> int:
     """Print the table; keep what is found."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    return run(__doc__.splitlines()[0], "damaged bags", Trial(mutated, read))
+
+
+def run(about: str, what: str, trial: Trial) -> int:
+    """Print the table of a trial; keep what is found.
+
+    :param about: what the program does.
+    :param what: what the table counts.
+    :param trial: what is tried.
+    """
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--quick", action="store_true", help="a few bags: does it run?")
     parser.add_argument("--count", type=int, default=COUNT, help="bags (%(default)s)")
     parser.add_argument("--first", type=int, default=0, help="number of the first (%(default)s)")
@@ -232,7 +257,7 @@ def main() -> int:
     finds: list[tuple[int, str]] = []
     slowest, most = 0.0, 0.0
     with tempfile.TemporaryDirectory() as folder:
-        reader = Watched(Path(folder))
+        reader = Watched(Path(folder), trial)
         # The first answer waits for the imports.
         reader.ask(options.first, 120.0)
         for number in range(options.first, options.first + count):
@@ -246,6 +271,7 @@ def main() -> int:
             most = max(most, used)
             if said not in EXPECTED or took > SECONDS or grew:
                 finds.append((number, f"{said} after {took:.1f} s, {used:.0f} MB"))
+                print(f"bag {number}: {finds[-1][1]}", file=sys.stderr, flush=True)
                 said = "a find"
             outcomes[said] += 1
         reader.close()
@@ -253,15 +279,13 @@ def main() -> int:
         options.keep.mkdir(parents=True, exist_ok=True)
         bags = seeds()
         for number, _ in finds:
-            (options.keep / f"{number}.mcap").write_bytes(mutated(number, bags))
-    for number, why in finds:
-        print(f"fuzz_bags: bag {number}: {why}", file=sys.stderr)
+            (options.keep / f"{number}.mcap").write_bytes(trial.make(number, bags))
     rows = [(name, outcomes[name]) for name in (*EXPECTED, "a find")]
     rows += [
         ("slowest [s]", three(slowest)),
         ("most memory of the reading process [MB]", three(most)),
     ]
-    print(table((f"{count} damaged bags", "number"), rows))
+    print(table((f"{count} {what}", "number"), rows))
     return 1 if finds else 0
 
 
