@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError
+from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError, defect
 from relay_autotune.experiment.early_end import Finding
 from relay_autotune.identification import (
     DEFAULT_METHOD,
@@ -389,7 +389,8 @@ def _guarded(record: Record, method: str, known: Known) -> Identification:
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         # A search that meets a number that is not finite says so with a ValueError.
         raise IdentificationError(
-            f"{method} broke down on this record ({error}): it holds no usable response"
+            f"{method} broke down on this record, whose numbers it cannot work with: it holds no "
+            f"usable response, or this is {defect(error)}"
         ) from error
 
 

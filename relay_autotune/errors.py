@@ -1,5 +1,8 @@
 """The errors that this package raises; each message says found, expected and what to do."""
 
+import traceback
+from pathlib import Path
+
 
 class RelayAutotuneError(Exception):
     """Base of every error that the package raises on purpose."""
@@ -39,3 +42,24 @@ class MissingPackageError(RelayAutotuneError, ImportError):
 
 class LoopError(RelayAutotuneError, RuntimeError):
     """The nodes of a running loop are not there, or do not answer."""
+
+
+def defect(error: BaseException) -> str:
+    """Return what a user is told of an error that is none of ours: where to look, and who should.
+
+    Its own words would mean nothing to a user, and may quote a hostile file.
+
+    :param error: the error.
+    """
+    if isinstance(error, MemoryError):
+        return "it takes more memory than there is"
+    frames = traceback.extract_tb(error.__traceback__)
+    package = Path(__file__).parent
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(package)]
+    place = "an unknown place"
+    if own:
+        place = f"{Path(own[-1].filename).relative_to(package)}:{own[-1].lineno}"
+    return (
+        f"a defect of relay_autotune, {type(error).__name__} at {place}; please report this line, "
+        f"with the recording if you can"
+    )

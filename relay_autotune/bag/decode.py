@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.bag.limits import MOST_ELEMENTS
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.names import CYCLE, EXPERIMENT
 from relay_autotune.bag.schema import Number, Struct, Text, Type, first_line, message_type
 from relay_autotune.errors import BagError
+from relay_autotune.escape import visible
 
 _LENGTH = Number("uint32", "u4")
 # numpy's types as the module struct names them
@@ -92,9 +94,10 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
         )
     root = message_type(channel)
     messages = []
+    budget = _Budget()
     for data in payload:
         try:
-            decoded = _decoded(root, data)
+            decoded = _decoded(root, data, budget)
         except (ValueError, struct.error, MemoryError) as error:
             raise BagError(
                 f"a message of {channel.topic} does not fit its definition: {first_line(error)}"
@@ -103,7 +106,23 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
     return messages
 
 
-def _decoded(root: Struct, data: bytes) -> Any:
+class _Budget:
+    """Counts what takes memory of its own."""
+
+    def __init__(self) -> None:
+        self._left = MOST_ELEMENTS
+
+    def take(self, count: int) -> None:
+        """Take so many structures or elements.
+
+        :raises ValueError: if there are too many.
+        """
+        self._left -= count
+        if self._left < 0:
+            raise ValueError(f"more than {MOST_ELEMENTS} structures and elements of lists")
+
+
+def _decoded(root: Struct, data: bytes, budget: _Budget) -> Any:
     """Decode one message; bytes after its end are allowed.
 
     ROS 2's own serialization leaves some there: it makes room for the alignment of a sequence's
@@ -111,15 +130,16 @@ def _decoded(root: Struct, data: bytes) -> Any:
     """
     if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < 4:
         raise ValueError("it is not in plain CDR")
-    return _Decoder(memoryview(data)[4:], "<" if data[1] else ">").take(root)
+    return _Decoder(memoryview(data)[4:], "<" if data[1] else ">", budget).take(root)
 
 
 class _Decoder:
     """Takes one value after another out of a message in plain CDR, see `cdr`."""
 
-    def __init__(self, data: memoryview, order: str) -> None:
+    def __init__(self, data: memoryview, order: str, budget: _Budget) -> None:
         self._data = data
         self._order = order
+        self._budget = budget
         self._at = 0
 
     def take(self, kind: Type) -> Any:
@@ -129,11 +149,12 @@ class _Decoder:
         if isinstance(kind, Text):
             return self._text(kind)
         if isinstance(kind, Struct):
+            self._budget.take(1)
             return SimpleNamespace(**{name: self.take(inner) for name, inner in kind.fields})
         count = self._number(_LENGTH) if kind.count is None else kind.count
         if isinstance(kind.item, Number):
             return self._array(kind.item, count)
-        # Each takes a byte at least, so that a wrong count meets the message's end.
+        self._budget.take(count)
         return [self.take(kind.item) for _ in range(count)]
 
     def _number(self, kind: Number) -> Any:
@@ -159,7 +180,7 @@ class _Decoder:
             raise ValueError(f"a text ends {end - len(self._data)} bytes behind the message")
         text = bytes(self._data[self._at : end]).removesuffix(b"\0").decode("utf-8")
         self._at = end
-        return text
+        return visible(text)
 
     def _align(self, size: int) -> None:
         self._at = (self._at + size - 1) & -size

@@ -69,10 +69,11 @@ def named_field(root: Struct, field: str, topic: str) -> Path:
             raise SelectionError(f"{topic} has no field {field!r}; it has {_some(root)}")
         steps.append(step)
     if not isinstance(kind, Number):
-        inner = [f"{field}{'' if p[:1] == '[' else '.'}{p}" for p in _listed(kind)]
+        some = itertools.islice(_listed(kind), _LISTED)
+        inner = [f"{field}{'' if p[:1] == '[' else '.'}{p}" for p in some]
         raise SelectionError(
             f"{field!r} of {topic} is no number; expected the name of one"
-            + (f", such as {', '.join(inner[:_LISTED])}" if inner else "")
+            + (f", such as {', '.join(inner)}" if inner else "")
         )
     return Path(root, tuple(steps))
 
@@ -124,7 +125,7 @@ def _steps(field: str, topic: str) -> Iterator[Step]:
 
 def _listed(kind: Type) -> Iterator[str]:
     """Yield the names of numbers, without those of the header."""
-    return (p for p in numeric_paths(kind) if not p.startswith(("header.", "stamp.")))
+    return numeric_paths(kind, without=("header", "stamp"))
 
 
 def _some(root: Struct) -> str:

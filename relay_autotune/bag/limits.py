@@ -17,6 +17,13 @@ FREE_DISK = 256 << 20
 # Bytes of the definition of a message type: the largest of the common interfaces has 20 kB.
 LARGEST_DEFINITION = 256 << 10
 
+# Bytes of the definitions of a file that are read.
+MOST_DEFINITIONS = 8 << 20
+
+# Structures and elements of lists in the messages of a topic that are decoded whole, as those of
+# relay_node are.
+MOST_ELEMENTS = 200_000
+
 # Types within types, and fields of all of them together.
 DEEPEST_TYPE = 40
 MOST_FIELDS = 5_000

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.bag.limits import MOST_DECLARATIONS
+from relay_autotune.escape import visible
 from relay_autotune.record import IntArray
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
@@ -43,10 +44,10 @@ def sized_bytes(data: bytes, at: int) -> tuple[bytes, int]:
 
 
 def text(data: bytes, at: int) -> tuple[str, int]:
-    """Return the text after its length, and the place after it."""
+    """Return the text after its length, made visible, and the place after it."""
     raw, at = sized_bytes(data, at)
     try:
-        return raw.decode("utf-8"), at
+        return visible(raw.decode("utf-8")), at
     except UnicodeDecodeError:
         raise DamageError("a name is not UTF-8") from None
 

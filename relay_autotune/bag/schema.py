@@ -7,10 +7,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from relay_autotune.bag.idl import types_from_idl
 from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.ros2msg import types_from_ros2msg
 from relay_autotune.errors import BagError
+from relay_autotune.escape import visible
 
 _NUMBERS = {
     **dict.fromkeys(("bool", "byte", "octet", "char", "uint8"), "u1"),
@@ -129,35 +131,16 @@ def message_type(channel: Channel) -> Struct:
 def _parsed(channel: Channel, text: str) -> Mapping[str, Any]:
     if not text.strip():
         raise _senseless(channel, "it is empty")
-    if channel.schema_encoding == "ros2msg":
-        try:
+    try:
+        if channel.schema_encoding == "ros2msg":
             return types_from_ros2msg(text, channel.type)
-        except ValueError as error:
-            raise _senseless(channel, first_line(error)) from None
-    if channel.schema_encoding in ("ros2idl", "omgidl"):
-        return _parsed_idl(channel, text)
+        if channel.schema_encoding in ("ros2idl", "omgidl"):
+            return types_from_idl(_IDL_DIRECTIVE.sub("", _IDL_HEADING.sub("", text)))
+    except ValueError as error:
+        raise _senseless(channel, first_line(error)) from None
     raise _senseless(
         channel, f"it is in {channel.schema_encoding!r}; expected 'ros2msg' or 'ros2idl'"
     )
-
-
-def _parsed_idl(channel: Channel, text: str) -> Mapping[str, Any]:
-    # Few bags define a type in IDL, and loading its parser takes longer than reading a small bag.
-    try:
-        from rosbags.typesys import TypesysError, get_types_from_idl
-    except ImportError:
-        raise BagError(
-            f"reading {channel.type} needs the Python package rosbags; "
-            f"install it with: pip install rosbags"
-        ) from None
-    types: dict[str, Any] = {}
-    try:
-        for part in _IDL_HEADING.split(_IDL_DIRECTIVE.sub("", text)):
-            types |= get_types_from_idl(part) if part.strip() else {}
-    except (TypesysError, LookupError, ValueError, TypeError, AttributeError, RecursionError,
-            ArithmeticError, MemoryError) as error:  # fmt: skip
-        raise _senseless(channel, first_line(error)) from None
-    return types
 
 
 class _Tree:
@@ -207,21 +190,45 @@ class _Tree:
         return Repeated(item, None)
 
 
-def numeric_paths(kind: Type, prefix: str = "") -> Iterator[str]:
-    """Yield the paths of a type's numbers; one element stands for those of an array."""
+def numeric_paths(root: Type, without: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield the paths of a type's numbers; one element stands for those of an array.
+
+    A type of a kilobyte can hold more of them than can be gone through: take some.
+
+    :param root: the type.
+    :param without: names of its own fields that are left out.
+    """
+    if isinstance(root, Struct) and without:
+        root = Struct(root.name, tuple(f for f in root.fields if f[0] not in without))
+    return _paths(root, "", {})
+
+
+def _paths(kind: Type, prefix: str, known: dict[int, bool]) -> Iterator[str]:
     if isinstance(kind, Number):
         yield prefix
     elif isinstance(kind, Repeated):
-        yield from numeric_paths(kind.item, f"{prefix}[0]")
+        yield from _paths(kind.item, f"{prefix}[0]", known)
     elif isinstance(kind, Struct):
         for name, inner in kind.fields:
-            yield from numeric_paths(inner, f"{prefix}.{name}" if prefix else name)
+            # Where there are none, looking once is enough.
+            if _has_numbers(inner, known):
+                yield from _paths(inner, f"{prefix}.{name}" if prefix else name, known)
+
+
+def _has_numbers(kind: Type, known: dict[int, bool]) -> bool:
+    if isinstance(kind, Repeated):
+        return _has_numbers(kind.item, known)
+    if not isinstance(kind, Struct):
+        return isinstance(kind, Number)
+    if id(kind) not in known:
+        known[id(kind)] = any(_has_numbers(inner, known) for _, inner in kind.fields)
+    return known[id(kind)]
 
 
 def first_line(error: Exception) -> str:
     """Return what an error says, in one line."""
     lines = str(error).strip().splitlines()
-    return " ".join(lines[:2])[:120] if lines else type(error).__name__
+    return visible(" ".join(lines[:2])[:120]) if lines else type(error).__name__
 
 
 def _senseless(channel: Channel, why: str) -> BagError:

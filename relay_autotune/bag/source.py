@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -34,6 +35,29 @@ _OTHERS = (
 )
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading, and nothing else: a pipe or a device may never end.
+
+    :param path: the file.
+    :raises BagError: if it is missing, unreadable, or no regular file.
+    """
+    try:
+        # Without this flag, opening a pipe waits for its other end.
+        opened = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise BagError(f"{path} does not exist; expected a recording") from None
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise BagError(f"cannot read {path}: {why}") from error
+    if stat.S_ISREG(os.fstat(opened).st_mode):
+        return os.fdopen(opened, "rb")
+    folder = stat.S_ISDIR(os.fstat(opened).st_mode)
+    os.close(opened)
+    raise BagError(
+        f"{path} is {'a folder' if folder else 'no regular file'}; expected a recording in a file"
+    )
+
+
 class Source:
     """A file that begins as MCAP files do, open for reading ranges of it.
 
@@ -47,12 +71,7 @@ class Source:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.notes: list[str] = []
-        try:
-            self._file: BinaryIO = path.open("rb")
-        except FileNotFoundError:
-            raise BagError(f"{path} does not exist; expected a recording") from None
-        except OSError as error:
-            raise BagError(f"cannot read {path}: {error.strerror or error}") from error
+        self._file = open_regular(path)
         try:
             if self.read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
                 self._expand()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from relay_autotune.bag.cdr import Path
 from relay_autotune.bag.decode import decode_messages
 from relay_autotune.bag.fields import may_be_single, named_field, only_field, split_name, stamp_of
-from relay_autotune.bag.limits import MOST_EXPECTED
+from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
 from relay_autotune.bag.locate import Messages
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
@@ -61,6 +61,7 @@ class Topics:
     progress: Progress | None = None
     _signals: dict[str, TimedSignal] = field(default_factory=dict)
     _types: dict[tuple[str, str, str, bytes], Struct] = field(default_factory=dict)
+    _defined: int = 0
 
     @property
     def notes(self) -> list[str]:
@@ -243,6 +244,12 @@ class Topics:
     def _type(self, channel: Channel) -> Struct:
         key = (channel.type, channel.encoding, channel.schema_encoding, channel.definition)
         if key not in self._types:
+            self._defined += len(channel.definition)
+            if self._defined > MOST_DEFINITIONS:
+                raise BagError(
+                    f"the definitions of types in {self.path} have more than {MOST_DEFINITIONS} "
+                    f"bytes together; name the topics with --measurement and --command"
+                )
             self._types[key] = message_type(channel)
         return self._types[key]
 

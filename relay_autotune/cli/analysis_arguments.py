@@ -13,6 +13,7 @@ from relay_autotune.cli.arguments import add_quantities, finite, given_quantitie
 from relay_autotune.cli.design_arguments import add_design, design_options
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import RelayAutotuneError, SelectionError
+from relay_autotune.escape import visible
 from relay_autotune.identification.known import Known
 from relay_autotune.quantities import declared
 
@@ -94,7 +95,7 @@ def jobs_of(
     groups = [tuple(names)] if jointly or options.join else [(name,) for name in names]
     return [
         Job(
-            name=", ".join(group),
+            name=visible(", ".join(group)),
             paths=group,
             selection=Selection(
                 options.measurement,

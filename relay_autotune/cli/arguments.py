@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from relay_autotune.errors import RelayAutotuneError, SelectionError
+from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.escape import visible
 from relay_autotune.quantities import Quantity
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
@@ -26,6 +27,9 @@ def worst(*statuses: int) -> int:
     """
     return max(statuses, key=_WORSE.index)
 
+# Set to anything in the environment, it lets a defect end a command with its traceback.
+DEBUG = "RELAY_AUTOTUNE_DEBUG"
+
 
 def finite(text: str) -> float:
     """Return a finite number given on the command line."""
@@ -39,8 +43,12 @@ def finite(text: str) -> float:
 
 
 def say(program: str, text: str) -> None:
-    """Tell the user something that is no result."""
-    print(f"{program}: {text}", file=sys.stderr)
+    """Tell the user something that is no result.
+
+    :param program: name of the command.
+    :param text: what it says; names of files and of the command line are made visible here.
+    """
+    print(visible(f"{program}: {text}", keep="\n"), file=sys.stderr)
 
 
 def guarded(program: str, work: Callable[[], int]) -> int:
@@ -70,6 +78,11 @@ def guarded(program: str, work: Callable[[], int]) -> int:
         return NOTHING_FOUND
     except KeyboardInterrupt:
         return 130
+    except Exception as error:
+        if os.environ.get(DEBUG):
+            raise
+        say(program, f"stopped by {defect(error)}")
+        return NOTHING_FOUND
     finally:
         if left_to_system:
             signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE
-from relay_autotune.errors import RelayAutotuneError, SelectionError
+from relay_autotune.cli.arguments import DEBUG, DONE, DOUBTFUL, NOTHING_FOUND, USAGE
+from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.escape import visible
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -91,8 +93,10 @@ def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Anal
         return _failed(job, said, str(error), USAGE), ()
     except RelayAutotuneError as error:
         return _failed(job, said, str(error), NOTHING_FOUND), ()
-    except (Exception, RecursionError) as error:  # noqa: BLE001  it must not stop the other bags
-        why = f"{job.name}: could not be analysed: {type(error).__name__}: {error}"
+    except Exception as error:
+        if os.environ.get(DEBUG):
+            raise
+        why = f"{job.name} could not be analysed: {defect(error)}"
         return _failed(job, said, why, NOTHING_FOUND), ()
     status = status_of(analyses)
     if status == NOTHING_FOUND:
@@ -179,7 +183,12 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
 
 
 def _failed(job: Job, said: Sequence[str], why: str, status: int) -> Done:
-    sentence = why if any(p in why for p in (job.name, *job.paths)) else f"{job.name}: {why}"
+    why = visible(why, keep="\n")
+    sentence = (
+        why
+        if any(p in why for p in (job.name, *map(visible, job.paths)))
+        else f"{job.name}: {why}"
+    )
     return Done(job.name, status, (*said, sentence), _text(job, (), sentence))
 
 

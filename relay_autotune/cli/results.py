@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, worst
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.escape import cell
 
 ENDINGS = (".jsonl", ".csv", ".parquet")
 
@@ -143,7 +144,7 @@ class Results:
                 with new.open("w", newline="", encoding="utf-8") as file:
                     writer = csv.DictWriter(file, COLUMNS)
                     writer.writeheader()
-                    writer.writerows(self._rows())
+                    writer.writerows(map(_for_spreadsheets, self._rows()))
             else:
                 pyarrow = _pyarrow()
                 text, number = pyarrow.string(), pyarrow.float64()
@@ -183,6 +184,10 @@ def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _cell(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, list) else value
+
+
+def _for_spreadsheets(row: dict[str, Any]) -> dict[str, Any]:
+    return {n: cell(value) if isinstance(value, str) else value for n, value in row.items()}
 
 
 def _status(document: dict[str, Any]) -> int:

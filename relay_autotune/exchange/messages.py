@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from relay_autotune.errors import ModelError, RecordError, RelayAutotuneError, TuningError
+from relay_autotune.escape import visible
 from relay_autotune.experiment.early_end import Finding
 from relay_autotune.record.record import LARGEST, Cycle, FloatArray, Outcome, Record, RelaySettings
 from relay_autotune.verdict import NOT_JUDGED, Judgement
@@ -179,8 +180,8 @@ def record_from_message(message: Any) -> Record:
         noise_std=float(message.noise_std),
         cycle_start=tuple(int(i) for i in message.cycle_start),
         outcome=outcome,
-        reason=str(message.reason),
-        experiment_id=str(message.experiment_id),
+        reason=visible(str(message.reason)),
+        experiment_id=visible(str(message.experiment_id)),
         start=start_seconds(stamp_nanoseconds(message.header.stamp)),
         lost_samples=int(message.lost_samples),
     )
@@ -272,7 +273,7 @@ def record_from_cycles(messages: Iterable[Any]) -> Record:
         command=joined["command"],
         settings=settings_from_message(run[-1].settings),
         cycle_start=(*starts, length - 1),
-        experiment_id=str(run[-1].experiment_id),
+        experiment_id=visible(str(run[-1].experiment_id)),
         start=start_seconds(start),
     )
 

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 
 from relay_autotune.analysis import Analysis, analyse, analyse_jointly, check_names
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,
     fill_transfer_function,
@@ -156,7 +156,11 @@ class IdentifierNode(ServedNode):
         self._wait_for(_Fit(work, done.set_result))
         found = await done
         if isinstance(found, Exception):
-            response.reason = str(found) or type(found).__name__
+            response.reason = (
+                str(found)
+                if isinstance(found, RelayAutotuneError)
+                else f"the record could not be analysed: {defect(found)}"
+            )
             return response
         name, stamp = record.experiment_id, _last_stamp(record)
         response.success, response.reason = found.model is not None, found.reason

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.bag.source import open_regular
 from relay_autotune.errors import BagError, RelayAutotuneError
+from relay_autotune.escape import visible
 from relay_autotune.identification import Estimate, FitReport, Identification
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import DIFFERENCES, Validation
@@ -24,6 +26,7 @@ from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Outcome, RelaySettings
 from relay_autotune.report.case import Case, around, measured_points, model_case
 from relay_autotune.tuning import Gains
+from relay_autotune.tuning.gains import NUMBERS
 from relay_autotune.verdict import (
     NOT_JUDGED,
     Finding,
@@ -35,6 +38,10 @@ from relay_autotune.verdict import (
 
 FloatArray = NDArray[np.float64]
 
+# Bytes of a file of results, and cycles of an experiment in it.
+_LARGEST = 64 << 20
+_MOST_CYCLES = 1_000_000
+
 
 def read_documents(path: Path | str) -> tuple[Case, ...]:
     """Return the experiments of a file of documents, one on each line or a single one.
@@ -42,10 +49,14 @@ def read_documents(path: Path | str) -> tuple[Case, ...]:
     :param path: a file that `replay --json` or the demo wrote.
     :raises BagError: if it cannot be read or is no such document.
     """
+    with open_regular(Path(path)) as file:
+        raw = file.read(_LARGEST + 1)
+    if len(raw) > _LARGEST:
+        raise BagError(f"{path} has more than {_LARGEST} bytes; expected a result of `replay`")
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BagError(f"{path} cannot be read: {error}") from error
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        raise BagError(f"{path} is no JSON: it is not in UTF-8") from None
     documents = _parsed(text, str(path))
     return tuple(case for document in documents for case in cases_of_document(document, str(path)))
 
@@ -72,15 +83,28 @@ def cases_of_document(document: Any, name: str) -> tuple[Case, ...]:
     :raises BagError: if it is no such document.
     """
     try:
+        document = _visible(document)
         if "error" in document:
             return (_unreadable(str(document["bag"]), str(document["error"])),)
         truth = _model(document["truth"]) if "truth" in document else None
         return tuple(_case(e, str(document["bag"]), truth) for e in document["experiments"])
-    except (RelayAutotuneError, KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"no field {error}" if isinstance(error, KeyError) else str(error)
+    except (RelayAutotuneError, LookupError, TypeError, ValueError, AttributeError,
+            ArithmeticError, RecursionError, MemoryError) as error:  # fmt: skip
+        what = f"no field {error}" if isinstance(error, KeyError) else visible(str(error))
         raise BagError(
             f"{name} is no result of an experiment ({what}); expected what `replay --json` prints"
         ) from error
+
+
+def _visible(value: Any) -> Any:
+    """Return a value with the texts in it made visible."""
+    if isinstance(value, str):
+        return visible(value)
+    if isinstance(value, list):
+        return [_visible(item) for item in value]
+    if isinstance(value, dict):
+        return {visible(name): _visible(item) for name, item in value.items()}
+    return value
 
 
 def _unreadable(source: str, error: str) -> Case:
@@ -106,7 +130,7 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         limit_cycle=None if cycle is None else _limit_cycle(cycle),
         samples=int(e["samples"]),
         lost_samples=int(e["lost_samples"]),
-        settings=None if e["relay"] is None else RelaySettings(**e["relay"]),
+        settings=None if e["relay"] is None else _settings(e["relay"]),
         models_around=around(None if selected is None else models[selected]),
         added_delay=_number(e.get("added_delay", 0.0)),
         points=measured_points(models),
@@ -141,18 +165,25 @@ def _index(value: Any, things: Sequence[object]) -> int | None:
     return None if value is None else int(value)
 
 
+def _settings(relay: dict[str, Any]) -> RelaySettings:
+    values = {name: _number(value) for name, value in relay.items()}
+    return RelaySettings(**values | {"reverse_acting": bool(relay["reverse_acting"])})  # type: ignore[arg-type]
+
+
 def _limit_cycle(c: dict[str, Any]) -> LimitCycle:
     numbers: dict[str, Any] = {
         field.name: _number(c[field.name])
         for field in fields(LimitCycle)
         if field.name not in ("std", "cycles", "converged")
     }
+    if not 0 <= int(c["cycles"]) <= _MOST_CYCLES:
+        raise ValueError(f"{c['cycles']} cycles")
     cycles = tuple(range(int(c["cycles"])))
     return LimitCycle(**numbers, cycles=cycles, converged=bool(c["converged"]))
 
 
 def _identification(m: dict[str, Any]) -> Identification:
-    model, names = _model(m), tuple(m["values"])
+    model, names = _model(m), tuple(map(_name, m["values"]))
     structure = structure_of(model, names)
     covariance = None
     # Where a parameter is tied to another one, only the method knows how.
@@ -161,7 +192,7 @@ def _identification(m: dict[str, Any]) -> Identification:
     values = np.array([_number(v) for v in m["values"].values()])
     ends = np.array([[_number(end) for end in m["ci95"][n]] for n in names]).reshape(-1, 2)
     return Identification(
-        method=str(m["method"]),
+        method=_name(m["method"]),
         estimate=Estimate.of(structure, values, covariance),
         ci95_low=ends[:, 0],
         ci95_high=ends[:, 1],
@@ -224,13 +255,24 @@ def _gains(g: dict[str, Any]) -> Gains:
         # Where no gain or delay makes the loop unstable, the document has null.
         if value is None:
             value = math.inf if name.endswith("_margin") else math.nan
-        values[name] = tuple(value) if isinstance(value, list) else value
+        if name in NUMBERS:
+            values[name] = _number(value)
+        else:
+            values[name] = tuple(map(str, value)) if isinstance(value, list) else str(value)
+    _name(values["rule"])
     return Gains(**values)
 
 
 def _point(p: dict[str, Any]) -> FrequencyPoint:
     value = complex(_number(p["real"]), _number(p["imaginary"]))
     return FrequencyPoint(_number(p["frequency"]), value, _number(p["std"]))
+
+
+def _name(value: Any) -> str:
+    """Return the name of a method, a rule or a parameter, which stand in figures."""
+    if not isinstance(value, str) or not value.isidentifier():
+        raise ValueError(f"{value!r} is no name")
+    return value
 
 
 def _number(value: Any) -> float:

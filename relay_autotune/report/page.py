@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import relay_autotune
+from relay_autotune.escape import visible
 from relay_autotune.exchange.text import digits, process_mathml, process_text
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
@@ -101,7 +102,7 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
     }
     sections = [_section(case, k, len(cases) > 1) for k, case in enumerate(cases, start=1)]
     return environment.get_template("report.html").render(
-        title=title or cases[0].source,
+        title=visible(title or cases[0].source),
         sections=sections,
         version=relay_autotune.__version__,
         light=Markup(_variables(0)),

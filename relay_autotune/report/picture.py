@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from relay_autotune.escape import visible
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.style import INK, MUTED, WIDE, new_figure, save
@@ -23,7 +24,7 @@ def draw_picture(case: Case, path: Path, *, title: str) -> None:
     """
     plates = {plate.key: plate for plate in PLATES}
     figure = new_figure(WIDE, sum(height for _, height in _ROWS) + 0.4)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=13, weight="bold", color=INK)
+    figure.suptitle(_plain(title), x=0.01, ha="left", fontsize=13, weight="bold", color=INK)
     heights = [height for _, height in _ROWS]
     rows = figure.subfigures(len(_ROWS), 1, squeeze=False, height_ratios=heights)[:, 0]
     for row, (keys, _) in zip(rows, _ROWS, strict=True):
@@ -34,8 +35,13 @@ def draw_picture(case: Case, path: Path, *, title: str) -> None:
             part.set_facecolor("none")
             missing = plates[key].missing(case)
             if missing:
-                text = f"{plates[key].title}: {missing}"
+                text = _plain(f"{plates[key].title}: {missing}")
                 part.text(0.02, 0.5, text, color=MUTED, fontsize=10, wrap=True)
             else:
                 plates[key].draw(case, part, narrow=len(keys) > 1)
     save(figure, str(path))
+
+
+def _plain(text: str) -> str:
+    # Between two dollar signs matplotlib reads a formula.
+    return visible(text).replace("$", r"\$")

@@ -120,7 +120,7 @@ def test_a_recording_that_was_not_read_has_its_place(capsys, tmp_path) -> None:
     [
         (("x.json", "-o", "page.doc"), ".html, .png, .svg, .pdf", 2),
         (("x.json", "-o", "no/page.html"), "there is no folder no", 2),
-        (("x.json",), "cannot be read", 1),
+        (("x.json",), "does not exist", 1),
         (("no_such_bag",), "does not exist", 1),
         (("no_such_bag", "--method", "guess"), "unknown method 'guess'", 2),
     ],
