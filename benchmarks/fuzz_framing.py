@@ -4,7 +4,7 @@ A small recording is taken apart into its records, and one to three of them are 
 and counts within messages, schemas, names, times, what chunks and their indexes declare, what the
 indexes list, the summary. Then it is put together again, so that every record has its length,
 every chunk its size and checksum, and every index its place, but for the lie. Each bag is read
-twice: as it is, and without message indexes and summary, which leaves nothing but its messages to
+twice: as it is, and without indexes and statistics, which leaves nothing but its messages to
 believe. A find is an error or a warning that is not one of ours; an answer that differs between
 the two without a word; a control character in what is said; more than 5 s, or more than 1 GB.
 """
@@ -202,9 +202,10 @@ def put_together(bag: Bag, *, bare: bool = False) -> bytes:
     """Return the file.
 
     :param bag: its parts.
-    :param bare: leave out message indexes and summary.
+    :param bare: leave out all indexes and the summary; what that declares stands at the front.
     """
-    out = bytearray(MAGIC)
+    declared = b"".join(_record(r.opcode, r.body) for r in bag.summary if bag.has_summary)
+    out = bytearray(MAGIC + (declared if bare else b""))
     counts: dict[int, int] = {}
     indexes: list[bytes] = []
     for part in bag.parts:
@@ -246,8 +247,7 @@ def put_together(bag: Bag, *, bare: bool = False) -> bytes:
     out += _record(DATA_END, struct.pack("<I", 0))
     start = len(out)
     if bag.has_summary and not bare:
-        for record in bag.summary:
-            out += _record(record.opcode, record.body)
+        out += declared
         if bag.has_statistics:
             listed = b"".join(struct.pack("<HQ", *item) for item in counts.items())
             about = struct.pack(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from relay_autotune.bag.signals import Signal
+from relay_autotune.bag.source import open_regular
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.escape import visible
 from relay_autotune.record.record import FloatArray
 
 # Times from here on are taken as seconds since 1970; no experiment lasts that long.
@@ -67,12 +70,10 @@ def _nanoseconds(seconds: float) -> int:
 def _rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the column names, and each row with its line number."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.TextIOWrapper(open_regular(path), newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, skipinitialspace=True)
-            names = [name.strip() for name in next(reader, [])]
+            names = [visible(name.strip()) for name in next(reader, [])]
             rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except FileNotFoundError:
-        raise BagError(f"{path} does not exist; expected a recording") from None
     except OSError as error:
         raise BagError(f"cannot read {path}: {error.strerror or error}") from error
     except UnicodeDecodeError:
@@ -91,6 +92,19 @@ def _rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             f"{path} has the columns {_listed(names)}; expected at least three, separated by "
             f"commas: time, measurement, command"
         )
+    twice = next((name for name in names if name and names.count(name) > 1), None)
+    if twice is not None:
+        raise SelectionError(
+            f"{path} has {names.count(twice)} columns named {twice!r}; expected a name of its own "
+            f"for each"
+        )
+    for line, row in rows:
+        # A separator at a line's end is no cell.
+        if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
+            raise BagError(
+                f"{path}, line {line}: {len(row)} cells, but {len(names)} columns have a name; a "
+                f"decimal comma, or a separator within a text, would make such a line"
+            )
     if len(rows) < 2:
         raise BagError(f"{path} has {len(rows)} rows of numbers; expected at least two")
     return names, rows
@@ -116,8 +130,6 @@ def _choose(
             raise SelectionError(
                 f"{path} has no column {name!r}; its columns are {_listed(names)}"
             )
-        if names.count(name) > 1:
-            raise SelectionError(f"{path} has {names.count(name)} columns named {name!r}")
     if len(set(chosen)) < 3:
         raise SelectionError(
             f"time, measurement and command must be three columns of {path}, "

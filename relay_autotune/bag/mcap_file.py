@@ -117,6 +117,13 @@ class McapFile:
         self._layout = scan(self._source, self._largest)
         for note in self._layout.notes:
             self._note(note)
+        found = self._layout.declared.channels
+        for channel in wanted:
+            if found.get(channel) != self.channels.get(channel):
+                self._note(
+                    f"{self.path.name} declares {self._name(channel)} at its end otherwise than "
+                    f"among its data; its end counts"
+                )
         return self._layout.holding(wanted)
 
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:

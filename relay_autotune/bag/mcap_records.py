@@ -6,7 +6,7 @@ Layout: https://mcap.dev/spec. Every length is checked against what is there bef
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -96,12 +96,21 @@ class Declarations:
     """
 
     def __init__(self) -> None:
-        self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.message_counts: dict[int, int] | None = None
         self.contradictions: list[str] = []
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self._channels: dict[int, tuple[str, int, str, dict[str, str]]] = {}
         self._taken: set[tuple[int, bytes]] = set()
+
+    @property
+    def channels(self) -> dict[int, Channel]:
+        """The channels by their ids, each with its type, wherever that is declared."""
+        return {
+            number: Channel(number, topic, name, encoding, schema_encoding, definition, metadata)
+            for number, (topic, schema, encoding, metadata) in self._channels.items()
+            for name, schema_encoding, definition in [self._schemas.get(schema, ("", "", b""))]
+        }
 
     def take_all(self, content: bytes | memoryview, offsets: IntArray) -> None:
         """Take in those of the records inside of a chunk that declare channels.
@@ -148,13 +157,10 @@ class Declarations:
             topic, at = text(body, 4)
             encoding, at = text(body, at)
             metadata, _ = map_of_text(body, at)
-            name, schema_encoding, definition = self._schemas.get(schema_number, ("", "", b""))
-            channel = Channel(number, topic, name, encoding, schema_encoding, definition, metadata)
-            first = self.channels.setdefault(number, channel)
-            if replace(first, metadata=metadata) != channel:
+            first = self._channels.setdefault(number, (topic, schema_number, encoding, metadata))
+            if first[:3] != (topic, schema_number, encoding):
                 self.contradictions.append(
-                    f"channel {number} is declared as {first.topic} ({first.type}) and, "
-                    f"differently, as {topic} ({name})"
+                    f"channel {number} is declared as {first[0]} and, differently, as {topic}"
                 )
         elif opcode == METADATA:
             name, at = text(body, 0)

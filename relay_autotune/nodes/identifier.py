@@ -290,7 +290,7 @@ class IdentifierNode(ServedNode):
         if isinstance(found, Analysis):
             return found
         self.get_logger().error(
-            f"experiment {name} could not be analysed: {type(found).__name__}: {found}"
+            f"experiment {name} could not be analysed: {defect(found)}"
         )
         return None
 

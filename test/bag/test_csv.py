@@ -88,7 +88,7 @@ def test_a_file_that_is_not_there_or_no_text(tmp_path):
     with pytest.raises(BagError, match="is not a text file"):
         read_experiments(tmp_path / "b.csv")
     (tmp_path / "c.csv").mkdir()
-    with pytest.raises(BagError, match="Is a directory"):
+    with pytest.raises(BagError, match="is a folder"):
         read_experiments(tmp_path / "c.csv")
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import sys
 import tracemalloc
 
 import numpy as np
@@ -10,12 +12,20 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_bags import START
+from made_bags import REPOSITORY, START
 from mcap.writer import CompressionType, Writer
 
+from relay_autotune.bag.fields import named_field
 from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.schema import message_type, numeric_paths
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import encode_float64
+from relay_autotune.errors import BagError, SelectionError
+
+sys.path.insert(0, str(REPOSITORY / "benchmarks"))
+fuzz_framing = pytest.importorskip("fuzz_framing")
 
 COUNT = 400
 
@@ -292,3 +302,127 @@ def test_message_indexes_of_other_topics_are_not_read(tmp_path):
     values, notes = read(path)
     np.testing.assert_array_equal(values, np.arange(COUNT))
     assert notes == []
+
+
+# --- valid framing that lies inside it
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_bags_that_lie(tmp_path, part):
+    seeds = fuzz_framing.seeds_once()
+    path = tmp_path / "bag.mcap"
+    for number in range(60 * part, 60 * (part + 1)):
+        path.write_bytes(fuzz_framing.made(number, seeds))
+        said = fuzz_framing.judge(path, number)
+        assert said in ("read", "read, with a note", "refused"), number
+
+
+@pytest.mark.parametrize("left", [0, 10])
+def test_messages_that_an_index_leaves_out_are_read_all_the_same(tmp_path, left):
+    path = write(tmp_path / "bag.mcap")
+    data = bytearray(path.read_bytes())
+    for at in records(data, 7):
+        struct.pack_into("<I", data, at + 11, 16 * left)
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert any("has a bad message index" in note and f"it lists {left}" in note for note in notes)
+
+
+def test_an_index_of_another_channel_hides_nothing(tmp_path):
+    path = write(tmp_path / "bag.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    second = list(records(data, 7))[1]
+    (channel,) = struct.unpack_from("<H", data, second + 9)
+    struct.pack_into("<H", data, second + 9, channel + 1)
+    # The index at the end says so as well, so that its chunk would be left alone.
+    chunk_index = list(records(data, 8))[1]
+    struct.pack_into("<H", data, chunk_index + 45, channel + 1)
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert any("has a bad message index" in note for note in notes)
+
+
+def test_statistics_that_differ_are_said(tmp_path):
+    path = write(tmp_path / "bag.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, next(records(data, 11)) + 9 + 48, COUNT - 7)
+    path.write_bytes(data)
+    values, notes = read(path)
+    assert values.size == COUNT
+    assert notes == [f"bag.mcap says that it has {COUNT - 7} messages of /x; it has {COUNT}"]
+
+
+def test_a_summary_that_names_a_channel_differently_is_said(tmp_path):
+    path = write(tmp_path / "bag.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"/other")
+    data[at : at + 6] = b"/OTHER"
+    path.write_bytes(data)
+    _, notes = read(path)
+    assert any("bag.mcap contradicts itself: channel 2" in note for note in notes)
+
+
+def channel(text, encoding="ros2msg"):
+    """Return a channel of a type x_msgs/msg/T of a definition."""
+    return Channel(1, "/t", "x_msgs/msg/T", "cdr", encoding, text.encode(), {})
+
+
+def doubling(depth, last):
+    """Return a definition in which each type holds the next one twice."""
+    parts = ["x_msgs/A0 header\nx_msgs/A0 b\n"]
+    for k in range(depth):
+        inner = f"x_msgs/A{k + 1}" if k + 1 < depth else last
+        parts.append(f"{'=' * 80}\nMSG: x_msgs/A{k}\n{inner} a\n{inner} b\n")
+    return "".join(parts)
+
+
+def test_types_that_double_are_gone_through_once():
+    assert list(numeric_paths(message_type(channel(doubling(38, "string"))))) == []
+    root = message_type(channel(doubling(38, "float64")))
+    with pytest.raises(SelectionError, match=r"name one, as in /t:b\.a\.a"):
+        named_field(root, "", "/t")
+    with pytest.raises(SelectionError, match="'header' of /t is no number"):
+        named_field(root, "header", "/t")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "const long A = " + "(" * 500 + "1" + ")" * 500 + ";",
+        "module a { " * 500,
+        "struct S { " + "sequence<" * 500 + "double" + ">" * 500 + " data; };",
+        "@a(" * 500,
+        '@a("\x1b',
+    ],
+)
+def test_definitions_in_idl_that_nest_without_end(text):
+    with pytest.raises(BagError, match=r"makes no sense|is missing"):
+        message_type(channel(text, "ros2idl"))
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "log.csv"])
+def test_a_pipe_or_a_device_is_no_recording(tmp_path, name):
+    pipe = tmp_path / name
+    os.mkfifo(pipe)
+    with pytest.raises(BagError, match="is no regular file"):
+        read_experiments(pipe)
+    pipe.unlink()
+    pipe.symlink_to("/dev/zero")
+    with pytest.raises(BagError, match="is no regular file"):
+        read_experiments(pipe)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("t,y,u\n0,1,2\n1,2,3,4\n", "line 3: 4 cells, but 3 columns"),
+        ("t,y,y\n0,1,2\n1,2,3\n", "2 columns named 'y'"),
+    ],
+)
+def test_a_csv_whose_lines_do_not_fit_its_header(tmp_path, text, complaint):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(BagError, match=complaint):
+        read_experiments(path)

@@ -77,7 +77,6 @@ def test_manifest_names_what_is_imported():
         "matplotlib": "python3-matplotlib",
         "mcap": "mcap-ros2-support",
         "numpy": "python3-numpy",
-        "rosbags": "python3-rosbags-pip",
         "scipy": "python3-scipy",
         "yaml": "python3-yaml",
     }
