@@ -31,7 +31,7 @@ from relay_autotune.bag.mcap_records import (
     unsigned,
 )
 from relay_autotune.bag.source import MAGIC, Source, file_records, record_body
-from relay_autotune.record import IntArray
+from relay_autotune.record.record import IntArray
 
 # Records outside of chunks are read in pieces of this size.
 _PIECE = 4 << 20

@@ -27,6 +27,7 @@ def worst(*statuses: int) -> int:
     """
     return max(statuses, key=_WORSE.index)
 
+
 # Set to anything in the environment, it lets a defect end a command with its traceback.
 DEBUG = "RELAY_AUTOTUNE_DEBUG"
 

@@ -289,9 +289,7 @@ class IdentifierNode(ServedNode):
         # One bad record must not end the node.
         if isinstance(found, Analysis):
             return found
-        self.get_logger().error(
-            f"experiment {name} could not be analysed: {defect(found)}"
-        )
+        self.get_logger().error(f"experiment {name} could not be analysed: {defect(found)}")
         return None
 
     def _task(self) -> Task:

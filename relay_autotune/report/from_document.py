@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.source import open_regular
+from relay_autotune.control.gains import NUMBERS
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.escape import visible
 from relay_autotune.identification import Estimate, FitReport, Identification
@@ -26,7 +27,6 @@ from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Outcome, RelaySettings
 from relay_autotune.report.case import Case, around, measured_points, model_case
 from relay_autotune.tuning import Gains
-from relay_autotune.tuning.gains import NUMBERS
 from relay_autotune.verdict import (
     NOT_JUDGED,
     Finding,
