@@ -21,6 +21,10 @@ _MOST_GROWTH = 4.0
 # A target is aimed at with so much to spare, since an oscillation is not quite linear in it.
 _TO_SPARE = 1.2
 
+# Levels that grew by so much, with a swing that grew by less than this: the process does not get
+# what it is told. A band makes small swings larger than in proportion, by a third of them at most.
+_GROWN, _CLIPPED = 3.0, 1.5
+
 
 class Levels:
     """The levels of a relay about its baseline.
@@ -45,6 +49,8 @@ class Levels:
             if abs(parameters.bias) >= self._wanted:
                 self._wanted = 1.5 * abs(parameters.bias)
         self._shift = 0.0
+        # Amplitude, half swing and levels of the first cycle that stood clear of the noise.
+        self._first_clear: tuple[float, float, float, float] | None = None
         self._set()
 
     def _set(self) -> None:
@@ -91,6 +97,29 @@ class Levels:
         """Move both levels, to bear a load that has come [u]."""
         self._shift += by
         self._set()
+
+    def why_clipped(self, half_swing: float, clear: float) -> str:
+        """Return why the actuator must be at its ends, "" if nothing says so.
+
+        A response that stood clear of what disturbs it has to grow with the levels.
+
+        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param clear: the half swing that stands clear [y].
+        """
+        first = self._first_clear
+        if first is None:
+            if half_swing >= clear:
+                self._first_clear = self.amplitude, half_swing, self.low, self.high
+            return ""
+        amplitude, swing, low, high = first
+        if self.amplitude < _GROWN * amplitude or half_swing >= _CLIPPED * swing:
+            return ""
+        return (
+            f"the actuator is clipped: the amplitude grew from {amplitude:.3g} to "
+            f"{self.amplitude:.3g}, and half the swing of the measurement from {swing:.3g} to "
+            f"{half_swing:.3g} only; give its true ends for command_min and command_max, or an "
+            f"amplitude with which it stays between {low:.3g} and {high:.3g}"
+        )
 
     def growth_for(self, half_swing: float, least: float) -> float:
         """Return the factor by which the amplitude is to grow, 1 if it is large enough.

@@ -338,6 +338,10 @@ class Oscillation:
             self._parameters.target_amplitude, self._rest.noise_std, self._hysteresis, y
         )
         half_swing = 0.5 * float(y.max() - y.min())
+        clear = clear_swing(0.0, self._rest.noise_std, self._hysteresis, y)
+        if clipped := self._levels.why_clipped(half_swing, clear):
+            self._end(Outcome.FAILED, clipped)
+            return True
         factor = self._levels.growth_for(half_swing, least)
         if factor == 1.0:
             if half_swing < least:

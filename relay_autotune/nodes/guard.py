@@ -52,6 +52,24 @@ class FollowWatch:
         self._came = True
         self._stays: deque[bool] = deque(maxlen=_STAYS)
         self._followed = math.nan
+        self._position = math.nan
+        self._ends: dict[float, float] = {}
+
+    @property
+    def rail(self) -> str:
+        """What to add where it moves, but each time ends short of the command: a sentence part."""
+        ends = {**self._ends, self._command: self._position}
+        told = sorted(command for command in ends if not math.isnan(command))
+        if len(told) < 2:
+            return ""
+        low, high = told[0], told[-1]
+        moved = ends[high] - ends[low]
+        if not 0.0 < moved < high - low - self._tolerance():
+            return ""
+        return (
+            f"; it moves between {ends[low]:g} and {ends[high]:g} only: it is clipped there, give "
+            f"command_min and command_max within these"
+        )
 
     def add(self, now: float, command: float, position: float) -> bool:
         """Take a position; return True if the actuator does not follow.
@@ -61,10 +79,12 @@ class FollowWatch:
         :param position: where it says it is [u].
         """
         if command != self._command:
+            self._ends[self._command] = self._position
             if math.isnan(self._followed):
                 self._followed = now
             self._stays.append(self._came)
             self._command, self._since, self._came = command, now, False
+        self._position = position
         if abs(position - command) <= self._tolerance():
             if not self._came and self._stays[-1]:
                 self._followed = now

@@ -246,7 +246,7 @@ class LoopEnds:
         if self._follow.add(self._feedback_at, self.commanded, message.data):
             self._stop(
                 f"the actuator does not follow: it is told {self.commanded:g} and says that it is "
-                f"at {message.data:g}"
+                f"at {message.data:g}{self._follow.rail}"
             )
 
     def _look(self) -> None:

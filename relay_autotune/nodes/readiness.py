@@ -19,6 +19,9 @@ from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.silence import Sensor
 from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
 
+# Levels so many times as far from zero as the baseline may be beyond the actuator's ends.
+_FAR = 10.0
+
 
 class NotReadyError(RelayAutotuneError):
     """A tune that cannot start."""
@@ -94,6 +97,33 @@ def policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
             f"start_without_hold to true"
         )
     return SafePolicy(command=safe, hold=True, gain=gain)
+
+
+def require_known_range(parameters: ExperimentParameters, baseline: float) -> None:
+    """Refuse levels far beyond the baseline where no limit says that the actuator goes so far.
+
+    An actuator that is at its end passes on less than it is told, and nothing in the record of two
+    levels need show it: the model has too small a gain then, and the gains are too large by as
+    much.
+
+    :param parameters: the experiment's parameters, valid.
+    :param baseline: command of the operating point, as the user gave it [u]; 0 tells no size.
+    :raises NotReadyError: with the limit to give.
+    """
+    if parameters.finds_amplitude or baseline == 0.0 or math.isnan(baseline):
+        return
+    middle, most = baseline + parameters.relay_bias, _FAR * abs(baseline)
+    for level, limit, name in (
+        (middle + parameters.amplitude, parameters.command_max, "command_max"),
+        (middle - parameters.amplitude, parameters.command_min, "command_min"),
+    ):
+        if abs(level) > most and math.isinf(limit):
+            raise NotReadyError(
+                f"a level of the relay is {level:g}, more than {_FAR:g} times the baseline "
+                f"{baseline:g}, and {name} is not given: what the actuator does not follow makes "
+                f"gains that are too large; give command_min and command_max, the ends of the "
+                f"actuator, or a smaller amplitude"
+            )
 
 
 def plan_of(parameters: ExperimentParameters, baseline: float, policy: SafePolicy) -> str:

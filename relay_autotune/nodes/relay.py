@@ -35,6 +35,7 @@ from relay_autotune.nodes.readiness import (
     plan_of,
     policy_from,
     require_connections,
+    require_known_range,
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
@@ -214,6 +215,7 @@ class RelayNode(ServedNode):
         else:
             mean = self._loop.mean_command()
             baseline = baseline_from(values["baseline"], mean, self._held)
+            require_known_range(parameters, values["baseline"])
         parameters.validate(baseline)
         policy = policy_from(values, connected=self._loop.is_connected)
         require_connections(self, self._ends, self._sensor, values["measurement_timeout"])

@@ -80,6 +80,30 @@ def test_a_target_out_of_reach_is_said_and_the_limits_hold():
     assert record.settings.bias == 1.0
 
 
+@pytest.mark.parametrize("end", [0.2, 0.5])
+def test_a_clipped_actuator_shows_in_a_response_that_does_not_grow(end):
+    tune = searching(target_amplitude=5.0)
+    plant, command = FopdtPlant(2.0, 2.0, 1.0), 0.0
+    noise = gaussian(0.001)
+    for k in range(40_000):
+        y = plant.advance(0.05 * k, min(max(command, -end), end)) + noise()
+        command = tune.step(0.05 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.FAILED
+    assert "the actuator is clipped: the amplitude grew from" in tune.reason
+    assert np.abs(tune.record().command).max() < 10.0
+    assert command == 0.0
+
+
+@pytest.mark.parametrize("dead_time", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("std", [0.0, 0.01])
+def test_a_response_that_grows_is_not_taken_for_a_clipped_one(dead_time, std):
+    tune = searching(target_amplitude=0.5)
+    run(tune, FopdtPlant(2.0, 2.0, dead_time), 0.02, noise=gaussian(std))
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+
+
 def test_a_coarse_sensor_needs_several_steps():
     plant, step = FopdtPlant(2.0, 2.0, 1.0), 0.3
     tune = searching()

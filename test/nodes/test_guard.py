@@ -59,6 +59,19 @@ def test_one_that_lags_by_half_of_a_stay_follows(stay):
     assert noticed(lambda t: command(max(t - lag, 0.0), stay), stay) == float("inf")
 
 
+@pytest.mark.parametrize(("ends", "said"), [((0.0, 5.0), "between 0 and 5 only"), ((9, 9), "")])
+def test_one_that_is_clipped_is_told_from_one_that_is_stuck(ends, said):
+    watch = FollowWatch(lambda: 50.0, TIMEOUT)
+    low, high = ends
+    for k in range(400):
+        told = 132.0 if k // 40 % 2 else -68.0
+        if watch.add(k * EVERY, told, min(max(told, low), high)):
+            break
+    assert k < 399
+    assert said in watch.rail
+    assert bool(watch.rail) == bool(said)
+
+
 def test_one_that_lags_by_a_stay_does_not():
     stay = 0.1
     assert noticed(lambda t: command(max(t - stay, 0.0), stay), stay) < 3.0 * TIMEOUT

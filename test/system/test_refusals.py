@@ -158,6 +158,18 @@ def test_a_parameter_out_of_range(idle: Rig, name: str, value: float) -> None:
     assert name in result.reason
 
 
+def test_levels_far_beyond_the_baseline_without_limits(idle: Rig) -> None:
+    for name, value in (("baseline", 2.0), ("command_min", -math.inf), ("command_max", math.inf)):
+        assert set_parameter(idle, name, value).successful
+    try:
+        refused(
+            idle, "a level of the relay is 132, more than 10 times the baseline", amplitude=100.0
+        )
+    finally:
+        for name, value in (("baseline", 0.0), ("command_min", -2.0), ("command_max", 2.0)):
+            assert set_parameter(idle, name, value).successful
+
+
 def test_an_unknown_baseline(idle: Rig) -> None:
     assert set_parameter(idle, "baseline", math.nan).successful
     with Ends(idle):
