@@ -196,6 +196,8 @@ def analyse(
         beside=0 if driven is record else _LOAD,
         free=not known.structure,
         samples=chosen.method == DEFAULT_METHOD,
+        others=found.models[1:],
+        settled=bool(cycles) and limit_cycle(cycles).converged,
     )
     return _judged(
         found, evidence, (record,), (rule,) if alone else _first(rule), simple, options, rng
@@ -267,7 +269,13 @@ def _judged(
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
-    loop = Loop(gains, lambda model: ms_on(gains, task.in_loop(model)), gains.ms, gains.ms_95)
+    loop = Loop(
+        controller=gains,
+        ms_on=lambda model: ms_on(gains, task.in_loop(model)),
+        ms=gains.ms,
+        ms_95=gains.ms_95,
+        added_delay=task.options.added_delay,
+    )
     findings = (*findings, *judge(LOOP_CHECKS, replace(evidence, loop=loop)))
     judgement = Judgement(findings)
     if judgement.verdict is Verdict.NONE:

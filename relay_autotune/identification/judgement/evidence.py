@@ -9,10 +9,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.errors import ModelError
 from relay_autotune.identification.judgement.direction import OtherDirection, other_direction
+from relay_autotune.identification.judgement.visible import VisibleError, visible_error
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
+
+# In so many of its time constants a process that grows by itself runs away from any rest.
+MOST_GROWTH = 7.0
+# A rival may leave so much more, and has to have so much of the support.
+_AS_WELL = 1.1
+_WORTH_HEARING = 0.01
 
 ComplexArray = NDArray[np.complexfloating]
 
@@ -25,12 +34,14 @@ class Loop:
     :param ms_on: Ms of the loop that these gains make with a model; inf: it is unstable.
     :param ms: Ms on the model that counts.
     :param ms_95: Ms that 95 % of the models within its uncertainty stay below.
+    :param added_delay: dead time of the loop beside the process's own [s].
     """
 
     controller: Callable[[ComplexArray], ComplexArray]
     ms_on: Callable[[TransferFunction], float]
     ms: float
     ms_95: float
+    added_delay: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,8 @@ class Evidence:
     :param beside: number of parameters that were estimated beside the model, as those of a load.
     :param free: True if the structure was chosen from the data, False if it was given.
     :param samples: True if the model was fitted to the samples themselves.
+    :param others: other methods' models of the record, with the quality of their fit.
+    :param settled: True if the record has a limit cycle whose last cycles agree.
     :param loop: the gains; None: there are none yet.
     """
 
@@ -50,6 +63,8 @@ class Evidence:
     beside: int = 0
     free: bool = True
     samples: bool = True
+    others: tuple[Identification, ...] = ()
+    settled: bool = False
     loop: Loop | None = None
 
     @cached_property
@@ -60,3 +75,41 @@ class Evidence:
         if not (relay and self.samples and self.free):
             return None
         return other_direction(self.found, self.record, beside=self.beside)
+
+    @cached_property
+    def visible(self) -> VisibleError | None:
+        """What the record shows of the model's error; None where it cannot tell."""
+        try:
+            return visible_error(self.found.model, self.record)
+        except (ModelError, np.linalg.LinAlgError):
+            return None
+
+    @cached_property
+    def rivals(self) -> tuple[TransferFunction, ...]:
+        """Other models that explain the record nearly as well."""
+        most = _AS_WELL * self.found.fit.residual_rms
+        models = (
+            *(r.model for r in self.found.rivals if r.support > _WORTH_HEARING),
+            *(m.model for m in self.others if m.fit.residual_rms <= most),
+        )
+        interval = self.record.duration / max(len(self.record) - 1, 1)
+        return tuple(
+            m
+            for m in models
+            if self.growth(m) <= MOST_GROWTH and not is_unseen(m, interval, self.record.duration)
+        )
+
+    def growth(self, model: TransferFunction) -> float:
+        """Return the longest stay of the command over the time with which a model grows.
+
+        :param model: any; one that does not grow by itself has 0.
+        """
+        growing = [-t.real for t in model.time_constants if t.real < 0.0]
+        return self.longest_stay / min(growing) if growing else 0.0
+
+    @cached_property
+    def longest_stay(self) -> float:
+        """Longest time within the record for which the command stood still [s]."""
+        time, changes = self.record.time, self.record.input().times
+        inside = changes[(changes > time[0]) & (changes < time[-1])]
+        return float(np.max(np.diff(np.concatenate((time[:1], inside, time[-1:])))))

@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.identification.judgement.evidence import Evidence
-from relay_autotune.identification.judgement.quality import misfit, noise_of, unexplained_share
+from relay_autotune.exchange.text import process_text
+from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
+from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.verdict import Check, Measured
+
+_FREQUENCIES = 300
 
 
 def _direction(evidence: Evidence) -> Measured | None:
@@ -39,8 +44,11 @@ def _open_dead_time(evidence: Evidence) -> Measured | None:
 
 
 def _residual(evidence: Evidence) -> Measured | None:
-    noise = noise_of(evidence.record)
-    value = misfit(evidence.found, evidence.record, noise=noise)
+    # What was not measured at rest is no measure: instruments and processes have noise of any
+    # colour, and second differences show its fast part alone.
+    if not math.isfinite(evidence.record.noise_std):
+        return None
+    value = misfit(evidence.found, evidence.record)
     return None if math.isnan(value) else Measured(value)
 
 
@@ -52,7 +60,7 @@ def _share(evidence: Evidence) -> Measured | None:
 
 def _limit_cycle(evidence: Evidence) -> Measured | None:
     validation = evidence.found.validation
-    if validation is None:
+    if validation is None or not evidence.settled:
         return None
     return Measured(
         math.inf if validation.reason else abs(validation.period),
@@ -70,6 +78,34 @@ def _ultimate(evidence: Evidence) -> Measured | None:
 def _models_around(evidence: Evidence) -> Measured | None:
     loop = evidence.loop
     return None if loop is None else Measured(loop.ms_95 / loop.ms)
+
+
+def _growth(evidence: Evidence) -> Measured | None:
+    growth = evidence.growth(evidence.found.model)
+    return Measured(growth) if growth > 0.0 else None
+
+
+def _visible(evidence: Evidence) -> Measured | None:
+    loop, error = evidence.loop, evidence.visible
+    if loop is None or error is None:
+        return None
+    record, model = evidence.record, evidence.found.model
+    interval = record.duration / max(len(record) - 1, 1)
+    w = np.geomspace(2.0 * math.pi / record.duration, math.pi / interval, _FREQUENCIES)
+    process = model(1j * w) * np.exp(-1j * w * loop.added_delay)
+    tolerance = np.abs(loop.controller(1j * w) / (1.0 + process * loop.controller(1j * w)))
+    share = error.sure(w) * tolerance
+    at = int(np.argmax(share))
+    return Measured(float(share[at]), f"{w[at]:.3g} rad/s")
+
+
+def _rivals(evidence: Evidence) -> Measured | None:
+    loop = evidence.loop
+    if loop is None or not evidence.rivals:
+        return None
+    found = [(loop.ms_on(model), model) for model in evidence.rivals]
+    ms, model = max(found, key=lambda pair: pair[0])
+    return Measured(ms / loop.ms, process_text(model))
 
 
 MODEL_CHECKS = (
@@ -95,9 +131,22 @@ MODEL_CHECKS = (
         measure=_open_dead_time,
     ),
     Check(
+        name="growth",
+        title="Growth",
+        what="longest time for which the command stood still, over the time constant with which "
+        "the model grows",
+        unit="",
+        failed=MOST_GROWTH,
+        sentence="the model grows by itself and would have run away {value} time constants long, "
+        "which the record did not",
+        remedy="name a stable structure, or record the controller's command if a loop was closed",
+        measure=_growth,
+    ),
+    Check(
         name="residual",
         title="Residual",
-        what="residual over the larger of 1.3 times the noise and 2 % of the measurement's spread",
+        what="residual over the larger of 1.3 times the noise at rest and 2 % of the "
+        "measurement's spread",
         unit="",
         doubtful=4.0,
         sentence="the model leaves {value} times what noise and a simple structure may leave",
@@ -149,6 +198,30 @@ LOOP_CHECKS = (
         sentence="the gains are {value} times as fragile on models that the data allow",
         remedy="run more cycles, use a larger amplitude, or choose the rule robust",
         measure=_models_around,
+    ),
+    Check(
+        name="visible_response",
+        title="Visible response",
+        what="difference between the model and the response that the record shows without any "
+        "structure, over what the loop bears (1: it may be unstable), at the worst frequency",
+        unit="",
+        doubtful=0.6,
+        sentence="the record shows another response than the model's: at {detail} the difference "
+        "is {value} of what the loop bears",
+        remedy="look at the model over the data; name another structure, or record from rest "
+        "without other inputs",
+        measure=_visible,
+    ),
+    Check(
+        name="rivals",
+        title="Rivals",
+        what="Ms of the gains on the worst of the other models that explain the record as well, "
+        "over Ms on the model that counts",
+        unit="",
+        doubtful=2.0,
+        sentence="{detail} explains the record as well, and on it Ms is {value} times as large",
+        remedy="run a test that tells them apart: a biased relay, or a longer step",
+        measure=_rivals,
     ),
 )
 

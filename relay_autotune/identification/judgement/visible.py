@@ -1,0 +1,118 @@
+"""What a record shows of a process without any structure, beside the model that was chosen.
+
+The model is run on the recorded command alone, from rest at an unknown constant command and
+without drift or load, and what it leaves is regressed on the past of the command: an impulse
+response in bins of the lag, ``e(t) = c + sum_j g_j int u(t - lag) dlag`` over each bin. Its
+frequency response is the model's error (a model-error model, Ljung 1999): where it is large
+against what the loop bears, the gains are those of another process. A ridge keeps it at zero
+where the command excites nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant, Record
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
+
+_BINS = 24
+_MOST_SAMPLES = 2000
+_LEAST_SAMPLES = 60
+# Of the regression's own size: what is excited less than this is taken for not excited.
+_RIDGE = 1e-3
+# Standard deviations that a difference has to stand clear of.
+_SURE = 3.0
+
+
+@dataclass(frozen=True)
+class VisibleError:
+    """The difference between a record's response and a model's, without a structure.
+
+    :param edges: of the bins of the lag [s], shape (m + 1,).
+    :param height: impulse response of the difference in each bin [y/(u s)], shape (m,).
+    :param covariance: of the heights, shape (m, m).
+    :param residual: what is left then, rms [y].
+    """
+
+    edges: FloatArray
+    height: FloatArray
+    covariance: FloatArray
+    residual: float
+
+    def at(self, frequency: FloatArray) -> ComplexArray:
+        """Return its frequency response [y/u].
+
+        :param frequency: rad/s, shape (k,).
+        """
+        return np.asarray(self._integrals(frequency) @ self.height)
+
+    def sure(self, frequency: FloatArray) -> FloatArray:
+        """Return its magnitude less what chance explains, at least zero [y/u].
+
+        :param frequency: rad/s, shape (k,).
+        """
+        basis = self._integrals(frequency)
+        variance = np.einsum("km,mn,kn->k", basis, self.covariance, basis.conj()).real
+        chance = _SURE * np.sqrt(np.maximum(variance, 0.0))
+        return np.maximum(np.abs(basis @ self.height) - chance, 0.0)
+
+    def _integrals(self, frequency: FloatArray) -> ComplexArray:
+        ends = np.exp(-1j * np.outer(frequency, self.edges))
+        return np.asarray((ends[:, :-1] - ends[:, 1:]) / (1j * frequency[:, None]))
+
+
+def visible_error(model: TransferFunction, record: Record) -> VisibleError | None:
+    """Return what a record shows of a model's error; None where it cannot tell.
+
+    :param model: any; of an unstable one no open loop can tell.
+    :param record: the record.
+    """
+    if any(t.real < 0.0 for t in model.time_constants) or len(record) < _LEAST_SAMPLES:
+        return None
+    u, time, y = record.input(), record.time, record.measurement
+    error = y - response(model, time, u)
+    few = np.unique(np.linspace(0, time.size - 1, min(time.size, _MOST_SAMPLES)).astype(np.int64))
+    time, error = time[few], error[few]
+    shortest = max(float(np.median(np.diff(time))), 1e-6 * record.duration)
+    edges = np.concatenate(([0.0], np.geomspace(shortest, record.duration, _BINS)))
+    past = _integral(u, time[:, None] - edges)
+    columns = past[:, :-1] - past[:, 1:]
+    # The measurement's zero and the command before the record are not known.
+    before = response(model, time, PiecewiseConstant(np.array([time[0]]), np.ones(1), 0.0))
+    unknown, _ = np.linalg.qr(np.stack((np.ones(time.size), before), axis=1))
+    columns = columns - unknown @ (unknown.T @ columns)
+    error = error - unknown @ (unknown.T @ error)
+    size = np.sqrt(np.einsum("nm,nm->m", columns, columns))
+    if not float(size.max()) > 0.0:
+        return None
+    size = np.maximum(size, _RIDGE * float(size.max()))
+    scaled = columns / size
+    normal = scaled.T @ scaled
+    inverse = np.linalg.inv(normal + _RIDGE * np.eye(normal.shape[0]))
+    height = inverse @ (scaled.T @ error)
+    left = error - scaled @ height
+    rms = math.sqrt(float(np.mean(left**2)))
+    # A residual that goes on from sample to sample is worth less than its number of samples.
+    neighbours = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
+    colour = (1.0 + max(neighbours, 0.0)) / max(1.0 - neighbours, 1e-3)
+    covariance = rms**2 * colour * (inverse @ normal @ inverse) / np.outer(size, size)
+    return VisibleError(edges, height / size, covariance, rms)
+
+
+def _integral(u: PiecewiseConstant, at: FloatArray) -> FloatArray:
+    """Return the integral of the command's deviation from its first value up to given times."""
+    if u.times.size == 0:
+        return np.zeros(at.shape)
+    away = u.values - u.initial
+    before = np.concatenate(([0.0], np.cumsum(away[:-1] * np.diff(u.times))))
+    k = np.searchsorted(u.times, at, side="right") - 1
+    value = before[k] + away[k] * (at - u.times[k])
+    return np.where(k >= 0, value, 0.0)
