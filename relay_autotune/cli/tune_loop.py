@@ -136,7 +136,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             leave=lambda: bool(interrupted),
         )
         # Until here there is nothing that could be left half done.
-        heeded = ending_signals()
+        # While it is stopped by Ctrl-Z the tune goes on, which is no harm.
+        heeded = ending_signals() - {signal.SIGTSTP}
         for number in heeded:
             heed(number)
         if interrupted:
