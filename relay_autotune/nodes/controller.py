@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
-from relay_autotune.control.controller import PidController
+from relay_autotune.control.controller import GainBounds, PidController, is_usable
 from relay_autotune.control.gains import Controller, Gains
+from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step
 from relay_autotune.errors import ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
+from relay_autotune.nodes.gains_journal import GainsJournal
+from relay_autotune.nodes.gains_keeper import GainsKeeper
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
@@ -36,6 +42,9 @@ from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 # How long the end waits for its last message to be acknowledged.
 ACKNOWLEDGE = Duration(seconds=0.2)
+NAMES_OF_GAINS = frozenset(entry.name for entry in GAINS)
+# How long the end of the process may wait for another node to take its gains back [s].
+END_WITHIN = 5.0
 
 
 class ControllerNode(ServedNode):
@@ -51,19 +60,21 @@ class ControllerNode(ServedNode):
         declare(self, FIXED, read_only=True)
         values = values_of(self, (*GAINS, *OTHERS, *FIXED))
         require_own_time(values["sample_period"], values["repeat_period"])
-        self._gains = gains_from(values)
+        gains = gains_from(values)
+        if gains is not None:
+            bounds_from(values).require(gains)
         self._results = Results(self, is_stable)
         # The experiment that gains are of, and the gains.
         self._pending: tuple[str, Gains] | None = None
         # Why they are not to be used without being told to; empty: they are trusted.
         self._doubt = ""
         self._applying = False
-        self._previous: Controller | None = None
         self._model: TransferFunction | None = None
         self._model_doubt = ""
         self._limits = limits_from(values)
+        self._range = range_from(values)
         self._pid = PidController(
-            self._gains,
+            gains,
             values["initial_command"],
             limits=self._limits,
             automatic=not values["manual"],
@@ -73,6 +84,7 @@ class ControllerNode(ServedNode):
         self._period: float = values["sample_period"]
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._count = 0
+        self._ending = False
         self._held = False
         # What a verification adds to set-point and command.
         self._offset = self._load = 0.0
@@ -85,13 +97,15 @@ class ControllerNode(ServedNode):
             ready=self._ready_to_verify,
             heights=self._steps_of,
             move=self._move,
+            begin=self._begin_verification,
             ended=self._after_verification,
         )
         self._remote: RemoteLoop | None = None
+        self._place: OwnGains | RemoteGains = OwnGains(self._use)
         if values["apply_to"]:
             mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
-            gains = RemoteGains(self, values["apply_to"], mapping)
-            self._remote = RemoteLoop(self, gains, self._setpoint, self._verifier.interrupt)
+            self._place = RemoteGains(self, values["apply_to"], mapping)
+            self._remote = RemoteLoop(self, self._place, self._setpoint, self._verifier.interrupt)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
         self._repeater: Repeater | None = None
@@ -117,14 +131,30 @@ class ControllerNode(ServedNode):
         )
         self.create_subscription(PidGains, "pi_gains", self._on_gains, quality.RESULT)
         self.create_subscription(ModelMessage, "transfer_function", self._on_model, quality.RESULT)
-        self.create_service(Trigger, "~/apply", self._on_apply)
+        # The loop goes on while these wait for the disk, or for another node.
+        waiting = ReentrantCallbackGroup()
+        self.create_service(Trigger, "~/apply", self._on_apply, callback_group=waiting)
         self.create_service(Trigger, "~/discard", self._on_discard)
-        self.create_service(Trigger, "~/revert", self._on_revert)
+        self.create_service(Trigger, "~/revert", self._on_revert, callback_group=waiting)
         self.create_service(SetBool, "~/automatic", self._on_automatic)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
+        journal = GainsJournal(
+            Path(values["record_directory"]).expanduser(),
+            self.get_fully_qualified_name(),
+            self.context.get_domain_id(),
+            f"{measurement.topic_name} {values['apply_to']}".strip(),
+        )
+        given = set_of(gains) if gains is not None and self._remote is None else None
+        self._keeper = GainsKeeper(self, self._place, journal, given)
+        if self._remote is None and self._keeper.gains != given:
+            self._use(self._keeper.gains)
+            self.get_logger().warning(
+                f"starts with {said(self._pid.gains)}, not with the parameters' {said(gains)}, "
+                f"for what was proven or failed before: see {journal.path}"
+            )
         self.get_logger().info(
-            f"ready: {said(self._gains)}, "
+            f"ready: {said(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
             f"commands go to {self._commands.topic_name}"
         )
@@ -155,10 +185,21 @@ class ControllerNode(ServedNode):
             self._take(self.get_clock().now().nanoseconds * 1e-9 - ago, value)
 
     def _take(self, at: float, value: float) -> None:
+        if self._ending:
+            return
+        if math.isfinite(value) and not self._is_possible(value):
+            self._verifier.out_of_range(value)
+            self.get_logger().warning(
+                f"the measurement is {value:g}, outside of its range: the command is held",
+                throttle_duration_sec=5.0,
+            )
+            value = math.nan
         if math.isnan(self._setpoint) and math.isfinite(value):
             self._setpoint = value
         if self._remote is not None:
             command = self._remote.command
+            if self._verifier.is_running and (reason := self._remote.why_silent()):
+                self._verifier.interrupt(reason)
         else:
             command = self._pid.step(at, self._setpoint + self._offset, value)
             self._message.data = self._limits.clip(command + self._load)
@@ -167,14 +208,25 @@ class ControllerNode(ServedNode):
         if math.isfinite(value) and math.isfinite(command):
             self._verifier.sample(at, value, command)
 
+    def _is_possible(self, value: float) -> bool:
+        return is_usable(value) and self._range.low <= value <= self._range.high
+
     def _on_setpoint(self, message: Float64) -> None:
-        if math.isfinite(message.data):
-            self._setpoint = message.data
+        value = message.data
+        if not self._is_possible(value):
+            self.get_logger().error(
+                f"the set-point {value:g} is outside of the measurement's range, so that "
+                f"{self._setpoint:g} stays"
+            )
+            return
+        if value != self._setpoint:
+            self._verifier.interrupt(f"the set-point was changed to {value:g} by another node")
+        self._setpoint = value
 
     def _on_command(self, message: Float64) -> None:
         if self._remote is not None:
-            self._remote.command = message.data
-        elif self._held and math.isfinite(message.data):
+            self._remote.hear_command(message.data)
+        elif self._held:
             self._pid.track(message.data)
 
     def _on_hold(self, message: Bool) -> None:
@@ -204,16 +256,33 @@ class ControllerNode(ServedNode):
         gains = self._results.gains(message)
         if gains is None:
             return
-        self._pending = (message.experiment_id, gains)
+        name = message.experiment_id
+        try:
+            self._bounds.require(gains)
+            self._keeper.history.require_not_failed(self._place.set_of(gains))
+        except RelayAutotuneError as error:
+            self._results.refusals.say("gains", name, error)
+            return
+        self._pending = (name, gains)
         self._doubt = why_doubtful(message)
         if self._doubt:
-            self.get_logger().warning(f"gains of {message.experiment_id} are {self._doubt}")
-        if self._doubt or not self.get_parameter("auto_apply").value:
+            self.get_logger().warning(f"gains of {name} are {self._doubt}")
+        asked = self.get_parameter("auto_apply").value
+        cut_short = not self._keeper.history.is_open_to(self._place.set_of(gains))
+        if self._doubt or cut_short or not asked:
             self.get_logger().info(
-                f"gains of {message.experiment_id} wait: {said(gains)}; call "
+                f"gains of {name} wait: {said(gains)}; call "
                 f"{self.get_fully_qualified_name()}/apply or /discard"
+                + (
+                    "; their verification was cut short, so that auto_apply leaves them"
+                    * cut_short
+                )
             )
         self._apply_by_itself()
+
+    @property
+    def _bounds(self) -> GainBounds:
+        return bounds_from(values_of(self, OTHERS))
 
     def _on_model(self, message: Any) -> None:
         if not message.final:
@@ -232,6 +301,8 @@ class ControllerNode(ServedNode):
         if self._pending is None or self._doubt or not self.get_parameter("auto_apply").value:
             return
         name, gains = self._pending
+        if not self._keeper.history.is_open_to(self._place.set_of(gains)):
+            return
         doubt = self._results.doubt(name, gains)
         if doubt:
             self._results.refusals.say("to apply gains by itself", name, TuningError(doubt))
@@ -253,30 +324,23 @@ class ControllerNode(ServedNode):
     async def _apply(self) -> tuple[bool, str]:
         if self._pending is None:
             return False, "no gains wait to be applied"
-        name, gains = self._pending
-        if self._verifier.is_running:
-            return False, "a verification is running; wait for its end"
+        name, gains = pending = self._pending
         try:
             # The record may have come after the gains.
             self._results.check(name, gains)
+            self._bounds.require(gains)
+            if self._doubt and not self.get_parameter("accept_doubtful").value:
+                raise TuningError(
+                    f"they are {self._doubt}; set the parameter accept_doubtful to true to have "
+                    "them all the same"
+                )
+            done = await self._keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
-            return False, f"the gains of {name} are refused: {error}"
-        if self._doubt and not self.get_parameter("accept_doubtful").value:
-            return False, (
-                f"gains of {name} are {self._doubt}; set the parameter accept_doubtful to true to "
-                "have them all the same"
-            )
-        if self._remote is not None:
-            try:
-                await self._remote.apply(gains)
-            except RelayAutotuneError as error:
-                return False, str(error)
+            return False, f"the gains of {name} are not in force: {error}"
+        # Others may have come meanwhile.
+        if self._pending is pending:
             self._pending = None
-            return True, f"{self._remote.target} has the gains of {name}"
-        self._previous = self._gains
-        self._pending = None
-        self._use(gains)
-        return True, f"{said(self._gains)} in force; the gains before are kept for ~/revert"
+        return True, f"gains of {name}: {done}; ~/revert brings back those before"
 
     async def _on_apply(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = await self._apply()
@@ -289,24 +353,16 @@ class ControllerNode(ServedNode):
         return response
 
     async def _on_revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._verifier.is_running:
-            response.message = "a verification is running; wait for its end"
-            return response
-        response.success, response.message = await self._revert()
+        try:
+            response.message = await self._keeper.revert()
+            response.success = True
+        except RelayAutotuneError as error:
+            response.message = str(error)
         return response
 
-    async def _revert(self) -> tuple[bool, str]:
-        if self._remote is not None:
-            return await self._remote.revert()
-        if self._previous is None and self._gains is None:
-            return False, "there are no gains before these"
-        before, self._previous = self._previous, self._gains
-        self._use(before)
-        return True, f"{said(before)} in force again"
-
-    def _use(self, gains: Controller | None) -> None:
+    def _use(self, kept: GainSet | None) -> None:
         """Put gains in force, and into the parameters."""
-        self._gains = gains
+        gains = None if kept is None else controller_of(kept)
         self._pid.use(gains)
         values: dict[str, Any] = {entry.name: entry.default for entry in GAINS}
         if gains is not None:
@@ -335,23 +391,43 @@ class ControllerNode(ServedNode):
                 "accept_doubtful to true to step all the same"
             )
         if self._remote is not None:
-            return Verifiable(await self._remote.ready(), self._model, self._limits)
-        if self._gains is None or not self._pid.is_automatic:
+            self._remote.require_ready()
+            kept = await self._place.read()
+        else:
+            kept = self._keeper.gains
+        if kept is None or (self._remote is None and not self._pid.is_automatic):
             raise NotVerifiable("the controller is not in automatic, or has no gains")
-        return Verifiable(self._gains, self._model, self._limits)
+        return Verifiable(self._place.controller_of(kept), self._model, self._limits)
+
+    async def _begin_verification(self) -> None:
+        await self._keeper.begin_verification()
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value
         allowed = self.get_parameter("verify_load_max").value
+        highest = max(
+            abs(self.get_parameter(name).value) for name in ("verify_step", "verify_step_max")
+        )
         if not (math.isfinite(height) and math.isfinite(request.load_step)):
             raise NotVerifiable("a step must be finite")
         if height == 0.0 and request.load_step == 0.0:
             raise NotVerifiable(
                 "no step is given: set setpoint_step, or the parameter verify_step"
             )
+        if abs(height) > highest:
+            raise NotVerifiable(
+                f"setpoint_step is {height:g}, verify_step_max allows {highest:g}: set it to the "
+                "largest step that the process may be given"
+            )
+        setpoint = self._setpoint if self._remote is None else self._remote.setpoint
+        if height and not self._is_possible(setpoint + height):
+            raise NotVerifiable(
+                f"the step leads to the set-point {setpoint + height:g}, outside of "
+                f"measurement_min to measurement_max"
+            )
         if request.load_step and self._remote is not None:
             raise NotVerifiable(
-                f"{self._remote.target} commands: no load step can be added to that, ask for none"
+                f"{self._place.name} commands: no load step can be added to that, ask for none"
             )
         if abs(request.load_step) > allowed:
             raise NotVerifiable(
@@ -365,17 +441,21 @@ class ControllerNode(ServedNode):
             self._remote.move(setpoint)
         self._offset, self._load = setpoint, load
 
-    async def _after_verification(self, passed: bool, reason: str) -> str:
-        if not passed and (self._remote is not None or self._previous is not None):
-            reason = f"{reason}; {(await self._revert())[1]}"
-        self.get_logger().info(f"verification {'passed' if passed else 'failed'}: {reason}")
+    async def _after_verification(self, passed: bool | None, reason: str) -> str:
+        if self._ending:
+            return reason
+        reason += await self._keeper.end_verification(passed)
+        verdict = "ended without a verdict" if passed is None else "passed" if passed else "failed"
+        self.get_logger().info(f"verification {verdict}: {reason}")
         return reason
 
     # The end.
 
     def end(self, reason: str) -> None:
-        """Take back what a verification moves, and leave a command that may stay."""
+        """Take back what a verification moves, and leave a command and gains that may stay."""
         rested = self._verifier.rested_at
+        at_work = self._verifier.is_running or self._keeper.is_at_work
+        self._ending = True
         self._verifier.interrupt(reason)
         if self._remote is not None:
             self._remote.wait_for_setpoint(ACKNOWLEDGE)
@@ -387,6 +467,18 @@ class ControllerNode(ServedNode):
             self._commands.publish(self._message)
             self._commands.wait_for_all_acked(ACKNOWLEDGE)
             self.get_logger().info(f"{reason}; the command is left at {safe:g}")
+        if at_work:
+            self._undo()
+
+    def _undo(self) -> None:
+        """Bring back another node's gains where they are on trial, and end the verification."""
+        undone = self.executor.create_task(self._keeper.abandon)
+        deadline = time.monotonic() + END_WITHIN
+        while time.monotonic() < deadline and (self._verifier.is_running or not undone.done()):
+            self.executor.turn(0.02)
+        # Who asked for the verification gets its result.
+        for _ in range(20):
+            self.executor.turn(0.01)
 
     # Parameters.
 
@@ -394,11 +486,16 @@ class ControllerNode(ServedNode):
         if self._following:
             return SetParametersResult(successful=True)
         try:
-            values = merged(self, (*GAINS, *OTHERS), changes)
-            gains_from(values)
-            limits_from(values)
             if self._verifier.is_running:
                 raise ParameterError("parameters stay as they are while a verification runs")
+            values = merged(self, (*GAINS, *OTHERS), changes)
+            limits_from(values)
+            range_from(values)
+            gains, bounds = gains_from(values), bounds_from(values)
+            if gains is not None:
+                bounds.require(gains)
+            if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
+                self._keeper.require_editable(set_of(gains) if gains is not None else None)
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -408,12 +505,65 @@ class ControllerNode(ServedNode):
             return
         names = {change.name for change in changes}
         values = values_of(self, (*GAINS, *OTHERS))
-        if names & {entry.name for entry in GAINS}:
-            self._previous, self._gains = self._gains, gains_from(values)
-            self._pid.use(self._gains)
+        if names & NAMES_OF_GAINS and self._remote is None:
+            gains = gains_from(values)
+            self._pid.use(gains)
+            self._keeper.edited(set_of(gains) if gains is not None else None)
+        self._range = range_from(values)
         if names & {"command_min", "command_max"}:
             self._limits = limits_from(values)
             self._pid.limit(self._limits)
+
+
+class OwnGains:
+    """The controller of this node as a place for gains.
+
+    :param use: puts gains in force; None: the command is held.
+    """
+
+    name = "this node"
+    outlives = False
+
+    def __init__(self, use: Callable[[GainSet | None], None]) -> None:
+        self._use = use
+
+    async def read(self) -> GainSet | None:
+        """Return None: nobody else changes these gains."""
+        return None
+
+    async def put(self, gains: GainSet | None) -> None:
+        """Put gains in force, or hold the command."""
+        self._use(gains)
+
+    def set_of(self, controller: Controller) -> GainSet:
+        """Return the numbers of a controller."""
+        return set_of(controller)
+
+    def controller_of(self, gains: GainSet) -> Controller:
+        """Return the controller that numbers make."""
+        return controller_of(gains)
+
+    def said(self, gains: GainSet | None) -> str:
+        """Say which gains are in force."""
+        if gains is None:
+            return "no gains are in force, the command is held"
+        return f"{said(controller_of(gains))} in force"
+
+
+def set_of(gains: Controller) -> GainSet:
+    """Return gains as the history keeps them.
+
+    :param gains: the controller.
+    """
+    return GainSet.of({entry.name: getattr(gains, entry.name) for entry in GAINS})
+
+
+def controller_of(gains: GainSet) -> Controller:
+    """Return gains that the history has kept.
+
+    :param gains: as `set_of` made them.
+    """
+    return Controller(**gains.by_name())
 
 
 def gains_from(values: dict[str, Any]) -> Controller | None:
@@ -446,6 +596,28 @@ def limits_from(values: dict[str, Any]) -> Limits:
     :raises RelayAutotuneError: if they leave none.
     """
     return Limits(values["command_min"], values["command_max"])
+
+
+def range_from(values: dict[str, Any]) -> Limits:
+    """Return the range of the measurement.
+
+    :param values: the parameters by name.
+    :raises ParameterError: if they leave none.
+    """
+    low, high = values["measurement_min"], values["measurement_max"]
+    if not low < high:
+        raise ParameterError(
+            f"measurement_min {low:g} and measurement_max {high:g} leave no range"
+        )
+    return Limits(low, high)
+
+
+def bounds_from(values: dict[str, Any]) -> GainBounds:
+    """Return what gains may be put in force.
+
+    :param values: the parameters by name.
+    """
+    return GainBounds(values["kc_max"], values["ti_min"])
 
 
 def said(gains: Controller | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from relay_autotune.control.controller import LARGEST_GAIN, LARGEST_VALUE, LONGEST_TIME
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.quantities import Quantity
 
@@ -13,10 +14,12 @@ GAINS = (
         0.0,
         "u/y",
         "Proportional gain, with the sign of the process; 0: no gains yet, the command is held.",
+        -LARGEST_GAIN,
+        LARGEST_GAIN,
     ),
-    Quantity("ti", 0.0, "s", "Integral time; 0: no integral action.", 0.0),
-    Quantity("td", 0.0, "s", "Derivative time.", 0.0),
-    Quantity("tf", 0.0, "s", "Time constant of the filter on the measurement.", 0.0),
+    Quantity("ti", 0.0, "s", "Integral time; 0: no integral action.", 0.0, LONGEST_TIME),
+    Quantity("td", 0.0, "s", "Derivative time.", 0.0, LONGEST_TIME),
+    Quantity("tf", 0.0, "s", "Time constant of the filter on the measurement.", 0.0, LONGEST_TIME),
     Quantity("b", 1.0, "", "Weight of the set-point in the proportional part.", 0.0, 1.0),
 )
 OTHERS = (
@@ -28,6 +31,30 @@ OTHERS = (
         "u",
         "Command that is left when the node ends; NaN: the last one, and where a verification was "
         "running, the one at which the loop rested before.",
+    ),
+    Quantity(
+        "measurement_min",
+        -math.inf,
+        "y",
+        "A measurement below this is a fault of the sensor: it is passed over, and the command is "
+        "held.",
+    ),
+    Quantity("measurement_max", math.inf, "y", "Likewise above this."),
+    Quantity(
+        "kc_max",
+        LARGEST_GAIN,
+        "u/y",
+        "Gains with a kc of a larger magnitude are refused.",
+        0.0,
+        LARGEST_GAIN,
+    ),
+    Quantity(
+        "ti_min",
+        0.0,
+        "s",
+        "Gains with a shorter ti, other than 0, are refused.",
+        0.0,
+        LONGEST_TIME,
     ),
     Quantity(
         "auto_apply",
@@ -47,6 +74,16 @@ OTHERS = (
         0.0,
         "y",
         "Height of the set-point step of ~/verify, where the request gives none.",
+        -LARGEST_VALUE,
+        LARGEST_VALUE,
+    ),
+    Quantity(
+        "verify_step_max",
+        0.0,
+        "y",
+        "Largest set-point step that a request of ~/verify may ask for; 0: none beyond "
+        "verify_step.",
+        0.0,
     ),
     Quantity(
         "verify_load_max",
@@ -97,6 +134,12 @@ FIXED = (
         "",
         "Which gain goes into which of that node's parameters, separated by commas, such as "
         "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d.",
+    ),
+    Quantity(
+        "record_directory",
+        "~/.ros/relay_autotune",
+        "",
+        "Folder of the journal in which proven and failed gains are kept.",
     ),
 )
 PARAMETERS = (*GAINS, *OTHERS, *FIXED)

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from relay_autotune.control.gains import Controller
+from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import ParameterError, RelayAutotuneError
 
 # What may be sent, by the names of the gains in both forms.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
 
-# How far a value that is read back may be from what was set, relatively.
-_EQUAL = 1e-9
+# How long an answer is waited for [s].
+TIMEOUT = 2.0
 
 
 class RemoteError(RelayAutotuneError):
@@ -65,94 +69,112 @@ def controller_of(gains: Mapping[str, float]) -> Controller:
 
 
 class RemoteGains:
-    """Set the gains of a node and read them back.
+    """The parameters of another node as a place for gains: all of them or none.
+
+    Each question is given up after `TIMEOUT`, so that a node that hangs keeps nobody waiting.
 
     :param node: the node that asks.
     :param target: name of the node that controls.
     :param mapping: which gain goes into which of its parameters.
     """
 
+    outlives = True
+
     def __init__(self, node: Node, target: str, mapping: Mapping[str, str]) -> None:
-        self.target = target
+        self.name = target
+        self._node = node
         self._mapping = dict(mapping)
         base = target.rstrip("/")
         # The answers must come while the callback that waits for them has not returned.
-        group = ReentrantCallbackGroup()
+        self._group = ReentrantCallbackGroup()
         self._get, self._set = (
-            node.create_client(kind, f"{base}/{name}", callback_group=group)
+            node.create_client(kind, f"{base}/{name}", callback_group=self._group)
             for kind, name in (
                 (GetParameters, "get_parameters"),
                 (SetParametersAtomically, "set_parameters_atomically"),
             )
         )
 
-    async def read(self) -> dict[str, float]:
-        """Return the present values of the parameters by name.
+    def set_of(self, controller: Controller) -> GainSet:
+        """Return the parameters that make a controller.
 
-        :raises RemoteError: if the node is not there, or lacks one of them.
+        :param controller: the gains.
         """
-        if not self._get.service_is_ready() or not self._set.service_is_ready():
-            raise RemoteError(f"the node {self.target} is not there, or has no parameter services")
+        return GainSet.of({t: getattr(controller, name) for name, t in self._mapping.items()})
+
+    def controller_of(self, gains: GainSet) -> Controller:
+        """Return the controller that parameters make.
+
+        :param gains: the parameters.
+        :raises RelayAutotuneError: if they make none.
+        """
+        values = gains.by_name()
+        return controller_of({name: values[target] for name, target in self._mapping.items()})
+
+    def said(self, gains: GainSet | None) -> str:
+        """Say which gains are in force."""
+        if gains is None:
+            return f"{self.name} keeps its gains, since none before them are known: see to it"
+        return f"{self.name} has {gains}"
+
+    async def read(self) -> GainSet:
+        """Return the present values of the parameters.
+
+        :raises RelayAutotuneError: if the node does not answer, or lacks one of them.
+        """
         names = list(self._mapping.values())
-        answer = await self._get.call_async(GetParameters.Request(names=names))
+        answer = await self._ask(self._get, GetParameters.Request(names=names))
         values = {}
         for name, value in zip(names, answer.values, strict=False):
             if value.type == ParameterType.PARAMETER_DOUBLE:
                 values[name] = float(value.double_value)
         missing = [name for name in names if name not in values]
         if missing:
-            raise RemoteError(f"{self.target} has no number {', '.join(missing)}")
-        return values
+            raise RemoteError(f"{self.name} has no number {', '.join(missing)}")
+        return GainSet.of(values)
 
-    async def controller(self) -> Controller:
-        """Return the gains in force.
+    async def put(self, gains: GainSet | None) -> None:
+        """Set the parameters and read them back.
 
-        :raises RelayAutotuneError: if they cannot be read, or make no controller.
+        :param gains: None: leave them as they are, since another node's command cannot be held.
+        :raises RelayAutotuneError: if they are not as they were set, or that is not known.
         """
-        values = await self.read()
-        return controller_of({name: values[target] for name, target in self._mapping.items()})
-
-    async def write(self, gains: Controller) -> dict[str, float]:
-        """Set the parameters, read them back, and undo all if one is not as it was set.
-
-        :param gains: the gains.
-        :return: the values before, by parameter name.
-        :raises RemoteError: if the gains are not in force; then the ones before are.
-        """
-        before = await self.read()
-        wanted = {target: float(getattr(gains, name)) for name, target in self._mapping.items()}
-        await self._put(wanted)
-        found = await self.read()
-        wrong = [
-            f"{name} is {found[name]:g} instead of {value:g}"
-            for name, value in wanted.items()
-            if abs(found[name] - value) > _EQUAL * abs(value)
-        ]
-        if wrong:
-            await self._put(before)
-            raise RemoteError(f"{self.target} did not take the gains: {'; '.join(wrong)}")
-        return before
-
-    async def restore(self, values: Mapping[str, float]) -> None:
-        """Set values that were there before.
-
-        :param values: by parameter name.
-        :raises RemoteError: if the node refuses them.
-        """
-        await self._put(values)
-
-    async def _put(self, values: Mapping[str, float]) -> None:
+        if gains is None:
+            return
         request = SetParametersAtomically.Request(
             parameters=[
                 Parameter(
                     name=name,
-                    value=ParameterValue(
-                        type=ParameterType.PARAMETER_DOUBLE, double_value=float(value)
-                    ),
+                    value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value),
                 )
-                for name, value in values.items()
+                for name, value in gains.values
             ]
         )
-        answer = await self._set.call_async(request)
+        answer = await self._ask(self._set, request)
         if not answer.result.successful:
-            raise RemoteError(f"{self.target} refused the gains: {answer.result.reason}")
+            raise RemoteError(f"{self.name} refused the gains: {answer.result.reason}")
+        found = await self.read()
+        if not found.is_near(gains):
+            raise RemoteError(f"{self.name} did not take the gains: it has {found}, not {gains}")
+
+    async def _ask(self, client: Any, request: Any) -> Any:
+        if not client.service_is_ready():
+            raise RemoteError(f"the node {self.name} is not there, or has no parameter services")
+        answer = client.call_async(request)
+
+        def give_up() -> None:
+            if not answer.done():
+                answer.set_exception(
+                    RemoteError(f"{self.name} did not answer within {TIMEOUT:g} s")
+                )
+
+        timer = self._node.create_timer(
+            TIMEOUT,
+            give_up,
+            callback_group=self._group,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        try:
+            return await answer
+        finally:
+            self._node.destroy_timer(timer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 
 from rclpy.duration import Duration
@@ -10,15 +11,17 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-from relay_autotune.control.gains import Controller
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.control.controller import is_usable
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.remote_gains import RemoteGains
 from relay_autotune.nodes.verifier import NotVerifiable
 
+# A controller that says nothing for so long commands no more [s].
+_SILENCE = 2.0
+
 
 class RemoteLoop:
-    """Apply gains to another node's controller, take them back, and move its set-point.
+    """Hear another node's controller, and move its set-point.
 
     :param node: the node that does.
     :param gains: the other node's parameters.
@@ -29,13 +32,13 @@ class RemoteLoop:
     def __init__(
         self, node: Node, gains: RemoteGains, setpoint: float, disturbed: Callable[[str], None]
     ) -> None:
-        self.target = gains.target
         self.command = math.nan
         """The last command heard [u]; NaN: none."""
         self._gains = gains
-        self._setpoint = setpoint
+        self._heard_at = 0.0
+        self.setpoint = setpoint
+        """The set-point in force [y]; NaN: not known."""
         self._disturbed = disturbed
-        self._before: dict[str, float] | None = None
         self._offset = 0.0
         # What was published comes back by the topic, where others publish, too.
         self._on_the_way: list[float] = []
@@ -53,51 +56,46 @@ class RemoteLoop:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
 
-    async def apply(self, gains: Controller) -> None:
-        """Set gains, all or none, and keep those before.
+    def hear_command(self, command: float) -> None:
+        """Take a command of the other node [u]."""
+        if is_usable(command):
+            self.command = command
+            self._heard_at = time.monotonic()
 
-        :param gains: the gains.
-        :raises RelayAutotuneError: if they are not in force.
+    def why_silent(self) -> str:
+        """Return a sentence if the other node commands no more, else ""."""
+        silent = time.monotonic() - self._heard_at
+        if silent < _SILENCE:
+            return ""
+        return f"no command of {self._gains.name} for {silent:.3g} s"
+
+    def require_ready(self) -> None:
+        """Refuse a loop where it could not be seen what a step of the set-point does.
+
+        :raises NotVerifiable: with the reason.
         """
-        self._before = await self._gains.write(gains)
-
-    async def revert(self) -> tuple[bool, str]:
-        """Bring back the gains before; return whether they are, and a sentence."""
-        if self._before is None:
-            return False, "nothing was applied"
-        try:
-            await self._gains.restore(self._before)
-        except RelayAutotuneError as error:
-            return False, str(error)
-        self._before = None
-        return True, f"{self.target} has its gains of before"
-
-    async def ready(self) -> Controller:
-        """Return the gains in force.
-
-        :raises RelayAutotuneError: if it could not be seen what a step of the set-point does.
-        """
-        topic = self._publisher.topic_name
-        if math.isnan(self._setpoint):
+        topic, target = self._publisher.topic_name, self._gains.name
+        if math.isnan(self.setpoint):
             raise NotVerifiable(
-                f"the set-point of {self.target} is not known: publish it on {topic}, or give "
+                f"the set-point of {target} is not known: publish it on {topic}, or give "
                 "initial_setpoint"
             )
         # One of the subscriptions is the node's own.
         if self._publisher.get_subscription_count() < 2:
             raise NotVerifiable(
-                f"nobody takes a set-point from {topic}: remap it to the topic of {self.target}"
+                f"nobody takes a set-point from {topic}: remap it to the topic of {target}"
             )
         if math.isnan(self.command):
-            raise NotVerifiable(f"no command of {self.target} has been heard")
-        return await self._gains.controller()
+            raise NotVerifiable(f"no command of {target} has been heard")
+        if reason := self.why_silent():
+            raise NotVerifiable(reason)
 
     def move(self, offset: float) -> None:
         """Put a step on the set-point [y]; 0: none."""
         if offset == self._offset:
             return
         self._offset = offset
-        value = self._setpoint + offset
+        value = self.setpoint + offset
         self._on_the_way.append(value)
         self._publisher.publish(Float64(data=value))
 
@@ -112,8 +110,10 @@ class RemoteLoop:
         if message.data in self._on_the_way:
             self._on_the_way.remove(message.data)
             return
-        if math.isnan(message.data):
+        if not is_usable(message.data):
             return
+        changed = message.data != self.setpoint + self._offset
         # It is in force already: there is nothing to go back to.
-        self._setpoint, self._offset = message.data, 0.0
-        self._disturbed(f"another node set the set-point to {message.data:g}")
+        self.setpoint, self._offset = message.data, 0.0
+        if changed:
+            self._disturbed(f"another node set the set-point to {message.data:g}")

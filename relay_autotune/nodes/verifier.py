@@ -34,6 +34,15 @@ _LEAST_BEFORE = 10
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
 _LOOK_EVERY = 0.2
+# So many samples in a row beyond what was predicted are no outliers of the sensor.
+_IN_A_ROW = 2
+# A hole of this part of a step leaves too little of it to judge.
+_LARGEST_HOLE = 0.25
+# On the steady clock: what comes before the first step may take so long [s], and the steps so many
+# times what is planned and so much more [s].
+_PREPARED_WITHIN = 60.0
+_TIMES_PLANNED = 4.0
+_MORE_THAN_PLANNED = 10.0
 
 _Sample = tuple[float, float, float]
 
@@ -88,7 +97,10 @@ class Verifier:
         nothing can.
     :param heights: returns the steps that a request asks for; raises likewise.
     :param move: puts a step on the set-point [y] and one on the command [u], 0: none.
-    :param ended: called with True if all steps passed, and a sentence; returns what to say.
+    :param begin: called before the first step; raises RelayAutotuneError where there shall be
+        none.
+    :param ended: called with True if all steps passed, False if one failed, None without a
+        verdict, and a sentence; returns what to say.
     """
 
     def __init__(
@@ -98,12 +110,14 @@ class Verifier:
         ready: Callable[[], Awaitable[Verifiable]],
         heights: Callable[[Any], list[Step]],
         move: Callable[[float, float], None],
-        ended: Callable[[bool, str], Awaitable[str]],
+        begin: Callable[[], Awaitable[None]],
+        ended: Callable[[bool | None, str], Awaitable[str]],
     ) -> None:
         self._node = node
         self._ready = ready
         self._heights = heights
         self._move = move
+        self._begin = begin
         self._ended = ended
         self._phase = _Phase.IDLE
         self._recent: deque[_Sample] = deque(maxlen=_BEFORE)
@@ -117,6 +131,10 @@ class Verifier:
         self._samples: list[_Sample] = []
         self._rest: Rest
         self._begun = 0.0
+        # On the steady clock: when it has to be over, and when the samples' time last went on.
+        self._until = self._advanced = 0.0
+        self._period = 0.0
+        self._beyond = 0
         self._watch = node.create_timer(
             _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
         )
@@ -157,7 +175,9 @@ class Verifier:
         if self._goal is not None:
             _refuse(goal, NotVerifiable("a verification is running"))
             return
-        self._goal, self._phase = goal, _Phase.PREPARING
+        self._goal, self._phase, self._found = goal, _Phase.PREPARING, []
+        self._until = time.monotonic() + _PREPARED_WITHIN
+        self._watch.reset()
         self._node.executor.create_task(self._prepare, goal)
 
     async def _prepare(self, goal: Any) -> None:
@@ -170,7 +190,7 @@ class Verifier:
             return
         if goal is not self._goal or self._phase is not _Phase.PREPARING:
             return
-        self._tried, self._steps, self._rest = tried, steps, rest
+        self._tried, self._steps, self._rest, self._period = tried, steps, rest, period
 
         def plans() -> list[Plan]:
             return [plan(tried.gains, tried.model, s, period, rest.noise_std) for s in steps]
@@ -182,16 +202,40 @@ class Verifier:
             return
         if isinstance(plans, Exception):
             self._goal, self._phase = None, _Phase.IDLE
+            self._watch.cancel()
             _refuse(goal, plans)
             return
-        self._plans, self._found, self._number = plans, [], 0
+        self._node.executor.create_task(self._begin_steps, goal, plans)
+
+    async def _begin_steps(self, goal: Any, plans: list[Plan]) -> None:
+        try:
+            await self._begin()
+        except RelayAutotuneError as error:
+            self._planned(goal, error)
+            return
+        if goal is not self._goal or self._phase is not _Phase.PREPARING:
+            await self._ended(None, "it ended before its first step")
+            return
+        self._plans, self._number, self._beyond = plans, 0, 0
         self._begun = self._recent[-1][0]
-        self._watch.reset()
+        planned = 2.0 * sum(p.duration for p in plans)
+        self._until = (
+            time.monotonic() + _TIMES_PLANNED * self._pace() * planned + _MORE_THAN_PLANNED
+        )
         self._begin_step()
+
+    def _pace(self) -> float:
+        """Return how long a second of the samples takes here."""
+        ours = self._arrivals[-1] - self._arrivals[0]
+        theirs = self._recent[-1][0] - self._recent[0][0]
+        return ours / theirs if theirs > 0.0 else 1.0
 
     def _at_rest(self, steps: list[Step]) -> tuple[Rest, float]:
         """Return where the loop rests, and its sample period [s]."""
         t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
+        period = float(np.median(np.diff(t)))
+        if not period > 0.0:
+            raise NotVerifiable("the time of the samples stands still: is /clock published?")
         line = np.polyfit(t - t[0], y, 1)
         noise = float(np.std(y - np.polyval(line, t - t[0]), ddof=2))
         drift = abs(float(line[0])) * float(t[-1] - t[0])
@@ -201,7 +245,7 @@ class Verifier:
                 f"the loop is not at rest: the measurement moved by {drift:.3g} over the last "
                 f"{len(self._recent)} samples; wait until it has settled"
             )
-        return Rest(float(y.mean()), float(u.mean()), noise), float(np.median(np.diff(t)))
+        return Rest(float(y.mean()), float(u.mean()), noise), period
 
     def _begin_step(self) -> None:
         self._phase, self._samples = _Phase.STEPPING, []
@@ -218,13 +262,28 @@ class Verifier:
         :param measurement: y.
         :param command: the controller's answer, without the load [u].
         """
+        since = at - self._recent[-1][0] if self._recent else 0.0
+        if since < 0.0:
+            # What came before lies in another time.
+            self._recent.clear()
+            self._arrivals.clear()
+        now = time.monotonic()
+        if since != 0.0:
+            self._advanced = now
         sample = (at, measurement, command)
         self._recent.append(sample)
-        self._arrivals.append(time.monotonic())
+        self._arrivals.append(now)
         if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
             return
-        self._samples.append(sample)
         wanted = self._plans[self._number]
+        hole = max(_SILENT_INTERVALS * self._period, _LARGEST_HOLE * wanted.duration)
+        if since < 0.0:
+            self.interrupt(f"time went backwards, by {-since:.3g} s")
+            return
+        if since > hole:
+            self.interrupt(f"the samples' time went on by {since:.3g} s from one to the next")
+            return
+        self._samples.append(sample)
         over = at - self._samples[0][0] >= wanted.duration
         if self._phase is _Phase.RETURNING:
             # What was found of the step before has come, too.
@@ -232,7 +291,8 @@ class Verifier:
                 self._go_on()
             return
         away = abs(measurement - self._rest.measurement)
-        if away > wanted.runaway:
+        self._beyond = self._beyond + 1 if away > wanted.runaway else 0
+        if self._beyond >= _IN_A_ROW:
             self._end(
                 False,
                 f"the measurement went {away:.3g} away from where it was, more than "
@@ -240,6 +300,12 @@ class Verifier:
             )
         elif over:
             self._return()
+
+    def out_of_range(self, measurement: float) -> None:
+        """Take a measurement beyond what the loop may do [y], which was not answered."""
+        self._beyond += 1
+        if self._phase is _Phase.STEPPING and self._beyond >= _IN_A_ROW:
+            self._end(False, f"the measurement left its range, to {measurement:.6g}")
 
     def _return(self) -> None:
         """Go back to where the loop was, while the step is judged."""
@@ -254,7 +320,7 @@ class Verifier:
         if goal is not self._goal or self._phase is not _Phase.RETURNING:
             return
         if isinstance(message, Exception):
-            self._end(False, f"the step could not be judged: {_said(message)}")
+            self.interrupt(f"the step could not be judged: {_said(message)}")
             return
         self._found.append(message)
         if not message.passed:
@@ -286,32 +352,39 @@ class Verifier:
     def interrupt(self, reason: str) -> None:
         """End it without a verdict [the loop is no longer the controller's]."""
         if self._phase not in (_Phase.IDLE, _Phase.ENDING):
-            self._end(False, reason, verdict=False)
+            self._end(None, reason)
 
     def _look(self) -> None:
+        now = time.monotonic()
+        if now > self._until:
+            self.interrupt("it took far longer than planned on the steady clock")
+            return
+        if self._phase is _Phase.PREPARING or not self._arrivals:
+            return
         arrivals = self._arrivals
         usual = (arrivals[-1] - arrivals[0]) / max(len(arrivals) - 1, 1)
-        silent = time.monotonic() - arrivals[-1]
-        if silent > max(_SILENCE, _SILENT_INTERVALS * usual):
-            self.interrupt(f"no measurement for {silent:.3g} s")
+        patience = max(_SILENCE, _SILENT_INTERVALS * usual)
+        if now - arrivals[-1] > patience:
+            self.interrupt(f"no measurement for {now - arrivals[-1]:.3g} s")
+        elif now - self._advanced > patience:
+            self.interrupt("the time of the samples stands still: is /clock published?")
 
     def _on_cancel(self, goal: Any) -> CancelResponse:
         if self._goal is not None and goal.goal_id == self._goal.goal_id:
             self._node.executor.create_task(self.interrupt, "cancelled")
         return CancelResponse.ACCEPT
 
-    def _end(self, passed: bool, reason: str, *, verdict: bool = True) -> None:
+    def _end(self, passed: bool | None, reason: str) -> None:
         if self._phase is not _Phase.PREPARING:
             self._move(0.0, 0.0)
         self._phase = _Phase.ENDING
         self._watch.cancel()
-        self._node.executor.create_task(self._conclude, passed, reason, verdict)
+        self._node.executor.create_task(self._conclude, passed, reason)
 
-    async def _conclude(self, passed: bool, reason: str, verdict: bool) -> None:
-        if verdict:
-            reason = await self._ended(passed, reason)
+    async def _conclude(self, passed: bool | None, reason: str) -> None:
+        reason = await self._ended(passed, reason)
         goal, self._goal, self._phase = self._goal, None, _Phase.IDLE
-        result = Verify.Result(passed=passed, reason=reason, steps=self._found)
+        result = Verify.Result(passed=passed is True, reason=reason, steps=self._found)
         self._found = []
         conclude(goal, result, succeeded=True)
 

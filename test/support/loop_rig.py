@@ -118,6 +118,9 @@ class Rig:
 
         :param output: what takes the place of its log, a pipe or a terminal; None: nothing does.
         """
+        if executable == "controller_node":
+            # What one test proves is not for the next one.
+            parameters.setdefault("record_directory", str(self.records))
         return self._launch(executable, [_path(executable)], arguments, parameters, output)
 
     def start_command(self, executable: str, *words: str, output: int) -> Process:

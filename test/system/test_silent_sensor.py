@@ -99,6 +99,7 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
         ti=0.4,
         initial_command=1.0,
         initial_setpoint=5.0,
+        verify_step_max=0.5,
     )
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
     models.publish(

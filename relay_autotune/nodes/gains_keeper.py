@@ -1,0 +1,299 @@
+"""The one owner of a controller's gains: puts them in force, and keeps on disk which they are."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.task import Future
+from rclpy.timer import Timer
+
+from relay_autotune.control.gains_history import (
+    GainSet,
+    GainsHistory,
+    HistoryError,
+    Work,
+)
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.nodes.gains_journal import GainsJournal
+from relay_autotune.nodes.lifetime import ServedNode
+
+# A place that did not answer is asked again so often [s].
+_ASK_AGAIN = 1.0
+
+
+class Place(Protocol):
+    """Where gains are in force: this node's controller, or another node's parameters."""
+
+    name: str
+    outlives: bool
+    """True if the gains stay in force when this process ends."""
+
+    async def read(self) -> GainSet | None:
+        """Return the gains in force, None if the command is held."""
+
+    async def put(self, gains: GainSet | None) -> None:
+        """Put gains in force, all or none.
+
+        :param gains: None: hold the command, where that can be done.
+        :raises RelayAutotuneError: if they are not in force, or that is not known.
+        """
+
+    def said(self, gains: GainSet | None) -> str:
+        """Say which gains are in force now, for people."""
+
+
+class GainsKeeper:
+    """Put gains in force, take them back, and mark those that are proven or failed.
+
+    The journal is ahead of what is done: it says what is about to be put in force before that is
+    sent, so that whatever ends the process, the next one knows what to undo.
+
+    :param node: the node.
+    :param place: where the gains are in force.
+    :param journal: where their history is kept.
+    :param given: gains of the node's configuration.
+    :raises RelayAutotuneError: if the journal cannot be read.
+    """
+
+    def __init__(
+        self, node: ServedNode, place: Place, journal: GainsJournal, given: GainSet | None
+    ) -> None:
+        self._node = node
+        self._place = place
+        self._journal = journal
+        self._busy = self._abandoned = False
+        # What the place is still to be brought to, and whether another's gains may be there.
+        self._goal: GainsHistory | None = None
+        self._anothers = True
+        self._timer: Timer | None = None
+        self._reported = ""
+        found = journal.load()
+        if found is None:
+            self.history = GainsHistory.begun(given)
+        elif place.outlives:
+            self.history = found
+            if (goal := found.after_interruption()) is not found:
+                self._goal = goal
+                self._ask_later(0.0)
+        else:
+            self.history = found.after_restart(given)
+        if self._goal is None:
+            self._write(self.history)
+
+    @property
+    def gains(self) -> GainSet | None:
+        """The gains in force, as far as is known."""
+        return self.history.gains
+
+    @property
+    def is_at_work(self) -> bool:
+        """True while gains are being put in force or verified, or are still to be undone."""
+        return self._busy or self.history.work is not Work.NOTHING or self._goal is not None
+
+    # What people ask for.
+
+    async def apply(self, gains: GainSet) -> str:
+        """Put gains in force and return what to say.
+
+        :param gains: all of them.
+        :raises RelayAutotuneError: if they are not; then those before are, as soon as the place
+            answers.
+        """
+        with self._alone():
+            now = self._observed(await self._place.read())
+            wanted = now.apply(gains)
+            await self._save(wanted)
+            self.history = wanted
+            try:
+                await self._place.put(gains)
+            except RelayAutotuneError as error:
+                self._goal, self._anothers = now, False
+                await self._settle()
+                raise type(error)(f"{error}{self._open()}") from error
+            if self._abandoned:
+                raise HistoryError("the node ends: the gains of before are brought back")
+            self.history = wanted.settled()
+            kept = await self._kept(self.history)
+        return f"{self._place.said(gains)}{kept}"
+
+    async def revert(self) -> str:
+        """Go back to the whole set that was in force before, and return what to say.
+
+        :raises RelayAutotuneError: if there is none, or it is not in force.
+        """
+        with self._alone():
+            wanted = self.history.revert()
+            await self._place.put(wanted.gains)
+            self.history = wanted
+            kept = await self._kept(wanted)
+        return f"{self._place.said(wanted.gains)} again{kept}"
+
+    def require_editable(self, gains: GainSet | None) -> None:
+        """Refuse gains that were set by hand.
+
+        :raises RelayAutotuneError: if they failed a verification, or something is being done.
+        """
+        if self._busy:
+            raise HistoryError("gains are being put in force; wait for the end of that")
+        self.history.edit(gains)
+
+    def edited(self, gains: GainSet | None) -> None:
+        """Take what was set by hand and is in force already."""
+        self.history = self.history.edit(gains)
+        self._node.compute(self._writing(self.history), self._wrote)
+
+    # Proof.
+
+    async def begin_verification(self) -> GainSet:
+        """Return the gains that are verified from now on.
+
+        :raises RelayAutotuneError: if there are none, or the journal cannot be written.
+        """
+        with self._alone():
+            wanted = self._observed(await self._place.read()).verify()
+            await self._save(wanted)
+            self.history = wanted
+            assert wanted.gains is not None
+            return wanted.gains
+
+    async def end_verification(self, passed: bool | None) -> str:
+        """Take the verdict, and bring back the gains before where they failed.
+
+        :param passed: None: it ended without a verdict; the gains stay.
+        :return: what to say, "" if there is nothing.
+        """
+        if self.history.work is not Work.VERIFY:
+            return ""
+        if passed is not False:
+            self.history = self.history.passed() if passed else self.history.settled()
+            return await self._kept(self.history)
+        # The gains go first: the journal says already that these are not to be trusted.
+        self._goal, self._anothers = self.history.fail(), False
+        await self._settle()
+        return self._open() or f"; {self._place.said(self.history.gains)} again"
+
+    async def abandon(self) -> None:
+        """Undo what is being done with gains that outlive the process, which is about to end."""
+        goal = self.history.after_interruption()
+        if self._place.outlives and goal is not self.history:
+            self._abandoned = True
+            self._goal, self._anothers = goal, False
+            await self._settle()
+
+    # Within.
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        if self._busy:
+            raise HistoryError("gains are being put in force; wait for the end of that")
+        if self._goal is not None:
+            raise HistoryError(f"gains of before are being brought back{self._open()}")
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+
+    def _observed(self, found: GainSet | None) -> GainsHistory:
+        return self.history if found is None else self.history.observe(found)
+
+    def _open(self) -> str:
+        """Say what is still to be brought back, "" if nothing is."""
+        if self._goal is None:
+            return ""
+        return (
+            f"; {self._place.name} is to get {self._goal.gains} back as soon as it answers"
+            f"{f' ({self._reported})' if self._reported else ''}"
+        )
+
+    async def _settle(self) -> None:
+        """Bring the place to where it is to be; if it does not answer, ask again later."""
+        goal, left = self._goal, self.history.gains
+        if goal is None:
+            return
+        try:
+            if self._anothers and goal.gains is not None and left is not None:
+                found = await self._place.read()
+                if found is not None and not found.is_mixture(goal.gains, left):
+                    self._node.get_logger().error(
+                        f"{self._place.name} has gains of another hand, {found}: they stay"
+                    )
+                    goal = goal.observe(found)
+            await self._place.put(goal.gains)
+        except RelayAutotuneError as error:
+            self._say(str(error))
+            self._ask_later(_ASK_AGAIN)
+            return
+        self.history, self._goal, self._reported = goal, None, ""
+        if kept := await self._kept(goal):
+            self._node.get_logger().error(kept.lstrip("; "))
+
+    def _say(self, problem: str) -> None:
+        if problem != self._reported:
+            self._reported = problem
+            self._node.get_logger().error(f"the gains of before are not in force: {problem}")
+
+    def _ask_later(self, wait: float) -> None:
+        if self._timer is None:
+            self._timer = self._node.create_timer(
+                max(wait, 1e-3), self._ask_again, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            )
+
+    def _ask_again(self) -> None:
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+
+        async def again() -> None:
+            if self._goal is None:
+                return
+            if self._busy:
+                self._ask_later(_ASK_AGAIN)
+                return
+            self._busy = True
+            try:
+                await self._settle()
+            finally:
+                self._busy = False
+            if not self._open():
+                self._node.get_logger().info(f"{self._place.said(self.history.gains)} again")
+
+        self._node.executor.create_task(again)
+
+    # The disk.
+
+    def _writing(self, history: GainsHistory) -> Callable[[], None]:
+        ticket = self._journal.ticket()
+        return lambda: self._journal.save(history, ticket)
+
+    def _write(self, history: GainsHistory) -> None:
+        try:
+            self._writing(history)()
+        except RelayAutotuneError as error:
+            self._node.get_logger().error(str(error))
+
+    def _wrote(self, error: Exception | None) -> None:
+        if error is not None:
+            self._node.get_logger().error(str(error))
+
+    async def _save(self, history: GainsHistory) -> None:
+        """Wait until the disk has a state, while the callbacks go on.
+
+        :raises JournalError: if it has not.
+        """
+        done: Future = Future()
+        self._node.compute(self._writing(history), done.set_result)
+        error = await done
+        if error is not None:
+            raise error
+
+    async def _kept(self, history: GainsHistory) -> str:
+        try:
+            await self._save(history)
+        except RelayAutotuneError as error:
+            return f"; {error}"
+        return ""

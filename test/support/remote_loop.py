@@ -1,0 +1,133 @@
+"""A loop that a node of the test's own controls, whose gains controller_node looks after.
+
+That node shares nothing with the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from loop_rig import LATCHED, RELIABLE, Rig
+from rcl_interfaces.srv import GetParameters
+from rclpy.action import ActionClient
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.msg import PidGains, TransferFunction
+
+PERIOD = 0.02
+PLANT = {
+    "sample_period": PERIOD,
+    "structure": "fopdt",
+    "gain": 2.0,
+    "time_constants": [0.3],
+    "dead_time": 0.1,
+    "operating_point": [5.0, 1.0],
+    "noise_std": 0.002,
+    "seed": 5,
+}
+OTHER = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import Float64
+rclpy.init()
+node = Node("pid_controller")
+for name, value in (("p", 0.3), ("i", 1.0), ("d", 0.0)):
+    node.declare_parameter(f"gains.heater.{name}", value)
+commands = node.create_publisher(Float64, "command", 10)
+integral, wanted = 1.0, 5.0
+def gain(name):
+    return node.get_parameter(f"gains.heater.{name}").value
+def on_setpoint(message):
+    global wanted
+    wanted = message.data
+def on_measurement(message):
+    global integral
+    error = wanted - message.data
+    before, integral = integral, integral + gain("i") * PERIOD * error
+    commands.publish(Float64(data=gain("p") * error + before))
+node.create_subscription(Float64, "setpoint", on_setpoint, 10)
+node.create_subscription(Float64, "measurement", on_measurement, 10)
+rclpy.spin(node)
+"""
+
+
+class Loop:
+    """The other node's loop, and a controller_node that looks after its gains."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.commands = rig.listen("command", Float64, RELIABLE)
+        self.setpoints = rig.listen("setpoint", Float64, RELIABLE)
+        self.models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+        self.gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+        rig.start_python("pid_controller", OTHER.replace("PERIOD", str(PERIOD)))
+        rig.plant(**PLANT)
+        names = ",".join(f"{name}:gains.heater.{name}" for name in "pid")
+        self.controller = rig.start(
+            "controller_node",
+            apply_to="/pid_controller",
+            apply_parameters=names,
+            verify_step_max=0.5,
+        )
+        rig.until(lambda: len(self.commands) > 60, "a closed loop")
+        # The processes find each other one by one.
+        rig.until(self.is_watched, "the controller_node")
+
+    def is_watched(self) -> bool:
+        reason = self.verify()[1].reason
+        return "no model has come" in reason
+
+    def apply(self, p: float, i: float, gain: float) -> None:
+        """Let gains and a model come, and put them in force."""
+        model = TransferFunction(final=True, denominator=[0.3, 1.0], dead_time=0.1)
+        model.numerator = [gain]
+        self.models.publish(model)
+        self.gains.publish(
+            PidGains(final=True, kc=p, ti=p / i, p=p, i=i, b=1.0, experiment_id=f"with {p:g}")
+        )
+        said = f"gains of with {p:g} wait"
+        self.rig.until(lambda: said in self.controller.log, "the gains")
+        applied = self.rig.until(
+            lambda: ((a := self.trigger("apply")).success and a) or None, "the other node"
+        )
+        assert f"gains of with {p:g}: /pid_controller has" in applied.message
+
+    def trigger(self, name: str) -> Any:
+        return self.rig.call(Trigger, f"controller_node/{name}", Trigger.Request())
+
+    def verify(
+        self, during: Callable[[], None] | None = None, **request: float
+    ) -> tuple[int, Any]:
+        """Ask for a proof of a loop at rest; once the set-point has moved, do something."""
+
+        def at_rest() -> tuple[int, Any] | None:
+            status, result = self.ask_for_proof(during, request)
+            # How long a loop takes to settle, a busy machine decides.
+            return None if "the loop is not at rest" in result.reason else (status, result)
+
+        return self.rig.until(at_rest, "a loop at rest")
+
+    def ask_for_proof(
+        self, during: Callable[[], None] | None, request: dict[str, float]
+    ) -> tuple[int, Any]:
+        moved = len(self.setpoints)
+        client = ActionClient(self.rig.node, Verify, "controller_node/verify")
+        self.rig.until(client.server_is_ready, "the action")
+        sent = client.send_goal_async(Verify.Goal(**request))
+        self.rig.until(sent.done, "the goal")
+        answer = sent.result().get_result_async()
+        if during is not None:
+            self.rig.until(lambda: len(self.setpoints) > moved or answer.done(), "the step")
+            if len(self.setpoints) > moved:
+                during()
+        self.rig.until(answer.done, "the result")
+        client.destroy()
+        return answer.result().status, answer.result().result
+
+    def values(self) -> list[float]:
+        request = GetParameters.Request(names=[f"gains.heater.{name}" for name in "pid"])
+        answer = self.rig.call(GetParameters, "pid_controller/get_parameters", request)
+        return [v.double_value for v in answer.values]

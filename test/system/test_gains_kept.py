@@ -1,0 +1,208 @@
+"""Which gains controller_node has in force, whatever comes: in a loop stepped by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+
+import pytest
+from hand_loop import SETPOINT, HandLoop
+from loop_rig import RELIABLE, Rig
+from std_msgs.msg import Float64
+
+GOOD, WILD = (0.5, 0.6), (0.9, 0.3)
+
+
+def test_revert_leads_to_the_last_whole_set_or_is_refused(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    refused = loop.trigger("revert")
+    assert not refused.success
+    assert "no gains before these" in refused.message
+    assert loop.gains_shown() == (0.3, 1.0)
+    assert loop.set(kc=0.7).successful
+    assert loop.set(ti=3.0).successful
+    assert loop.trigger("revert").success
+    assert loop.gains_shown() == (0.3, 1.0)
+    loop.apply(*GOOD, "one")
+    assert loop.trigger("revert").success
+    assert loop.gains_shown() == (0.3, 1.0)
+    assert not loop.trigger("revert").success
+
+
+def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
+    """Their model says a third of the gain that the process has."""
+    loop = HandLoop(rig)
+    assert loop.gains_shown()[0] == 0.0
+    loop.apply(*WILD, "wild", gain=0.7)
+    result = loop.verify(setpoint_step=0.3)
+    assert not result.passed
+    # The first gains ever: nothing was before them.
+    assert "the command is held" in result.reason
+    assert loop.gains_shown()[0] == 0.0
+    assert loop.answer_to(SETPOINT) == loop.answer_to(SETPOINT + 0.4)
+    again = loop.trigger("apply")
+    assert not again.success
+    by_hand = loop.set(kc=WILD[0], ti=WILD[1])
+    assert not by_hand.successful
+    assert "failed their verification" in by_hand.reason
+    # The latched topic offers them to each node that starts.
+    loop.node.signal(signal.SIGTERM)
+    assert loop.node.wait() == 0
+    loop.start(auto_apply=True)
+    rig.until(lambda: "gains of wild refused: these gains failed" in loop.node.log, "the gains")
+    assert loop.gains_shown()[0] == 0.0
+    # Others are taken; a second fail does not bring the first failed set back.
+    loop.offer(0.8, 0.3, "second", gain=0.7)
+    rig.until(lambda: loop.gains_shown() == (0.8, 0.3), "auto_apply")
+    assert not loop.verify(setpoint_step=0.3).passed
+    assert loop.gains_shown()[0] == 0.0
+    assert not loop.trigger("revert").success
+
+
+@pytest.mark.parametrize("moment", ["applied", "verifying"])
+def test_after_a_kill_the_proven_gains_are_in_force(rig: Rig, moment: str) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    loop.apply(*GOOD, "good")
+    result = loop.verify(setpoint_step=0.3)
+    assert result.passed, result.reason
+    loop.apply(*WILD, "wild")
+
+    def kill() -> None:
+        loop.node.signal(signal.SIGKILL)
+        loop.node.wait()
+        raise InterruptedError
+
+    if moment == "verifying":
+        with pytest.raises(InterruptedError):
+            loop.verify(kill, setpoint_step=0.3)
+    else:
+        loop.node.signal(signal.SIGKILL)
+        loop.node.wait()
+    # What was being tried is not taken from the latched topic either.
+    loop.start(auto_apply=moment == "verifying")
+    rig.until(lambda: "gains of wild wait" in loop.node.log, "the latched gains")
+    assert loop.gains_shown() == GOOD
+    assert "starts with kc 0.5" in loop.node.log, loop.node.log
+    # A configuration that was changed counts more.
+    loop.node.signal(signal.SIGTERM)
+    loop.node.wait()
+    loop.start(kc=0.2, auto_apply=False)
+    assert loop.gains_shown() == (0.2, 1.0)
+
+
+def test_a_journal_that_cannot_be_read_or_written(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    journal = rig.records / "gains.controller_node"
+    name = next(rig.records.glob("gains.controller_node*.json"))
+    assert name.name.startswith(journal.name)
+    second = rig.start("controller_node", **loop.parameters)
+    assert second.wait() == 2
+    assert "another process has" in second.log
+    loop.node.signal(signal.SIGTERM)
+    loop.node.wait()
+    assert json.loads(name.read_text())["in_force"]["standing"] == "given"
+    name.write_text("torn")
+    third = rig.start("controller_node", **loop.parameters)
+    assert third.wait() == 2
+    assert "is no journal of gains" in third.log
+    name.unlink()
+    name.with_suffix(".lock").unlink()
+    rig.records.rmdir()
+    rig.records.write_text("no folder")
+    loop.start()
+    assert "cannot be kept in" in loop.node.log
+    loop.offer(*GOOD, "good")
+    applied = loop.trigger("apply")
+    assert not applied.success
+    assert "cannot be kept in" in applied.message
+    assert loop.gains_shown() == (0.3, 1.0)
+
+
+@pytest.mark.parametrize("limits", [(0.0, 5.0), (-math.inf, math.inf)])
+def test_one_wild_sample_is_forgotten(rig: Rig, limits: tuple[float, float]) -> None:
+    low, high = limits
+    wild = [1.7e308, -1.7e308, 1e20, 1e13]
+    if math.isfinite(low):
+        wild += [65535.0, -65535.0]
+    loop = HandLoop(rig, kc=0.3, ti=0.6, command_min=low, command_max=high)
+    loop.step(40)
+    for value in wild:
+        command = loop.answer_to(value)
+        assert low <= command <= high
+        assert math.isfinite(command)
+        loop.step(120)
+        assert loop.command == pytest.approx(1.0, abs=0.02), value
+
+
+def test_a_range_of_the_measurement_holds_the_command(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=0.6, measurement_min=0.0, measurement_max=10.0)
+    loop.step(40)
+    assert loop.answer_to(65535.0) == loop.command
+    assert loop.answer_to(-1.0) == loop.command
+    assert "outside of its range" in loop.node.log
+    setpoints = rig.node.create_publisher(Float64, "setpoint", RELIABLE)
+    rig.until(lambda: setpoints.get_subscription_count() > 0, "the controller")
+    setpoints.publish(Float64(data=1e300))
+    rig.until(lambda: "the set-point 1e+300 is outside" in loop.node.log, "the refusal")
+    loop.step(40)
+    assert loop.command == pytest.approx(1.0, abs=0.02)
+
+
+def test_gains_out_of_bounds_are_left_alone(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0, kc_max=2.0, ti_min=0.1, auto_apply=True)
+    for kc, ti in ((-1e300, 1.0), (3.0, 1.0), (0.5, 0.01), (math.nan, 1.0), (0.5, math.inf)):
+        loop.publish(kc, ti, f"{kc:g}_{ti:g}")
+    rig.until(lambda: "gains of -1e+300_1 refused" in loop.node.log, "the refusal")
+    loop.offer(*GOOD, "good")
+    rig.until(lambda: loop.gains_shown() == GOOD, "those within the bounds")
+    # Nothing was in force between.
+    assert loop.trigger("revert").success
+    assert loop.gains_shown() == (0.3, 1.0)
+    assert not loop.set(kc=-2.5).successful
+
+
+def test_verify_is_bounded_and_ends_without_a_verdict_where_time_is_wrong(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    loop.apply(*GOOD, "good")
+    assert "verify_step_max allows 1" in loop.verify(setpoint_step=1e6).reason
+    assert "verify_step_max allows 1" in loop.verify(setpoint_step=-1.01).reason
+    for later, reason in (
+        (0.0, "the time of the samples stands still"),
+        (-3600.0, "time went backwards, by 3.6e+03 s"),
+        (1e6, "time went on by 1e+06 s"),
+    ):
+        result = loop.verify(lambda later=later: loop.step(later=later), setpoint_step=0.3)
+        assert not result.passed
+        assert reason in result.reason
+        # Nothing was found out about them.
+        assert loop.gains_shown() == GOOD
+    # Before the step as well.
+    result = loop.verify(setpoint_step=0.3)
+    assert result.passed, result.reason
+
+
+def test_a_set_point_of_the_operator_is_no_failure_of_the_gains(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    loop.apply(*GOOD, "good")
+    setpoints = rig.node.create_publisher(Float64, "setpoint", RELIABLE)
+    rig.until(lambda: setpoints.get_subscription_count() > 0, "the controller")
+
+    def same() -> None:
+        setpoints.publish(Float64(data=SETPOINT))
+        loop.step()
+
+    # One that says again what is in force changes nothing.
+    assert loop.verify(same, setpoint_step=0.3).passed
+
+    def other() -> None:
+        setpoints.publish(Float64(data=5.6))
+        loop.step()
+
+    result = loop.verify(other, setpoint_step=0.3)
+    assert not result.passed
+    assert "the set-point was changed to 5.6" in result.reason
+    assert loop.gains_shown() == GOOD
+    loop.step(120)
+    # It stays in force: a deviation of 0.6 takes 0.3 of command.
+    assert loop.command == pytest.approx(1.3, abs=0.02)
