@@ -97,8 +97,7 @@ class Verifier:
         nothing can.
     :param heights: returns the steps that a request asks for; raises likewise.
     :param move: puts a step on the set-point [y] and one on the command [u], 0: none.
-    :param begin: called before the first step; raises RelayAutotuneError where there shall be
-        none.
+    :param begin: called once a request can be tried; raises RelayAutotuneError where it shall not.
     :param ended: called with True if all steps passed, False if one failed, None without a
         verdict, and a sentence; returns what to say.
     """
@@ -184,11 +183,13 @@ class Verifier:
         try:
             tried = await self._ready()
             steps = self._heights(goal.request)
+            await self._begin()
             rest, period = self._at_rest(steps)
         except RelayAutotuneError as error:
-            self._planned(goal, error)
+            await self._leave(goal, error)
             return
         if goal is not self._goal or self._phase is not _Phase.PREPARING:
+            await self._ended(None, "it ended before its first step")
             return
         self._tried, self._steps, self._rest, self._period = tried, steps, rest, period
 
@@ -197,24 +198,21 @@ class Verifier:
 
         self._node.compute(plans, partial(self._planned, goal))
 
+    async def _leave(self, goal: Any, error: Exception) -> None:
+        """Refuse a goal whose first step was not made."""
+        if goal is not self._goal or self._phase is not _Phase.PREPARING:
+            return
+        self._phase = _Phase.ENDING
+        self._watch.cancel()
+        await self._ended(None, _said(error))
+        self._goal, self._phase = None, _Phase.IDLE
+        _refuse(goal, error)
+
     def _planned(self, goal: Any, plans: list[Plan] | Exception) -> None:
         if goal is not self._goal or self._phase is not _Phase.PREPARING:
             return
         if isinstance(plans, Exception):
-            self._goal, self._phase = None, _Phase.IDLE
-            self._watch.cancel()
-            _refuse(goal, plans)
-            return
-        self._node.executor.create_task(self._begin_steps, goal, plans)
-
-    async def _begin_steps(self, goal: Any, plans: list[Plan]) -> None:
-        try:
-            await self._begin()
-        except RelayAutotuneError as error:
-            self._planned(goal, error)
-            return
-        if goal is not self._goal or self._phase is not _Phase.PREPARING:
-            await self._ended(None, "it ended before its first step")
+            self._node.executor.create_task(self._leave, goal, plans)
             return
         self._plans, self._number, self._beyond = plans, 0, 0
         self._begun = self._recent[-1][0]

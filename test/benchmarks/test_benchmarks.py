@@ -19,6 +19,7 @@ QUICK = {
     "lockstep": ("--quick",),
     "latency": ("--quick",),
     "fault_table": ("--quick",),
+    "controller_kills": ("--quick",),
     "simulated_experiments": ("--quick",),
     "random_histories": ("--quick",),
     "endurance": ("--quick",),

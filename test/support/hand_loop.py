@@ -20,6 +20,7 @@ from relay_autotune.process.transfer_function import TransferFunction as Process
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
+VERDICT = PidGains.VERDICT_TRUSTED
 PERIOD = 0.05
 SETPOINT, COMMAND = 5.0, 1.0
 
@@ -59,7 +60,7 @@ class HandLoop:
         """Start the node, with other parameters if given, and wait until it answers."""
         self.parameters |= parameters
         self.node = self.rig.start("controller_node", **self.parameters)
-        self.rig.until(lambda: "ready:" in self.node.log, "the controller")
+        self.rig.until(lambda: "ready:" in self.node.log, "the controller", 60.0)
         before = len(self.commands)
 
         def answered() -> bool:
@@ -95,10 +96,13 @@ class HandLoop:
     def publish(self, kc: float, ti: float, name: str, gain: float = 2.0) -> None:
         """Publish a record, a model and gains of an experiment."""
         self.experiments.publish(experiment_of(Process.fopdt(gain, 0.5, 0.2), name))
-        model = TransferFunction(final=True, denominator=[0.5, 1.0], dead_time=0.2)
+        model = TransferFunction(
+            final=True, verdict=VERDICT, denominator=[0.5, 1.0], dead_time=0.2
+        )
         model.numerator, model.experiment_id = [gain], name
         self.models.publish(model)
-        self.gains.publish(PidGains(final=True, kc=kc, ti=ti, b=1.0, experiment_id=name))
+        gains = PidGains(final=True, verdict=VERDICT, kc=kc, ti=ti, b=1.0, experiment_id=name)
+        self.gains.publish(gains)
 
     def offer(self, kc: float, ti: float, name: str, gain: float = 2.0) -> None:
         """Publish them and wait until they have come."""

@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
+VERDICT = PidGains.VERDICT_TRUSTED
 PERIOD = 0.02
 PLANT = {
     "sample_period": PERIOD,
@@ -65,16 +66,21 @@ class Loop:
         self.gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
         rig.start_python("pid_controller", OTHER.replace("PERIOD", str(PERIOD)))
         rig.plant(**PLANT)
+        self.start()
+        rig.until(lambda: len(self.commands) > 60, "a closed loop")
+        # The processes find each other one by one.
+        rig.until(self.is_watched, "the controller_node")
+
+    def start(self) -> None:
+        """Start the controller_node, and wait until it says that it is ready."""
         names = ",".join(f"{name}:gains.heater.{name}" for name in "pid")
-        self.controller = rig.start(
+        self.controller = self.rig.start(
             "controller_node",
             apply_to="/pid_controller",
             apply_parameters=names,
             verify_step_max=0.5,
         )
-        rig.until(lambda: len(self.commands) > 60, "a closed loop")
-        # The processes find each other one by one.
-        rig.until(self.is_watched, "the controller_node")
+        self.rig.until(lambda: "ready:" in self.controller.log, "the controller_node", 60.0)
 
     def is_watched(self) -> bool:
         reason = self.verify()[1].reason
@@ -82,11 +88,15 @@ class Loop:
 
     def apply(self, p: float, i: float, gain: float) -> None:
         """Let gains and a model come, and put them in force."""
-        model = TransferFunction(final=True, denominator=[0.3, 1.0], dead_time=0.1)
+        model = TransferFunction(
+            final=True, verdict=VERDICT, denominator=[0.3, 1.0], dead_time=0.1
+        )
         model.numerator = [gain]
         self.models.publish(model)
         self.gains.publish(
-            PidGains(final=True, kc=p, ti=p / i, p=p, i=i, b=1.0, experiment_id=f"with {p:g}")
+            PidGains(
+                final=True, verdict=VERDICT, kc=p, ti=p / i, b=1.0, experiment_id=f"with {p:g}"
+            )
         )
         said = f"gains of with {p:g} wait"
         self.rig.until(lambda: said in self.controller.log, "the gains")

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from loop_rig import Rig
 from rclpy.action import ActionClient
-from remote_loop import Loop
+from remote_loop import VERDICT, Loop
 from std_msgs.msg import Float64
 
 from relay_autotune_msgs.action import Verify
@@ -25,7 +25,7 @@ def target_of(loop: Loop) -> Any:
 
 
 def offer(loop: Loop, name: str, **gains: float) -> None:
-    loop.gains.publish(PidGains(final=True, b=1.0, experiment_id=name, **gains))
+    loop.gains.publish(PidGains(final=True, verdict=VERDICT, b=1.0, experiment_id=name, **gains))
     loop.rig.until(lambda: f"gains of {name}" in loop.controller.log, "the gains")
 
 
@@ -102,7 +102,8 @@ def test_the_end_of_the_process_in_a_verification_brings_the_gains_back(
     setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
     rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
     setpoint.publish(Float64(data=5.0))
-    model = TransferFunction(final=True, numerator=[2.0], denominator=[0.3, 1.0], dead_time=0.1)
+    model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
+    model.numerator, model.denominator = [2.0], [0.3, 1.0]
     loop.models.publish(model)
     offer(loop, "tried", kc=0.5, ti=0.3125)
     assert loop.trigger("apply").success
@@ -115,10 +116,7 @@ def test_the_end_of_the_process_in_a_verification_brings_the_gains_back(
         rig.until(lambda: [m.data for m in loop.setpoints[-2:]] == [5.5, 5.0], "the set-point")
     else:
         assert loop.values() == [0.5, 1.6, 0.0]
-        names = ",".join(f"{name}:gains.heater.{name}" for name in "pid")
-        loop.controller = rig.start(
-            "controller_node", apply_to="/pid_controller", apply_parameters=names
-        )
+        loop.start()
         rig.until(lambda: loop.values() == BEFORE, "the gains of before")
         rig.until(lambda: "gains of tried wait" in loop.controller.log, "the latched gains")
     assert loop.values() == BEFORE

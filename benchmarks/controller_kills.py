@@ -1,0 +1,227 @@
+"""Kills of controller_node at random moments of apply and verify, and which gains follow.
+
+Usage, after `. ./env.sh`:
+
+    python3 benchmarks/controller_kills.py [--runs 200] [--minutes 60] [--quick]
+
+Each run offers other gains, calls ~/apply and, where that has answered, ~/verify, kills the node
+with SIGKILL at a random moment, starts it again and looks at the gains: those of this node in a
+loop that is stepped by hand (see test/support/hand_loop.py), and those of another node in a loop
+in real time (test/support/remote_loop.py). The gains on trial would fail, so that only those of
+before are right. Half of the runs are of each kind, at the same time. Exit status 1 if other gains
+are in force.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+from markdown import table
+from rclpy.action import ActionClient
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+# The rig and the loops are those of the tests.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+
+from hand_loop import HandLoop
+from loop_rig import Rig
+from remote_loop import VERDICT, Loop
+from ros_domain import free_domain
+
+from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.msg import PidGains, TransferFunction
+
+RUNS = 200
+# Kills come at any moment from the call of ~/apply on until so much later [s].
+WITHIN = 2.5
+PHASES = ("apply", "between", "verify", "after it")
+
+
+@dataclass(frozen=True)
+class Kill:
+    """A kill, and what came of it.
+
+    :param kind: whose gains: ``own`` or ``another node's``.
+    :param phase: what had been asked for and had not been answered.
+    :param seconds: from the start of the next process until the gains were seen in force.
+    :param problem: which gains were in force where they must not; empty: none.
+    """
+
+    kind: str
+    phase: str
+    seconds: float
+    problem: str
+
+
+class Course:
+    """Apply and verify, as far as they come until a moment.
+
+    :param rig: the rig.
+    :param go_on: lets the loop go on for a moment.
+    """
+
+    def __init__(self, rig: Rig, go_on: Callable[[], Any]) -> None:
+        self.rig = rig
+        self.go_on = go_on
+        self.apply = rig.node.create_client(Trigger, "controller_node/apply")
+        self.verify = ActionClient(rig.node, Verify, "controller_node/verify")
+
+    def until(self, moment: float, height: float) -> str:
+        """Call ~/apply, then ~/verify, and return what was being done at a moment."""
+        self.rig.until(lambda: self.apply.service_is_ready(), "the service")
+        self.rig.until(self.verify.server_is_ready, "the action")
+        deadline = time.monotonic() + moment
+        applied, sent, answer = self.apply.call_async(Trigger.Request()), None, None
+        while time.monotonic() < deadline:
+            self.go_on()
+            if sent is None and applied.done():
+                assert applied.result().success, applied.result().message
+                sent = self.verify.send_goal_async(Verify.Goal(setpoint_step=height))
+            elif sent is not None and sent.done() and answer is None:
+                answer = sent.result().get_result_async()
+        if not applied.done():
+            return "apply"
+        if sent is None or not sent.done():
+            return "between"
+        return "after it" if answer is not None and answer.done() else "verify"
+
+
+@contextmanager
+def rig_of_its_own() -> Iterator[Rig]:
+    """Yield a rig in a domain that nobody else uses."""
+    with free_domain() as domain, tempfile.TemporaryDirectory() as folder:
+        rig = Rig(domain, Path(folder))
+        try:
+            yield rig
+        finally:
+            rig.close()
+
+
+def own(runs: int, deadline: float) -> list[Kill]:
+    """Kill a node that controls: it must start with the gains that it had proven."""
+    found: list[Kill] = []
+    with rig_of_its_own() as rig:
+        loop = HandLoop(rig, kc=0.3, ti=1.0)
+        loop.apply(0.5, 0.6, "proven")
+        result = loop.verify(setpoint_step=0.3)
+        assert result.passed, result.reason
+        course = Course(rig, loop.step)
+        for count in range(runs):
+            if time.monotonic() > deadline:
+                break
+            random = Random(f"own {count}")
+            loop.step(120)
+            # For a process with a third of the gain that it has.
+            loop.offer(0.9 + 1e-4 * count, 0.3, f"tried {count}", gain=0.7)
+            phase = course.until(random.uniform(0.0, WITHIN), 0.3)
+            loop.node.signal(signal.SIGKILL)
+            loop.node.wait()
+            begun = time.monotonic()
+            loop.start()
+            kc, ti = loop.gains_shown()
+            right = (kc, ti) == (0.5, 0.6)
+            taken = time.monotonic() - begun
+            found.append(Kill("own", phase, taken, "" if right else f"kc {kc}, ti {ti}"))
+    return found
+
+
+def another(runs: int, deadline: float) -> list[Kill]:
+    """Kill a node that looks after another one's gains: that one must get back what it had."""
+    found: list[Kill] = []
+    with rig_of_its_own() as rig:
+        loop = Loop(rig)
+        before = loop.values()
+        setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
+        course = Course(rig, lambda: rig.executor.spin_once(timeout_sec=0.01))
+        model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
+        model.numerator, model.denominator = [0.6], [0.3, 1.0]
+        loop.models.publish(model)
+        for count in range(runs):
+            if time.monotonic() > deadline:
+                break
+            random = Random(f"another {count}")
+            rig.until(lambda: setpoint.get_subscription_count() >= 3, "both controllers")
+            setpoint.publish(Float64(data=5.0))
+            name = f"tried {count}"
+            kc = 0.8 + 1e-4 * count
+            gains = PidGains(final=True, verdict=VERDICT, kc=kc, ti=0.3, b=1.0)
+            gains.experiment_id = name
+            loop.gains.publish(gains)
+            rig.until(lambda name=name: f"gains of {name} wait" in loop.controller.log, name)
+            rig.run_for(2.0)
+            phase = course.until(random.uniform(0.0, WITHIN), 0.5)
+            loop.controller.signal(signal.SIGKILL)
+            loop.controller.wait()
+            begun = time.monotonic()
+            loop.start()
+            # Gains that were applied to the end, and not being verified, stay.
+            allowed = [before, [kc, kc / 0.3, 0.0]] if phase == "between" else [before]
+            problem = ""
+            try:
+                rig.until(lambda right=allowed: loop.values() in right, "the gains of before")
+            except AssertionError:
+                problem = str(loop.values())
+            found.append(Kill("another node's", phase, time.monotonic() - begun, problem))
+            if loop.values() != before:
+                loop.trigger("revert")
+    return found
+
+
+def end_in_order() -> None:
+    """Let a worker that is ended end the processes that it has started."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+
+
+def rows(kills: list[Kill]) -> list[tuple[object, ...]]:
+    """Return a row of the table for each kind of gains and moment."""
+    found = []
+    for kind in dict.fromkeys(kill.kind for kill in kills):
+        for phase in PHASES:
+            some = [kill for kill in kills if (kill.kind, kill.phase) == (kind, phase)]
+            if some:
+                times = [kill.seconds for kill in some]
+                wrong = sum(1 for kill in some if kill.problem)
+                shown = (f"{np.median(times):.1f}", f"{max(times):.1f}")
+                found.append((kind, phase, len(some), wrong, *shown))
+    return found
+
+
+def main() -> int:
+    """Kill and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=RUNS, help="kills, of both kinds together")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
+    parser.add_argument("--quick", action="store_true", help="two kills of each kind")
+    asked = parser.parse_args()
+    runs = 2 if asked.quick else asked.runs // 2
+    deadline = time.monotonic() + 60.0 * asked.minutes
+    with multiprocessing.get_context("spawn").Pool(2, end_in_order) as pool:
+        parts = [pool.apply_async(work, (runs, deadline)) for work in (own, another)]
+        kills = [kill for part in parts for kill in part.get()]
+    headings = (
+        *("gains", "killed in", "kills", "other gains than before"),
+        *("start to gains, median [s]", "longest [s]"),
+    )
+    print(table(headings, rows(kills)))
+    for kill in kills:
+        if kill.problem:
+            print(f"{kill.kind}, {kill.phase}: {kill.problem}", file=sys.stderr)
+    return 1 if any(kill.problem for kill in kills) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
