@@ -206,7 +206,6 @@ rclpy.spin(node)
         return [v.double_value for v in answer.values]
 
     assert values() == [1.0, 1.0, 1.0]
-<<<<<<< HEAD
     gains.publish(
         PidGains(
             final=True,
@@ -220,16 +219,12 @@ rclpy.spin(node)
             experiment_id="one",
         )
     )
-=======
-    gains.publish(PidGains(final=True, kc=2.0, ti=4.0, td=0.125, experiment_id="one"))
->>>>>>> e68e680 (Start controller_node with proven gains, and keep failed ones out for good)
     rig.until(lambda: "gains of one wait" in controller.log, "the gains")
     applied = rig.until(
         lambda: ((a := trigger(rig, "apply")).success and a) or None, "the other node"
     )
     assert "gains of one: /pid_controller has" in applied.message
     assert values() == [2.0, 0.5, 0.25]
-<<<<<<< HEAD
     gains.publish(
         PidGains(
             final=True,
@@ -242,9 +237,6 @@ rclpy.spin(node)
             experiment_id="two",
         )
     )
-=======
-    gains.publish(PidGains(final=True, kc=200.0, ti=4.0, experiment_id="two"))
->>>>>>> e68e680 (Start controller_node with proven gains, and keep failed ones out for good)
     rig.until(lambda: "gains of two wait" in controller.log, "the gains")
     refused = trigger(rig, "apply")
     assert not refused.success
