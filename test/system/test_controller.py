@@ -11,8 +11,9 @@ from action_msgs.msg import GoalStatus
 from loop_rig import LATCHED, RELIABLE, Rig
 from made_experiments import experiment_of
 from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import GetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
@@ -175,6 +176,42 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     assert parameters_of(rig) == [0.3, 0.8]
     # Without gains before these there is nothing left to go back to twice.
     assert len(result.steps) <= 1
+
+
+def test_doubtful_gains_are_never_applied_by_themselves(rig: Rig) -> None:
+    controller = rig.start("controller_node", **CONTROLLER, auto_apply=True)
+    experiments = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
+    models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+    gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+
+    def publish(name: str, verdict: int, kc: float) -> None:
+        experiments.publish(experiment_of(PROCESS, name))
+        model = TransferFunction(
+            final=True, numerator=[0.9], denominator=[0.8, 1.0], dead_time=0.4
+        )
+        model.experiment_id, model.verdict = name, verdict
+        models.publish(model)
+        found = PidGains(final=True, kc=kc, ti=0.8, b=1.0, experiment_id=name)
+        found.verdict, found.verdict_reason = verdict, "the cycles differ: look at the valve"
+        gains.publish(found)
+
+    publish("doubtful", PidGains.VERDICT_DOUBTFUL, 0.5)
+    rig.until(lambda: "gains of doubtful wait" in controller.log, "the doubtful gains")
+    refused = trigger(rig, "apply")
+    assert not refused.success
+    assert "the cycles differ: look at the valve" in refused.message
+    assert "accept_doubtful" in refused.message
+    # Those that are trusted are applied, so that the ones before would have been, too.
+    publish("trusted", PidGains.VERDICT_TRUSTED, 0.6)
+    rig.until(lambda: parameters_of(rig) == [0.6, 0.8], "the trusted gains")
+    publish("again", PidGains.VERDICT_DOUBTFUL, 0.5)
+    rig.until(lambda: "gains of again wait" in controller.log, "the doubtful gains")
+    assert parameters_of(rig) == [0.6, 0.8]
+    told = Parameter("accept_doubtful", value=True).to_parameter_msg()
+    request = SetParameters.Request(parameters=[told])
+    assert rig.call(SetParameters, "controller_node/set_parameters", request).results[0].successful
+    assert trigger(rig, "apply").success
+    assert parameters_of(rig) == [0.5, 0.8]
 
 
 def test_gains_go_to_another_node_all_or_none(rig: Rig) -> None:
