@@ -2,6 +2,8 @@
 # make demo    tune a simulated loop over real DDS; leaves demo_output/
 # make test    lint, type check, and the tests in both environments
 # make lint    ruff and mypy alone
+# make test-nightly   the tests that take long and prove little more
+# make release lay the two packages side by side in release/, for tools that look there
 # make docs    build the user guide as a web site in docs/_build/html
 # make clean   remove everything that the above have made
 
@@ -11,7 +13,7 @@ SOURCES = setup.py docs/conf.py launch relay_autotune test tools $(wildcard bags
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 
-.PHONY: setup demo test test-core test-oldest test-system test-rest lint docs clean
+.PHONY: setup demo test test-nightly test-core test-oldest test-system test-rest lint docs release clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
@@ -39,6 +41,9 @@ test-oldest:
 	@$(PYTHON) tools/prepare.py oldest
 	@if [ -d .venv-oldest ]; then .venv-oldest/bin/python -m pytest -q test/core; fi
 
+test-nightly: setup
+	@$(ENTER) && python3 -m pytest -q -m nightly
+
 lint: setup
 	@$(ENTER) && ruff check $(SOURCES)
 	@$(ENTER) && ruff format --check $(SOURCES)
@@ -48,6 +53,9 @@ docs:
 	@$(PYTHON) tools/prepare.py docs
 	@$(PYTHON) tools/build_docs.py
 
+release:
+	@rm -rf release && $(PYTHON) tools/release_tree.py release
+
 clean:
-	rm -rf .venv .venv-* build install log demo_output docs/_build .hypothesis .*_cache *.egg-info
+	rm -rf .venv .venv-* build install log demo_output release docs/_build .hypothesis .*_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

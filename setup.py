@@ -18,7 +18,7 @@ setup(
     description="Relay-feedback autotuner for ROS 2",
     license="Apache-2.0",
     maintainer="relay_autotune maintainers",
-    maintainer_email="maintainers@relay-autotune.example",
+    maintainer_email="relay-autotune@users.noreply.github.com",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed", "report/templates/*"]},
     data_files=[
@@ -32,6 +32,7 @@ setup(
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
     extras_require={
         "fleet": ["distributed", "pyarrow"],
+        "idl": ["rosbags"],
         "report": ["jinja2", "matplotlib"],
         "test": ["control", "hypothesis", "pytest"],
     },

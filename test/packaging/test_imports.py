@@ -1,0 +1,91 @@
+"""Which package of the code may import which: downwards only."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+# From the ground up. A package imports itself and those on floors below; two on one floor do not
+# know each other.
+FLOORS = (
+    {"errors", "threads"},
+    {"quantities", "registry", "confidence"},
+    {"record"},
+    {"process"},
+    {"experiment"},
+    {"identification"},
+    {"control"},
+    {"tuning"},
+    {"analysis"},
+    {"exchange"},
+    {"bag", "report"},
+    {"nodes"},
+    {"cli"},
+)
+FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in names}
+# What brings ROS in; all else runs without it.
+NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "control",
+           "tuning", "analysis", "exchange")  # fmt: skip
+FOREIGN = {"numpy", "scipy"}
+
+
+def package_of(module: str) -> str:
+    return module.split(".")[1] if "." in module else "__init__"
+
+
+def imports_of(file: Path):
+    """Yield the modules that a file imports, with whether that happens when it is loaded."""
+    tree = ast.parse(file.read_text())
+    later = set()
+    for node in ast.walk(tree):
+        checking = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if checking or isinstance(node, ast.FunctionDef):
+            later |= set(ast.walk(node))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node not in later) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module == "relay_autotune":
+            yield from ((f"relay_autotune.{a.name}", node not in later) for a in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module, node not in later
+
+
+def files_of(package: str) -> list[Path]:
+    folder = ROOT / "relay_autotune" / package
+    return sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
+
+
+def test_every_package_has_its_floor():
+    found = {
+        path.stem
+        for path in (ROOT / "relay_autotune").iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").is_file()
+    }
+    assert found - {"__init__", "start"} == set(FLOOR_OF)
+
+
+@pytest.mark.parametrize("package", FLOOR_OF)
+def test_a_package_imports_downwards_only(package):
+    upwards = [
+        f"{file.relative_to(ROOT)} imports {module}"
+        for file in files_of(package)
+        for module, at_load in imports_of(file)
+        if at_load
+        and module.startswith("relay_autotune.")
+        and package_of(module) != package
+        and FLOOR_OF[package_of(module)] >= FLOOR_OF[package]
+    ]
+    assert upwards == []
+
+
+@pytest.mark.parametrize("package", NUMERIC)
+def test_the_numeric_core_knows_no_ros_and_no_files(package):
+    foreign = {
+        module.partition(".")[0]
+        for file in files_of(package)
+        for module, at_load in imports_of(file)
+        if at_load
+    }
+    assert foreign - {"relay_autotune", *sys.stdlib_module_names} <= FOREIGN
