@@ -39,11 +39,11 @@ from processes import true_point
 from relay_autotune.analysis import analyse
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, Finding
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.identification.running_fit import RunningFit, Task
 from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import FloatArray, Record, RelaySettings
+from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.tuning import DesignOptions, analyse_loop
 
 RECORDS = 50

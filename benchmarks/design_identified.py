@@ -23,11 +23,11 @@ import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import identify
+from relay_autotune.loop.margins import frequencies, sensitivity_peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.tuning import ensemble, is_stable
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.loop.margins import frequencies, sensitivity_peaks
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask

@@ -21,12 +21,12 @@ from markdown import table, three
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.loop.margins import frequencies, margins, sensitivity_peaks
+from relay_autotune.loop.responses import step_figures
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning import RULES, Controller, is_stable
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.loop.margins import frequencies, margins, sensitivity_peaks
-from relay_autotune.tuning.loop.responses import step_figures
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask

@@ -21,6 +21,7 @@ from relay_autotune import threads  # noqa: F401  before numpy
 from markdown import table, three
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.control_law import ControlLaw
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import (
     RULES,
@@ -34,7 +35,6 @@ from relay_autotune.tuning import (
 )
 from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator
 from relay_autotune.tuning.forms import SeriesForm
-from relay_autotune.tuning.loop.control_law import ControlLaw
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
 

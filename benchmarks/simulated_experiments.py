@@ -31,10 +31,10 @@ from simulated_summary import summary
 import relay_autotune
 from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.identification import Known
+from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome
 from relay_autotune.tuning import DesignOptions, Gains
-from relay_autotune.tuning.loop.analysis import frequencies, is_stable, sensitivity_peaks
 
 EXPERIMENTS = 10_000
 QUICK = 4

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from benchmarks.markdown import table
 from relay_autotune.analysis import analyse
 from relay_autotune.identification.judgement.table import CHECKS
+from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record
-from relay_autotune.tuning.loop.analysis import ms_on
 from relay_autotune.verdict import Result, Verdict
 
 FloatArray = NDArray[np.float64]

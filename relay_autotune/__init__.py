@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from relay_autotune.experiment.experiment import RelayExperiment
     from relay_autotune.experiment.parameters import ExperimentParameters
     from relay_autotune.identification import METHODS, Identification, Known, identify
+    from relay_autotune.loop.closed_loop import simulate_closed_loop
     from relay_autotune.process.structures import STRUCTURES
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.process.ultimate import ultimate_point
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
     from relay_autotune.report import draw, write_report
     from relay_autotune.tuning import RULES, Controller, Gains, tune
-    from relay_autotune.tuning.loop.closed_loop import simulate_closed_loop
 
 _HOMES = {
     "analysis": ("Analysis", "analyse"),
@@ -47,7 +47,7 @@ _HOMES = {
     "experiment.parameters": ("ExperimentParameters",),
     "report": ("draw", "write_report"),
     "tuning": ("RULES", "Controller", "Gains", "tune"),
-    "tuning.loop.closed_loop": ("simulate_closed_loop",),
+    "loop.closed_loop": ("simulate_closed_loop",),
     "process.ultimate": ("ultimate_point",),
     "process.virtual_process": ("Disturbances", "VirtualProcess"),
 }

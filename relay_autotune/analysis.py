@@ -26,6 +26,7 @@ from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.quality import is_far_off
 from relay_autotune.identification.judgement.table import LOOP_CHECKS, MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING
+from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
@@ -40,7 +41,6 @@ from relay_autotune.tuning import (
     ensemble,
     rule_named,
 )
-from relay_autotune.tuning.loop.analysis import ms_on
 from relay_autotune.tuning.prediction import PredictedMs, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.exchange.text import digits
+from relay_autotune.text import digits
 
 if TYPE_CHECKING:
     from relay_autotune.identification.judgement.evidence import Evidence

@@ -19,12 +19,12 @@ from relay_autotune.bag.reader import read_experiments
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.document import document, model_fields, to_json
-from relay_autotune.exchange.text import digits, process_text
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import case_of
+from relay_autotune.text import digits, process_text
 
 TRUTH = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PERIOD = 0.1

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from relay_autotune.control.gains import NUMBERS, Gains
 from relay_autotune.errors import SelectionError
+from relay_autotune.loop.gains import NUMBERS, Gains
 
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z_]\w*\Z")

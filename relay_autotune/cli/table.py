@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.exchange.text import date_text, digits, process_text
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
+from relay_autotune.text import date_text, digits, process_text
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import TuningError
-from relay_autotune.exchange.text import digits, process_text
+from relay_autotune.text import digits, process_text
 from relay_autotune.tuning.forms import series_form
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import Any
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.exchange.messages import transfer_function_from_message
-from relay_autotune.exchange.text import digits, process_text
+from relay_autotune.text import digits, process_text
 from relay_autotune.verdict import Verdict
 
 # By the constants of Tune.Feedback and RelayExperiment.

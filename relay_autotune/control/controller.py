@@ -1,7 +1,7 @@
 r"""A PI or PID controller as it runs on a loop: from sample to sample, by hand or by itself.
 
-The law is that of :class:`~relay_autotune.control.gains.Controller`, sample by sample as in
-:class:`~relay_autotune.control.sampled.PidLaw`,
+The law is that of :class:`~relay_autotune.loop.gains.Controller`, sample by sample as in
+:class:`~relay_autotune.loop.sampled.PidLaw`,
 
     u = kc (b r - yf + (1/ti) int (r - yf) dt - td dyf/dt),   yf = y/(1 + tf s + (tf s)^2/2),
 
@@ -21,13 +21,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relay_autotune.control.gains import Controller
-from relay_autotune.control.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.closed_loop import ClosedLoop
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
 from relay_autotune.process.simulation import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import FloatArray
-from relay_autotune.tuning.loop.closed_loop import ClosedLoop
 
 # A measurement, set-point or command of a larger magnitude is the fault of whoever sent it [y, u].
 LARGEST_VALUE = 1e12

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from relay_autotune.control.controller import run_loop, scaled
-from relay_autotune.control.gains import Controller
-from relay_autotune.control.sampled import UNLIMITED, Limits
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import FloatArray
-from relay_autotune.tuning.loop.analysis import frequencies, is_stable, sensitivity_peaks
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from relay_autotune.control.gains import NUMBERS
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.validation import DIFFERENCES
 from relay_autotune.identification.shown.shape import shape_of_record
+from relay_autotune.loop.gains import NUMBERS
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.foreign import settings_of
 from relay_autotune.record.record import Outcome, Record

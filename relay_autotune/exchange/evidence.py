@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import ModelError, ParameterError, TuningError
 from relay_autotune.experiment.early_end import Finding
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
 

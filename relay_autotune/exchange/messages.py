@@ -428,7 +428,7 @@ def gains_from_message(message: Any) -> Gains:
     :param message: the message, of rclpy or decoded from a bag.
     :raises TuningError: if they cannot be, or its two forms contradict each other.
     """
-    from relay_autotune.control.gains import NUMBERS, Gains
+    from relay_autotune.loop.gains import NUMBERS, Gains
 
     parallel = ("p", "i", "d")
     numbers = {name: float(getattr(message, name)) for name in NUMBERS}
@@ -469,7 +469,7 @@ def fill_gains(
     :param judgement: of the experiment; None: it was not judged.
     """
     # A relay_node, which has no gains, need not load what computes them.
-    from relay_autotune.control.gains import NUMBERS
+    from relay_autotune.loop.gains import NUMBERS
 
     set_stamp(message.header.stamp, stamp_ns)
     message.experiment_id = experiment_id

@@ -7,12 +7,12 @@ import math
 from typing import TYPE_CHECKING
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.exchange.text import digits, process_mathml
+from relay_autotune.text import digits, process_mathml
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
-    from relay_autotune.control.gains import Gains
     from relay_autotune.identification import Identification
+    from relay_autotune.loop.gains import Gains
 
 
 def analysis_html(analysis: Analysis) -> str:

@@ -9,7 +9,7 @@ from relay_autotune.errors import MissingPackageError, ModelError
 from relay_autotune.process.transfer_function import TransferFunction
 
 if TYPE_CHECKING:
-    from relay_autotune.control.gains import Controller
+    from relay_autotune.loop.gains import Controller
 
 PADE_ORDER = 5
 

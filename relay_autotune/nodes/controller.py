@@ -17,11 +17,12 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
 from relay_autotune.control.controller import GainBounds, PidController, is_usable
-from relay_autotune.control.gains import Controller, Gains
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step
 from relay_autotune.errors import ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.loop.analysis import is_stable
+from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
 from relay_autotune.nodes.gains_journal import GainsJournal
@@ -35,7 +36,6 @@ from relay_autotune.nodes.results import Results
 from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.analysis import is_stable
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage

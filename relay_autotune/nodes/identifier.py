@@ -24,7 +24,6 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification import ONLY_JOINT
-from relay_autotune.identification.running_fit import RunningFit, Task
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, known_from, options_from
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -32,6 +31,7 @@ from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.results import Refusals
 from relay_autotune.nodes.signs_of_life import SignsOfLife
 from relay_autotune.record.record import Outcome, Record
+from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
 

@@ -12,9 +12,9 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import ParameterError, RelayAutotuneError
+from relay_autotune.loop.gains import Controller
 
 # What may be sent, by the names of the gains in both forms.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")

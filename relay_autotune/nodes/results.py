@@ -14,7 +14,6 @@ from typing import Any
 
 from rclpy.node import Node
 
-from relay_autotune.control.gains import Gains
 from relay_autotune.errors import ModelError, RelayAutotuneError, TuningError
 from relay_autotune.exchange.evidence import Evidence, check_finding
 from relay_autotune.exchange.messages import (
@@ -24,6 +23,7 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
 )
 from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.loop.gains import Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 

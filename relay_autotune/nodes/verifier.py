@@ -16,11 +16,11 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 
-from relay_autotune.control.gains import Controller
-from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import float64_array, set_stamp
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.goals import conclude
 from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune.process.transfer_function import TransferFunction

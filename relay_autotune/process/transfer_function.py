@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.errors import ModelError
-from relay_autotune.exchange.text import process_latex, process_text
 from relay_autotune.process.model_parameters import (
     exactly,
     oscillating_pair,
     positive,
 )
+from relay_autotune.text import process_latex, process_text
 
 ComplexArray = NDArray[np.complex128]
 

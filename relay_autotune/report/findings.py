@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from relay_autotune.exchange.text import date_text, digits
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case
+from relay_autotune.text import date_text, digits
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]

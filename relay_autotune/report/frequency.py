@@ -114,7 +114,7 @@ def _loop_frequencies(loop: TransferFunction) -> FloatArray:
 
     A dead time turns what is left about the origin for ever, which says no more after a few turns.
     """
-    from relay_autotune.tuning.loop.analysis import frequencies
+    from relay_autotune.loop.analysis import frequencies
 
     grid = frequencies(loop)
     size = np.abs(loop(1j * grid))

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.source import open_regular
-from relay_autotune.control.gains import NUMBERS
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.escape import visible
 from relay_autotune.identification import Estimate, FitReport, Identification
@@ -21,6 +20,7 @@ from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import DIFFERENCES, Validation
 from relay_autotune.identification.result import Rival
 from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.loop.gains import NUMBERS
 from relay_autotune.process.structures import GENERAL, GivenModel, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import LimitCycle

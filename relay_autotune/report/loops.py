@@ -7,11 +7,11 @@ import math
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.loop.closed_loop import ClosedLoop, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import BLUE, INK, MUTED, SKY, VERMILLION, finish, in_steps, legend
 from relay_autotune.tuning import Gains
-from relay_autotune.tuning.loop.closed_loop import ClosedLoop, simulate_closed_loop
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,6 @@ from markupsafe import Markup
 
 import relay_autotune
 from relay_autotune.escape import visible
-from relay_autotune.exchange.text import digits, process_mathml, process_text
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
@@ -27,6 +26,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import COLOURS, inline
+from relay_autotune.text import digits, process_mathml, process_text
 
 # Of the page itself, in dark mode; those of figures come from COLOURS.
 _NIGHT = (

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from relay_autotune.control.gains import Controller, Gains, Performance
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
+from relay_autotune.loop.analysis import analyse_loop, is_stable
+from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.registry import look_up
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
-from relay_autotune.tuning.loop.analysis import analyse_loop, cautions, is_stable
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
-from relay_autotune.tuning.task import DesignOptions, DesignTask
+from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
 DEFAULT_RULE = "robust"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.control.gains import Controller
+from relay_autotune.loop.gains import Controller
 
 FloatArray = NDArray[np.floating[Any]]
 

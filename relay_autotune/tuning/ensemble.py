@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
-from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.margins import frequencies
-from relay_autotune.tuning.loop.stability import (
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.margins import frequencies
+from relay_autotune.loop.stability import (
     at_infinity,
     closed_loop_unstable_poles,
     winding,
 )
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.tuning.surroundings import allowed_outside
 

@@ -7,7 +7,7 @@ ISA, in which everything here is computed, parallel and series:
 They differ in the numbers alone: the filter on the measurement, of time constant tf, is the same
 factor in all three. Luyben (2003, eq 11) writes the filter of the series form as
 ``1/(alpha td s + 1)``, alpha typically 0.1; ``alpha = tf/td`` here, with the second-order filter
-of :class:`~relay_autotune.control.gains.Controller` in the place of his first-order one, whose
+of :class:`~relay_autotune.loop.gains.Controller` in the place of his first-order one, whose
 delay is the same.
 """
 
@@ -16,8 +16,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 
 FORMS = ("isa", "parallel", "series")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.tuning.candidates import NoiseLimit, Optimum
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.search import Search

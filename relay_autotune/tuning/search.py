@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.margins import frequencies, peaks
+from relay_autotune.loop.noise import filter_for
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.candidates import Candidates, NoiseLimit, Optimum
@@ -26,8 +28,6 @@ from relay_autotune.tuning.design_grid import design_grid
 from relay_autotune.tuning.frontier import Bounds, Responses
 from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.load_cost import load_iaes
-from relay_autotune.tuning.loop.margins import frequencies, peaks
-from relay_autotune.tuning.loop.noise import filter_for
 from relay_autotune.tuning.pattern_search import pattern_search
 from relay_autotune.tuning.surroundings import Surroundings
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from relay_autotune.control.gains import Controller
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.responses import ClosedLoopTransforms, abscissae, inverted
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.responses import ClosedLoopTransforms, abscissae, inverted
 
 _WEIGHTS = np.linspace(0.0, 1.0, 101)
 _POINTS = 2048

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Performance
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity
@@ -14,6 +15,8 @@ from relay_autotune.tuning.model_set import ModelSet
 
 CONTROLLERS = ("auto", "pi", "pid")
 MS_RANGE = (1.2, 4.0)
+# What was asked for may be exceeded by this factor without a remark.
+_HELD = 1.01
 # +2 dB is Luyben's bound on the resonance of the level of a vessel (2003).
 MT_SELF_REGULATING, MT_INTEGRATING = 1.4, 1.26
 
@@ -148,3 +151,27 @@ class DesignTask:
     def around(self) -> ModelSet:
         """The models within the uncertainty, with the dead time that the loop adds to them."""
         return ModelSet([self.in_loop(model) for model in self.models])
+
+
+def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
+    """Return what the user must know before using gains, a sentence each.
+
+    :param performance: of the gains on the model.
+    :param task: what was asked for.
+    """
+    options, found = task.options, []
+    bounds = {
+        "Ms": (performance.ms, options.ms),
+        "Mt": (performance.mt, options.largest_mt(task.model)),
+    }
+    for name, (value, asked) in bounds.items():
+        if value > _HELD * asked:
+            found.append(f"{name} is {value:.3g}, above the {asked:g} that was asked for")
+    noise = performance.noise_gain * options.noise_std
+    known = options.sample_period > 0.0 and options.amplitude > 0.0
+    if known and noise > _HELD * options.noise_share * options.amplitude:
+        found.append(
+            f"the noise alone moves the command by {noise:.3g} (standard deviation), "
+            f"{100.0 * noise / options.amplitude:.0f} % of the relay's amplitude"
+        )
+    return tuple(found)

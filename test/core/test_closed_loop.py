@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from relay_autotune.control.sampled import SampledPid, filter_matrices
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.closed_loop import simulate_closed_loop
+from relay_autotune.loop.noise import noise_gain, open_noise_gain
+from relay_autotune.loop.responses import step_responses
+from relay_autotune.loop.sampled import SampledPid, filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, analyse_loop
-from relay_autotune.tuning.loop.closed_loop import simulate_closed_loop
-from relay_autotune.tuning.loop.noise import noise_gain, open_noise_gain
-from relay_autotune.tuning.loop.responses import step_responses
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.closed_loop import simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, analyse_loop
 from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator
-from relay_autotune.tuning.loop.closed_loop import simulate_closed_loop
 
 FOPDT = TransferFunction.fopdt(0.8724, 1.9574, 10.8567)
 LAGS = TransferFunction.lag_n(1.5661, 10.6313, 5, 0.0)

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import ModelError, ParameterError, TuningError
 from relay_autotune.exchange.evidence import Evidence, check_finding
 from relay_autotune.experiment.early_end import Finding
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.tuning.forms import ParallelForm, SeriesForm, parallel_form, series_form
 
 S = 1j * np.geomspace(1e-3, 1e3, 25)

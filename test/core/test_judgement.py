@@ -13,10 +13,10 @@ from relay_autotune.identification import identify
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.judgement.visible import visible_error
+from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record
-from relay_autotune.tuning.loop.analysis import ms_on
 from relay_autotune.verdict import Result, Verdict, judge
 
 PROCESS = TransferFunction.fopdt(2.0, 10.0, 3.0)

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.control.gains import NUMBERS, Gains
 from relay_autotune.errors import ModelError, RecordError, TuningError
 from relay_autotune.exchange.messages import (
     fill_cycle,
@@ -31,6 +30,7 @@ from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import Validation
 from relay_autotune.identification.result import FitReport
 from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.loop.gains import NUMBERS, Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 

@@ -7,8 +7,8 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from relay_autotune.exchange.text import date_text, digits, process_latex, process_mathml
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.text import date_text, digits, process_latex, process_mathml
 
 MODELS = {
     "1.650 e^(-10.00 s) / (1 + 20.00 s)": TransferFunction.fopdt(1.65, 20.0, 10.0),

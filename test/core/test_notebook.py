@@ -8,9 +8,9 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 
 from relay_autotune.analysis import Analysis
-from relay_autotune.control.gains import Gains
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import identified
+from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
 

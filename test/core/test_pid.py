@@ -11,10 +11,10 @@ from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
 from relay_autotune.control.controller import GainBounds, PidController, run_loop
-from relay_autotune.control.gains import Controller
-from relay_autotune.control.sampled import Limits
 from relay_autotune.control.verification import Step, compare, describe, plan
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.process.structures import structure_named
 
 GAINS = Controller(kc=1.2, ti=2.0)

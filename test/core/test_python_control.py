@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import MissingPackageError, ModelError
 from relay_autotune.exchange.python_control import to_control
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 
 MODELS = [

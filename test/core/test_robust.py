@@ -9,10 +9,10 @@ import pytest
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.loop.analysis import analyse_loop, is_stable
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask

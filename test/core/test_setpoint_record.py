@@ -7,8 +7,8 @@ import pytest
 
 from relay_autotune.analysis import analyse
 from relay_autotune.control.controller import PidController
-from relay_autotune.control.gains import Controller
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess

@@ -10,9 +10,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from worked_cases import PROCESSES, cases
 
+from relay_autotune.loop.stability import closed_loop_unstable_poles
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.loop.stability import closed_loop_unstable_poles
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T1"))

@@ -11,23 +11,25 @@ ROOT = Path(__file__).resolve().parents[2]
 # know each other.
 FLOORS = (
     {"errors", "threads"},
-    {"quantities", "registry", "confidence"},
-    {"record"},
+    {"quantities", "registry", "confidence", "text", "escape"},
+    {"record", "verdict"},
     {"process"},
     {"experiment"},
     {"identification"},
-    {"control"},
-    {"tuning"},
+    {"loop"},
+    {"control", "tuning"},
     {"analysis"},
+    {"running_fit"},
     {"exchange"},
-    {"bag", "report"},
+    {"bag"},
+    {"report"},
     {"nodes"},
     {"cli"},
 )
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in names}
 # What brings ROS in; all else runs without it.
-NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "control",
-           "tuning", "analysis", "exchange")  # fmt: skip
+NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "loop",
+           "control", "tuning", "analysis", "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

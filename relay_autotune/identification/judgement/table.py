@@ -12,9 +12,9 @@ import math
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.exchange.text import process_text
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
+from relay_autotune.text import process_text
 from relay_autotune.verdict import Check, Measured
 
 _FREQUENCIES = 300

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from relay_autotune.control.gains import Controller
+from relay_autotune.loop.gains import Controller
 from relay_autotune.tuning.rules.amigo import amigo
 from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae
 from relay_autotune.tuning.rules.luyben2003 import luyben2003, luyben2003_p

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import math
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.tuning.rules.applicability import (
     controller,
     process_of,

@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.forms import SeriesForm
 from relay_autotune.tuning.rules.applicability import named, process_of, wants_pid

@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.forms import SeriesForm
 from relay_autotune.tuning.rules.applicability import (

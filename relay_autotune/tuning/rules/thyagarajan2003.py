@@ -13,7 +13,6 @@ from dataclasses import replace
 
 from scipy.optimize import brentq
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.identification.methods.thyagarajan2003 import (
     dead_time_ratio,
@@ -23,6 +22,7 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     small_dead_time,
 )
 from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.rules.applicability import (
     fopdt_of,

@@ -8,7 +8,7 @@ The papers' examples take the latter, and so do the rules whose name ends in ``_
 
 from __future__ import annotations
 
-from relay_autotune.control.gains import Controller
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.rules.applicability import (
     controller,

@@ -20,10 +20,10 @@ import math
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from relay_autotune.control.gains import Controller
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.tuning.rules.applicability import controller, named, process_of, wants_pid
 from relay_autotune.tuning.task import DesignTask
 

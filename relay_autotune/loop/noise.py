@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.control.gains import Controller
-from relay_autotune.control.sampled import filter_matrices
+from relay_autotune.loop.control_law import ControlLaw
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.margins import frequencies
+from relay_autotune.loop.sampled import filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.control_law import ControlLaw
-from relay_autotune.tuning.loop.margins import frequencies
 
 FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -91,7 +91,7 @@ def noise_gain(controller: ControlLaw, model: TransferFunction, period: float) -
 
     The noise is that of the samples, and reaches the command directly and round the loop, in
     which the command is held for a period. A PI or PID controller counts as
-    :class:`~relay_autotune.control.sampled.SampledPid` runs it.
+    :class:`~relay_autotune.loop.sampled.SampledPid` runs it.
 
     :param controller: of a stable loop.
     :param model: the process, with all dead time of the loop, that of the hold included.

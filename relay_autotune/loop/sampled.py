@@ -21,7 +21,7 @@ from relay_autotune.errors import TuningError
 
 if TYPE_CHECKING:
     # The judgement of gains needs this module's filter.
-    from relay_autotune.control.gains import Controller
+    from relay_autotune.loop.gains import Controller
 
 FloatArray = NDArray[np.float64]
 Motion = tuple[FloatArray, FloatArray, FloatArray]

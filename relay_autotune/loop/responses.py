@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.control_law import ControlLaw
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.control_law import ControlLaw
 
 FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]

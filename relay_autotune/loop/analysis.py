@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 
-from relay_autotune.control.gains import Performance
 from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.loop.control_law import ControlLaw
+from relay_autotune.loop.gains import Performance
+from relay_autotune.loop.margins import frequencies, margins, sensitivity_peaks
+from relay_autotune.loop.noise import noise_gain
+from relay_autotune.loop.responses import step_figures
+from relay_autotune.loop.stability import closed_loop_unstable_poles
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.loop.control_law import ControlLaw
-from relay_autotune.tuning.loop.margins import frequencies, margins, sensitivity_peaks
-from relay_autotune.tuning.loop.noise import noise_gain
-from relay_autotune.tuning.loop.responses import step_figures
-from relay_autotune.tuning.loop.stability import closed_loop_unstable_poles
-from relay_autotune.tuning.task import DesignTask
 
-# What was asked for may be missed by so little without a word.
-_HELD = 1.01
-
-__all__ = ["analyse_loop", "cautions", "frequencies", "is_stable", "ms_on", "sensitivity_peaks"]
+__all__ = ["analyse_loop", "frequencies", "is_stable", "ms_on", "sensitivity_peaks"]
 
 
 def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
@@ -75,30 +71,6 @@ def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
         return math.inf
     grid = frequencies(*controller.characteristic(model))
     return sensitivity_peaks(lambda s: controller(s) * model(s), grid)[0]
-
-
-def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
-    """Return what the user must know before using gains, a sentence each.
-
-    :param performance: of the gains on the model.
-    :param task: what was asked for.
-    """
-    options, found = task.options, []
-    bounds = {
-        "Ms": (performance.ms, options.ms),
-        "Mt": (performance.mt, options.largest_mt(task.model)),
-    }
-    for name, (value, asked) in bounds.items():
-        if value > _HELD * asked:
-            found.append(f"{name} is {value:.3g}, above the {asked:g} that was asked for")
-    noise = performance.noise_gain * options.noise_std
-    known = options.sample_period > 0.0 and options.amplitude > 0.0
-    if known and noise > _HELD * options.noise_share * options.amplitude:
-        found.append(
-            f"the noise alone moves the command by {noise:.3g} (standard deviation), "
-            f"{100.0 * noise / options.amplitude:.0f} % of the relay's amplitude"
-        )
-    return tuple(found)
 
 
 def _at_rest(terms: tuple[TransferFunction, ...]) -> float | None:

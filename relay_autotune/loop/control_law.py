@@ -14,7 +14,7 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 
 class ControlLaw(Protocol):
-    """A linear controller, as :class:`~relay_autotune.control.gains.Controller` is."""
+    """A linear controller, as :class:`~relay_autotune.loop.gains.Controller` is."""
 
     def __call__(self, s: ComplexArray) -> ComplexArray:
         """Return -command per measurement at complex frequencies [u/y]."""

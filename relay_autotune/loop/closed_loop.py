@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.control.gains import Controller
-from relay_autotune.control.sampled import SampledController, SampledPid
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import SampledController, SampledPid
 from relay_autotune.process.simulation import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 

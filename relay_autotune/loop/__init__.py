@@ -1,0 +1,1 @@
+"""Closed loops: gains, the law as it runs, margins, stability, noise, responses."""

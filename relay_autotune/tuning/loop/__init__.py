@@ -1,1 +1,0 @@
-"""What a closed loop does: margins, stability, noise, responses."""
