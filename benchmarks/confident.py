@@ -36,7 +36,7 @@ import numpy as np
 from information import relative_bounds
 from processes import true_point
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import analyse_alone
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, Finding
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.simulation import exact_limit_cycle
@@ -189,7 +189,7 @@ class Bench:
 
     def _true_ms(self, record: Record) -> float:
         """Return the Ms of the gains after a test on the process; NaN: there are none."""
-        gains = analyse(record, alone=True).best_gains
+        gains = analyse_alone(record).best_gains
         if gains is None:
             return math.nan
         options = DesignOptions(sample_period=self.period)

@@ -27,6 +27,7 @@ from relay_autotune.identification.judgement.quality import is_far_off
 from relay_autotune.identification.judgement.table import LOOP_CHECKS, MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.loop.analysis import ms_on
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
@@ -130,12 +131,9 @@ def analyse(
     rule: str = DEFAULT_RULE,
     known: Known = NOTHING,
     options: DesignOptions | None = None,
-    final: bool = True,
-    alone: bool = False,
-    predict: bool = False,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
-    """Identify a record and, where the experiment was completed, tune.
+    """Identify a record and, where the experiment was completed, tune: by all methods and rules.
 
     Data that tell no model are a result, not an exception: the reason says what was found and
     what to do. Only a completed experiment, or data that carry no outcome at all, yield gains,
@@ -148,60 +146,177 @@ def analyse(
     :param known: what is known of the process beforehand.
     :param options: what is asked of the controller; noise and amplitude come from the record
         where they are not given.
-    :param final: False while the experiment still runs: only the chosen model, and no gains; this
-        takes a fraction of the time.
-    :param alone: True: only the chosen method's model and the chosen rule's gains, equal to those
-        beside all others; for many records.
-    :param predict: True: of a running experiment, predict Ms, too.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
     :raises RelayAutotuneError: if method or rule are unknown.
     """
     check_names(method, rule)
+    chosen = _chosen(record, method, known)
+    if isinstance(chosen, Analysis):
+        return chosen
+    models = [chosen.model, *_others(chosen.driven, method, known, chosen.model)]
+    simple = next((m.model for m in models if m.structure == FOPDT.name), None)
+    return _assessed(chosen, models, known, _first(rule), simple, options, rng)
+
+
+def analyse_alone(
+    record: Record,
+    *,
+    method: str = DEFAULT_METHOD,
+    rule: str = DEFAULT_RULE,
+    known: Known = NOTHING,
+    options: DesignOptions | None = None,
+    rng: np.random.Generator | None = None,
+) -> Analysis:
+    """Identify a record by one method and, where the experiment was completed, tune by one rule.
+
+    Model and gains are those of :func:`analyse`, without what would stand beside them; for many
+    records.
+
+    :param record: the experiment.
+    :param method: the method.
+    :param rule: the rule.
+    :param known: what is known of the process beforehand.
+    :param options: as for :func:`analyse`.
+    :param rng: as for :func:`analyse`.
+    :raises RelayAutotuneError: if method or rule are unknown.
+    """
+    check_names(method, rule)
+    chosen = _chosen(record, method, known)
+    if isinstance(chosen, Analysis):
+        return chosen
+    simple = chosen.simple(known, rule)
+    return _assessed(chosen, [chosen.model], known, (rule,), simple, options, rng)
+
+
+def model_so_far(
+    record: Record, *, method: str = DEFAULT_METHOD, known: Known = NOTHING
+) -> Analysis:
+    """Identify the record of an experiment that still runs, by one method.
+
+    This takes a fraction of the time of :func:`analyse`. There are no gains.
+
+    :param record: of the experiment so far.
+    :param method: the method.
+    :param known: what is known of the process beforehand.
+    :raises RelayAutotuneError: if the method is unknown.
+    """
+    method_named(method)
+    chosen = _chosen_so_far(record, method, known)
+    return chosen if isinstance(chosen, Analysis) else chosen.alone
+
+
+def prediction_so_far(
+    record: Record,
+    *,
+    method: str = DEFAULT_METHOD,
+    rule: str = DEFAULT_RULE,
+    known: Known = NOTHING,
+    options: DesignOptions | None = None,
+    rng: np.random.Generator | None = None,
+) -> Analysis:
+    """Identify as :func:`model_so_far` does, and predict the Ms that the gains would have.
+
+    :param record: of the experiment so far.
+    :param method: the method.
+    :param rule: the rule of the gains.
+    :param known: what is known of the process beforehand.
+    :param options: as for :func:`analyse`.
+    :param rng: as for :func:`analyse`.
+    :raises RelayAutotuneError: if method or rule are unknown.
+    """
+    check_names(method, rule)
+    chosen = _chosen_so_far(record, method, known)
+    if isinstance(chosen, Analysis):
+        return chosen
+    task = _task(chosen.alone, rng, chosen.simple(known, rule), options)
+    return replace(chosen.alone, predicted=predicted_ms(task, rule_named(rule)))
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The model that counts.
+
+    :param record: the record.
+    :param cycles: its whole cycles.
+    :param model: the identification.
+    :param driven: the record as the process was driven, with a load that came.
+    """
+
+    record: Record
+    cycles: tuple[Cycle, ...]
+    model: Identification
+    driven: Record
+
+    @property
+    def alone(self) -> Analysis:
+        """The analysis that has nothing else."""
+        return Analysis(self.record, self.cycles, (self.model,), 0)
+
+    def simple(self, known: Known, rule: str) -> TransferFunction | None:
+        """Return the FOPDT on which a rule is built, if it is built on one."""
+        if self.model.structure == FOPDT.name:
+            return self.model.model
+        return None if rule == DEFAULT_RULE else _simple((self.driven,), known, self.model)
+
+
+def _chosen(record: Record, method: str, known: Known) -> _Chosen | Analysis:
+    """Return the model that counts; where there is none, the analysis that says why."""
     cycles: tuple[Cycle, ...] = ()
     try:
         cycles = cycles_of(record)
         chosen = _guarded(record, method, known)
     except RelayAutotuneError as error:
-        return _nothing(record, cycles, error, final=final)
+        return _nothing(record, cycles, error)
     chosen = without_disturbance(
         chosen, record, cycles, lambda part: _guarded(part, method, known)
     )
-    # The record as the process was driven, with a load that came.
-    driven = record
-    if chosen.method == DEFAULT_METHOD and not known.structure:
-        chosen, driven = with_its_load(
-            chosen,
-            record,
-            cycles,
-            lambda part, kind: _guarded(part, method, replace(known, structure=kind)),
-        )
-    if not final and is_far_off(chosen, record):
-        # Its interval is that of a model which the record contradicts: nothing to end a test on.
-        chosen = replace(chosen, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
-    models = [chosen]
-    if final:
-        if not alone:
-            models += _others(driven, method, known, chosen)
-        models = list(assess(models, record))
-    simple = next((m.model for m in models if m.structure == "fopdt"), None)
-    if (alone or predict) and simple is None and rule != DEFAULT_RULE:
-        simple = _simple((driven,), known, chosen)
-    found = Analysis(record, cycles, tuple(models), 0)
-    if not final:
-        return _with_prediction(found, rule, rng, simple, options) if predict else found
+    if chosen.method != DEFAULT_METHOD or known.structure:
+        return _Chosen(record, cycles, chosen, record)
+    loaded = with_its_load(
+        chosen,
+        record,
+        cycles,
+        lambda part, kind: _guarded(part, method, replace(known, structure=kind)),
+    )
+    return _Chosen(record, cycles, *loaded)
+
+
+def _chosen_so_far(record: Record, method: str, known: Known) -> _Chosen | Analysis:
+    """Return the model that counts while an experiment runs, or why there is none."""
+    chosen = _chosen(record, method, known)
+    if isinstance(chosen, Analysis):
+        # What there is not yet is no verdict.
+        return replace(chosen, judgement=NOT_JUDGED)
+    if not is_far_off(chosen.model, record):
+        return chosen
+    # Its interval is that of a model which the record contradicts: nothing to end a test on.
+    model = replace(chosen.model, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
+    return replace(chosen, model=model)
+
+
+def _assessed(
+    chosen: _Chosen,
+    models: Sequence[Identification],
+    known: Known,
+    rules: Sequence[str],
+    simple: TransferFunction | None,
+    options: DesignOptions | None,
+    rng: np.random.Generator | None,
+) -> Analysis:
+    """Judge models, the one that counts first, and tune it."""
+    record = chosen.record
+    found = Analysis(record, chosen.cycles, assess(models, record), 0)
     evidence = Evidence(
         record,
         found.models[0],
-        beside=0 if driven is record else _LOAD,
+        beside=0 if chosen.driven is record else _LOAD,
         free=not known.structure,
-        samples=chosen.method == DEFAULT_METHOD,
+        samples=chosen.model.method == DEFAULT_METHOD,
         others=found.models[1:],
-        settled=bool(cycles) and limit_cycle(cycles).converged,
+        settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
     )
-    return _judged(
-        found, evidence, (record,), (rule,) if alone else _first(rule), simple, options, rng
-    )
+    return _judged(found, evidence, (record,), rules, simple, options, rng)
 
 
 def analyse_jointly(
@@ -240,13 +355,10 @@ def analyse_jointly(
     return _judged(found, evidence, records, _first(rule), simple, options, rng)
 
 
-def _nothing(
-    record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError, *, final: bool = True
-) -> Analysis:
+def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError) -> Analysis:
     """Return the analysis of a record that tells no model."""
     reason = _with_outcome(record, str(error))
-    judgement = Judgement(refused=reason) if final else NOT_JUDGED
-    return Analysis(record, cycles, reason=reason, judgement=judgement)
+    return Analysis(record, cycles, reason=reason, judgement=Judgement(refused=reason))
 
 
 def _judged(
@@ -301,10 +413,10 @@ def _simple(
     records: Sequence[Record], known: Known, chosen: Identification
 ) -> TransferFunction | None:
     """Return the FOPDT that fits best, on which most rules are built; None if there is none."""
-    if chosen.structure == "fopdt":
+    if chosen.structure == FOPDT.name:
         return chosen.model
     try:
-        found = identify_jointly(records, DEFAULT_METHOD, replace(known, structure="fopdt"))
+        found = identify_jointly(records, DEFAULT_METHOD, replace(known, structure=FOPDT.name))
     except RelayAutotuneError:
         return None
     return found.model
@@ -325,18 +437,6 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
             continue
     delay = task.options.added_delay
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
-
-
-def _with_prediction(
-    found: Analysis,
-    rule: str,
-    rng: np.random.Generator | None,
-    simple: TransferFunction | None,
-    options: DesignOptions | None,
-) -> Analysis:
-    """Add the Ms that the gains of a rule would have on the model and on those around it."""
-    task = _task(found, rng, simple, options)
-    return replace(found, predicted=predicted_ms(task, rule_named(rule)))
 
 
 def _task(
@@ -409,9 +509,9 @@ def _others(
 
     The first is the FOPDT that fits best, on which most rules are built.
     """
-    wanted = [(DEFAULT_METHOD, replace(known, structure="fopdt"))]
+    wanted = [(DEFAULT_METHOD, replace(known, structure=FOPDT.name))]
     wanted += [(name, known) for name in METHODS if name not in (method, DEFAULT_METHOD)]
-    if chosen.method == DEFAULT_METHOD and chosen.structure == "fopdt":
+    if chosen.method == DEFAULT_METHOD and chosen.structure == FOPDT.name:
         wanted = wanted[1:]
     found = []
     for name, facts in wanted:

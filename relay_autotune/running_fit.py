@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from relay_autotune.analysis import Analysis, analyse
+from relay_autotune.analysis import Analysis, model_so_far, prediction_so_far
 from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification import DEFAULT_METHOD, Identification, Known
 from relay_autotune.identification.known import NOTHING
@@ -68,12 +68,8 @@ class RunningFit:
         return found
 
     def _analyse(self, record: Record, task: Task, known: Known, sought: str) -> Analysis:
-        return analyse(
-            record,
-            method=task.method,
-            rule=task.rule,
-            known=known,
-            options=task.options,
-            final=False,
-            predict=sought == MS,
+        if sought != MS:
+            return model_so_far(record, method=task.method, known=known)
+        return prediction_so_far(
+            record, method=task.method, rule=task.rule, known=known, options=task.options
         )

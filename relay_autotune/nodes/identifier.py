@@ -13,7 +13,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 
-from relay_autotune.analysis import Analysis, analyse, analyse_jointly, check_names
+from relay_autotune.analysis import Analysis, analyse, analyse_jointly, check_names, model_so_far
 from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,
@@ -230,7 +230,8 @@ class IdentifierNode(ServedNode):
             new, self._cycles_are_new = self._cycles_are_new, False
             if new and self._cycles:
                 record = record_from_cycles(self._cycles.values())
-                work = partial(analyse, record, final=False, **vars(self._task()))
+                task = self._task()
+                work = partial(model_so_far, record, method=task.method, known=task.known)
                 return _Fit(work, partial(self._fitted, record.experiment_id))
         except RelayAutotuneError as error:
             what = "the cycles" if progress is None else "the progress"
@@ -245,7 +246,7 @@ class IdentifierNode(ServedNode):
             self._earlier = record
         if asked["method"] in ONLY_JOINT and earlier is not None:
             return partial(analyse_jointly, (record, earlier), **asked)
-        return partial(analyse, record, final=True, **asked)
+        return partial(analyse, record, **asked)
 
     # What came of it.
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import analyse, analyse_alone, model_so_far
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
@@ -52,7 +52,7 @@ def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
 
 
 def test_while_it_runs_there_is_a_model_and_no_gains():
-    found = analyse(_record(), final=False)
+    found = model_so_far(_record())
     assert found.model is not None
     assert len(found.models) == 1
     assert found.gains == ()
@@ -61,7 +61,7 @@ def test_while_it_runs_there_is_a_model_and_no_gains():
 @pytest.mark.parametrize(("method", "rule"), [("waveform", "robust"), ("wang_biased", "imc")])
 def test_alone_they_are_what_they_are_beside_others(method, rule):
     beside = analyse(_record(), method=method, rule=rule)
-    alone = analyse(_record(), method=method, rule=rule, alone=True)
+    alone = analyse_alone(_record(), method=method, rule=rule)
     assert [m.method for m in alone.models] == [method]
     assert alone.model.values.tolist() == beside.model.values.tolist()
     assert alone.model.fit.residual_rms == beside.model.fit.residual_rms
@@ -152,14 +152,14 @@ def test_a_running_test_forgets_a_disturbance_of_its_beginning():
     whole = simulate_sampled_relay(model, relay, period=0.2, noise=draws)
     record = replace(whole, noise_std=0.02)
     for disturbed in (record, replace(record, noise_std=np.nan)):
-        found = analyse(_beginning(disturbed, 300), final=False).model
+        found = model_so_far(_beginning(disturbed, 300)).model
         assert found is not None
         assert np.isnan(found.ultimate_gain_std)
     calm = replace(_record(noise=0.2), noise_std=np.nan)
-    found = analyse(_beginning(calm, 300), final=False).model
+    found = model_so_far(_beginning(calm, 300)).model
     assert found is not None
     assert found.ultimate_gain_std > 0.0
-    found = analyse(record, final=False).model
+    found = model_so_far(record).model
     assert found is not None
     assert found.ultimate_gain == pytest.approx(2.3069, rel=0.01)
     assert found.ultimate_gain_std < 0.01 * found.ultimate_gain

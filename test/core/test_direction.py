@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from virtual_tune import tuned
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import identify
 from relay_autotune.identification.judgement.direction import other_direction
@@ -43,7 +43,7 @@ def run(model, *, sign, period, **acting):
 def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, period, noise_std):
     tune = run(model, sign=-model.process_sign, period=period, noise_std=noise_std)
     assert tune.outcome is Outcome.COMPLETED
-    found = analyse(tune.record(), alone=True)
+    found = analyse_alone(tune.record())
     assert found.best_gains is None
     assert f"process_gain_sign {model.process_sign};" in found.reason
     # What the relay's own direction would have given is a model of the wrong sign.
@@ -55,7 +55,7 @@ def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, per
 def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     noise = {"noise_std": 0.01 * abs(model.gain)}
     tune = run(model, sign=model.process_sign, period=period, **noise)
-    found = analyse(tune.record(), alone=True)
+    found = analyse_alone(tune.record())
     assert found.best_gains is not None
     assert np.sign(found.best_gains.kc) == model.process_sign
 
@@ -76,4 +76,4 @@ def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting
     record = tune.record()
     other = other_direction(identify(record, "waveform"), record)
     assert other is None or other.lead < -6.0
-    assert analyse(record, alone=True).best_gains is not None
+    assert analyse_alone(record).best_gains is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from virtual_tune import tuned
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import model_so_far
 from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification import Known, identify
 from relay_autotune.identification.judgement.disturbance import with_its_load
@@ -41,7 +41,7 @@ def run(model, *, load_time, load_size, noise_std, seed):
 def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size, noise_std):
     tune = run(model, load_time=load_time, load_size=load_size, noise_std=noise_std, seed=1003)
     assert tune.cycle_count == 3
-    found = analyse(tune.record(), alone=True, final=False).model
+    found = model_so_far(tune.record()).model
     assert found is not None
     truth = ultimate_point(model)
     error = found.ultimate_gain / truth.gain - 1.0
@@ -57,7 +57,7 @@ def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size
 def test_a_load_that_no_structure_explains_does_not_pass_for_no_response():
     # What the models leave is so correlated that the simplest was chosen, which leaves all of it.
     tune = run(SECOND_ORDER, load_time=70.17, load_size=-0.4, noise_std=0.0, seed=1000)
-    found = analyse(tune.record(), alone=True, final=False).model
+    found = model_so_far(tune.record()).model
     assert found is not None
     assert found.ultimate_gain == pytest.approx(ultimate_point(SECOND_ORDER).gain, rel=1e-3)
 

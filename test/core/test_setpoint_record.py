@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import model_so_far
 from relay_autotune.control.controller import PidController
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.loop.gains import Controller
@@ -41,7 +41,7 @@ def test_the_process_is_told_from_its_controller_read_backward(dead_time):
         settings=tune.settings,
         noise_std=tune.noise_std,
     )
-    found = analyse(record, alone=True, final=False).model
+    found = model_so_far(record).model
     assert found is not None
     assert found.ultimate_gain == pytest.approx(truth.gain, rel=0.03)
     assert abs(found.ultimate_gain - truth.gain) < 3.0 * found.ultimate_gain_std

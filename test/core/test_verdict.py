@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from report_cases import completed
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import model_so_far
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, worst
 from relay_autotune.cli.replay_bag import status_of
 from relay_autotune.cli.table import table
@@ -157,4 +157,4 @@ def test_a_document_gives_the_judgement_back():
 
 
 def test_a_running_experiment_is_not_judged():
-    assert analyse(completed().record, final=False).verdict is Verdict.UNKNOWN
+    assert model_so_far(completed().record).verdict is Verdict.UNKNOWN

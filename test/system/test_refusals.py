@@ -324,12 +324,11 @@ LATE = """
 import sys, time
 from relay_autotune.nodes import identifier
 analyse = identifier.analyse
-def late(record, *, final=True, **asked):
-    if final:
-        time.sleep(3.5)
-        if len(record.cycle_start) > 6:
-            raise RuntimeError("too much for it")
-    return analyse(record, final=final, **asked)
+def late(record, **asked):
+    time.sleep(3.5)
+    if len(record.cycle_start) > 6:
+        raise RuntimeError("too much for it")
+    return analyse(record, **asked)
 identifier.analyse = late
 sys.exit(identifier.main())
 """
