@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import ModelError
+from relay_autotune.identification.differences import exact_steps, jacobian
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -161,17 +162,12 @@ class Estimate:
             except (ModelError, OverflowError):
                 return math.nan
 
-        gradient = np.zeros(self.values.size)
-        for i, deviation in enumerate(np.sqrt(np.maximum(np.diag(spread), 0.0))):
-            h = min(max(_SHARE * deviation, _STEPS[0]), _STEPS[1])
-            below = h
-            if not structure.logarithmic[i]:
-                h = max(_SHARE * deviation, _STEPS[0] * (abs(self.values[i]) or 1.0))
-                # At a dead time of zero there is one side only.
-                below = min(h, float(self.values[i] - structure.least[i]))
-            step = np.zeros(self.values.size)
-            step[i] = h
-            gradient[i] = (at(step) - at(-step * (below / h))) / (h + below)
+        part = _SHARE * np.sqrt(np.maximum(np.diag(spread), 0.0))
+        shortest = _STEPS[0] * np.where(self.values == 0.0, 1.0, np.abs(self.values))
+        up = np.where(structure.logarithmic, np.clip(part, *_STEPS), np.maximum(part, shortest))
+        # At a dead time of zero there is one side only.
+        room = np.where(structure.logarithmic, math.inf, self.values - structure.least)
+        gradient = jacobian(at, np.zeros(self.values.size), up, np.minimum(up, room))
         variance = float(gradient @ spread @ gradient)
         if not variance >= 0.0:
             return Uncertain(value)
@@ -205,25 +201,19 @@ class Estimate:
             log_response(values, frequency * (1.0 + step))
             - log_response(values, frequency * (1.0 - step))
         ) / (2.0 * step * frequency)
-        gradient_gain, gradient_frequency = [], []
-        for i, (parameter, value) in enumerate(zip(structure.parameters, values, strict=True)):
-            # A dead time or a zero of next to nothing still acts by its part of the period.
-            least = 0.0 if parameter.logarithmic else 1.0 / frequency
-            size = max(abs(value), least) or 1.0 / frequency
-            up, down = values.copy(), values.copy()
-            up[i] = value + step * size
-            down[i] = max(value - step * size, parameter.least)
-            change = log_response(up, frequency) - log_response(down, frequency)
-            change /= up[i] - down[i]
-            dw = -change.imag / by_frequency.imag
-            gradient_frequency.append(dw)
-            gradient_gain.append(-gain * (change.real + by_frequency.real * dw))
+        # A dead time or a zero of next to nothing still acts by its part of the period.
+        radian = 1.0 / frequency
+        size = np.maximum(np.abs(values), np.where(structure.logarithmic, 0.0, radian))
+        size = step * np.where(size == 0.0, radian, size)
+        steps = exact_steps(values, size, structure.least)
+        change = jacobian(lambda x: log_response(x, frequency), values, *steps)
+        by_frequency_of = -change.imag / by_frequency.imag
+        by_gain_of = -gain * (change.real + by_frequency.real * by_frequency_of)
 
-        def deviation(gradient: list[float]) -> float:
-            g = np.array(gradient)
-            return math.sqrt(max(float(g @ self.covariance @ g), 0.0))
+        def deviation(gradient: FloatArray) -> float:
+            return math.sqrt(max(float(gradient @ self.covariance @ gradient), 0.0))
 
-        return deviation(gradient_gain), deviation(gradient_frequency)
+        return deviation(by_gain_of), deviation(by_frequency_of)
 
     def draws(self, count: int, rng: np.random.Generator) -> Iterator[TransferFunction]:
         """Draw models from the uncertainty.

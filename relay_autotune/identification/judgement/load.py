@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Estimate, Identification
+from relay_autotune.identification.differences import jacobian
 from relay_autotune.process.response import response
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import FloatArray, PiecewiseConstant, Record
@@ -137,16 +138,15 @@ class _Fit:
         """Return the best few guesses."""
         now = self._output(self._values, self._u)
         left = self._measurement - now
-        columns = [np.ones(self._time.size)]
-        for k, value in enumerate(self._values):
-            step = _STEP * abs(value) or _STEP
-            moved = self._values.copy()
-            moved[k] += step
+
+        def output(values: FloatArray) -> FloatArray:
             try:
-                columns.append((self._output(moved, self._u) - now) / step)
+                return self._output(values, self._u)
             except RelayAutotuneError:
                 # It cannot be varied upwards: at the edge of what it may be.
-                columns.append(np.zeros(self._time.size))
+                return now
+
+        columns = [np.ones(self._time.size), *_slopes(output, self._values).T]
         model = self._build(self._values)
         guesses: list[tuple[float, FloatArray]] = []
         for instant in np.linspace(self._begin, self._span, _INSTANTS + 2)[1:-1]:
@@ -171,11 +171,10 @@ class _Fit:
             f"since no model fits the record without one"
         )
         point = np.append(self._values, [load.time, load.size, 0.0])
-        columns = [self._derivative(self.residual, point, k) for k in range(point.size)]
-        jacobian = np.column_stack(columns)
+        slopes = _slopes(self.residual, point)
         count = self._values.size
-        known = np.linalg.pinv(np.delete(jacobian, [count, count + 1], axis=1))[:count]
-        open_ = np.linalg.pinv(jacobian)[:count]
+        known = np.linalg.pinv(np.delete(slopes, [count, count + 1], axis=1))[:count]
+        open_ = np.linalg.pinv(slopes)[:count]
         noise = found.fit.residual_rms**2
         more = noise * (open_ @ open_.T - known @ known.T)
         # Samples that were passed over here would have told as much again.
@@ -184,9 +183,7 @@ class _Fit:
         ratio = np.zeros(count)
         np.divide(np.diag(more).clip(0.0), variance, out=ratio, where=variance > 0.0)
         wider = np.sqrt(1.0 + ratio)
-        gradients = np.column_stack(
-            [self._derivative(self._ultimate, self._values, k) for k in range(count)]
-        )
+        gradients = _slopes(self._ultimate, self._values)
         gain, frequency = np.einsum("ik,kl,il->i", gradients, more, gradients).clip(0.0)
         return replace(
             found,
@@ -202,10 +199,8 @@ class _Fit:
         point = ultimate_point(self._build(values))
         return np.full(2, math.nan) if point is None else np.array([point.gain, point.frequency])
 
-    @staticmethod
-    def _derivative(
-        function: Callable[[FloatArray], FloatArray], at: FloatArray, k: int
-    ) -> FloatArray:
-        step = np.zeros(at.size)
-        step[k] = _STEP * abs(at[k]) or _STEP
-        return (function(at + step) - function(at)) / step[k]
+
+def _slopes(function: Callable[[FloatArray], FloatArray], at: FloatArray) -> FloatArray:
+    """Return derivatives to the upper side, shape (n, p)."""
+    steps = np.where(at == 0.0, _STEP, _STEP * np.abs(at))
+    return jacobian(function, at, steps, np.zeros(at.size))

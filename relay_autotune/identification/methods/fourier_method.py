@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from scipy.special import fdtrc
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.interpolation import Interpolation, interpolated, smooth
@@ -303,19 +304,20 @@ class _Fit:
         # In the order of the residuals: all real parts, then the imaginary ones.
         numbers = [(i, 1.0 + 0.0j) for i in range(points.value.size)]
         numbers += [(int(i), 1.0j) for i in np.flatnonzero(points.frequency > 0.0)]
-        rates = []
-        for (i, direction), step in zip(numbers, steps, strict=True):
-            ends = []
-            for side in (_STEP, -_STEP):
-                moved = points.value.copy()
-                moved[i] += side * points.std[i] * direction
-                there = self.values(np.clip(x + side * step, *ends_of_search))
-                point = between(self.structure.build(there), points.frequency, moved)
-                ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
-                ends.append(np.append(there, ultimate))
-            rates.append((ends[0] - ends[1]) / (2.0 * _STEP))
-        spread = np.array(rates)
-        squares = spread.T @ spread
+        place = np.array([i for i, _ in numbers])
+        size = points.std[place] * np.array([direction for _, direction in numbers])
+
+        def answer(deviations: FloatArray) -> FloatArray:
+            moved = points.value.copy()
+            np.add.at(moved, place, deviations * size)
+            there = self.values(np.clip(x + deviations @ steps, *ends_of_search))
+            point = between(self.structure.build(there), points.frequency, moved)
+            ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
+            return np.append(there, ultimate)
+
+        none = np.zeros(len(numbers))
+        spread = jacobian(answer, none, none + _STEP)
+        squares = spread @ spread.T
         if points.numbers < self.free.size:
             # A single point does not tell three values apart, whatever comes nearest to it.
             squares[:-2, :-2] = math.nan

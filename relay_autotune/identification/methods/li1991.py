@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.differences import exact_steps, jacobian
 from relay_autotune.identification.methods.chang1992 import gain_and_time_constant
 from relay_autotune.identification.methods.lag_models import (
     MODEL_1,
@@ -152,11 +153,15 @@ def fit_jointly(
     def of_values(v: FloatArray) -> FloatArray:
         return residuals(model, v[0], tuple(v[1:-1].tolist()), v[-1], tests, errors)
 
+    sizes = 1e-5 * np.where(values == 0.0, values[1], values)
+    derivatives = jacobian(of_values, values, *exact_steps(values, sizes, 0.0))
+    if not fitted:
+        derivatives[:, -1] = 0.0
     return JointFit(
         Solution(gain, constants),
         delay,
         math.sqrt(2.0 * best.cost / (2 * len(tests))),
-        _derivatives(of_values, values, fitted),
+        derivatives,
     )
 
 
@@ -292,17 +297,3 @@ def _starts(
                 pair = [log_tau + math.log(spread), log_tau - math.log(spread)]
                 starts.append(np.array([math.log(gain), *pair, *tail]))
     return starts
-
-
-def _derivatives(
-    residuals: Callable[[FloatArray], FloatArray], values: FloatArray, dead_time: bool
-) -> FloatArray:
-    columns = []
-    for i in range(values.size):
-        step = 1e-5 * (values[i] or float(values[1]))
-        up, down = values.copy(), values.copy()
-        up[i], down[i] = values[i] + step, max(values[i] - step, 0.0)
-        columns.append((residuals(up) - residuals(down)) / (up[i] - down[i]))
-    if not dead_time:
-        columns[-1] = np.zeros_like(columns[0])
-    return np.stack(columns, axis=1)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.luyben2003 import from_step
@@ -38,6 +39,7 @@ _BEYOND = 1.4
 _SIGNIFICANT = 4.0
 _NEGLIGIBLE = 1e-9
 _UNEXPLAINED = 1.5
+_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -327,21 +329,18 @@ def _real_roots(polynomial: np.polynomial.Chebyshev, span: float) -> FloatArray:
 
 def _jacobian(curve: Curve, step: float) -> FloatArray:
     """Return the derivatives of the values by dead time, coefficients and baseline."""
-    size = float(np.abs(curve.coefficients[:-1]).max())
-    columns = []
-    h = 1e-6 * curve.span
     end = curve.dead_time + curve.span
-    for sign in (1.0, -1.0):
-        moved = curve.dead_time + sign * h
-        columns.append(_values(replace(curve, dead_time=moved, span=end - moved), step))
-    found = [(columns[0] - columns[1]) / (2.0 * h)]
-    for k in range(curve.coefficients.size):
-        change = np.zeros(curve.coefficients.size)
-        change[k] = 1e-6 * size
-        up = _values(replace(curve, coefficients=curve.coefficients + change), step)
-        down = _values(replace(curve, coefficients=curve.coefficients - change), step)
-        found.append((up - down) / (2.0 * change[k]))
-    return np.stack(found, axis=1)
+
+    def values(x: FloatArray) -> FloatArray:
+        dead_time = float(x[0])
+        # Moved by its coefficients alone, the curve reaches as far as it does.
+        span = curve.span if dead_time == curve.dead_time else end - dead_time
+        return _values(Curve(dead_time, span, x[1:]), step)
+
+    at = np.concatenate(([curve.dead_time], curve.coefficients))
+    steps = np.full(at.size, _STEP * float(np.abs(curve.coefficients[:-1]).max()))
+    steps[0] = _STEP * curve.span
+    return jacobian(values, at, steps)
 
 
 def _report(

@@ -17,6 +17,7 @@ from scipy.special import stdtrit
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.thyagarajan2003 import (
@@ -325,19 +326,19 @@ def _identified(
 
 def _jacobian(solve: Callable[[Shape], FloatArray], reading: Reading) -> FloatArray | None:
     """Return the derivatives of the values by the shape; None where one has no solution."""
-    columns = []
-    for name in reading.names:
-        value, spread = getattr(reading.shape, name), reading.std(name)
-        step = max(_STEP * spread, 1e-9 * reading.shape.half_period * (name != "amplitude"))
-        if name in ("amplitude", "level"):
-            step = max(_STEP * spread, 1e-9 * reading.shape.amplitude)
-        try:
-            up = solve(replace(reading.shape, **{name: value + step}))
-            down = solve(replace(reading.shape, **{name: value - step}))
-        except IdentificationError:
-            return None
-        columns.append((up - down) / (2.0 * step))
-    return np.stack(columns, axis=1)
+    shape, names = reading.shape, reading.names
+    # The others are times.
+    size = [shape.amplitude if n in ("amplitude", "level") else shape.half_period for n in names]
+    spread = np.array([reading.std(name) for name in names])
+    at = np.array([getattr(shape, name) for name in names])
+
+    def values(x: FloatArray) -> FloatArray:
+        return solve(replace(shape, **dict(zip(names, x.tolist(), strict=True))))
+
+    try:
+        return jacobian(values, at, np.maximum(_STEP * spread, 1e-9 * np.array(size)))
+    except IdentificationError:
+        return None
 
 
 def _literal(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.identification.differences import jacobian, relative_steps
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.waveform.quantisation import quantisation_step
 from relay_autotune.identification.waveform.residuals import covariance_meat
@@ -147,18 +148,13 @@ def _scores(problem: Problem, state: State, fit: Fit) -> tuple[FloatArray, Float
 def _gradient(problem: Problem, state: State, scale: float) -> FloatArray:
     """Return d(parameters of the field)/d(linear coefficients, theta), shape (p, k + m)."""
     structure, k = problem.structure, state.coefficients.size
+
+    def values(point: FloatArray) -> FloatArray:
+        read = structure.read(point[k:], scale * point[:k], like=state.theta)
+        assert read is not None
+        return read[1]
+
     point = np.concatenate((state.coefficients, state.theta))
-    columns = []
-    for i, value in enumerate(point):
-        h = 1e-6 * (abs(value) or 1.0)
-        # A logarithm near zero is a time near one second, not a small one.
-        h = max(h, 1e-6) if k <= i < point.size - 1 else h
-        ends = []
-        for side in (h, -h):
-            moved = point.copy()
-            moved[i] += side
-            read = structure.read(moved[k:], scale * moved[:k], like=state.theta)
-            assert read is not None
-            ends.append(read[1])
-        columns.append((ends[0] - ends[1]) / (2.0 * h))
-    return np.stack(columns, axis=1)
+    numbers = np.arange(point.size)
+    logarithms = (k <= numbers) & (numbers < point.size - 1)
+    return jacobian(values, point, relative_steps(point, logarithms))

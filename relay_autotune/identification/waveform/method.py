@@ -27,8 +27,10 @@ from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fi
 from relay_autotune.identification.waveform.robust import scale_of, weights
 from relay_autotune.identification.waveform.selection import (
     Candidate,
-    Selection,
+    Ground,
     after_the_unknown,
+    fit_all,
+    fit_one,
 )
 from relay_autotune.identification.waveform.separable import (
     Problem,
@@ -134,12 +136,12 @@ def _sign(records: Sequence[Record]) -> int:
 def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
     # What is decided on some thousand samples would not be decided otherwise on a million.
     part = problem.thinned(_MOST_FOR_CHOICE)
-    selection = Selection(part, part.time.size * NEGLIGIBLE**2, sign)
-    candidates = _candidates(selection, known)
+    ground = Ground.of(part, part.time.size * NEGLIGIBLE**2, sign)
+    candidates = _candidates(ground, known)
     rest = candidates
     while rest:
         picked = choose(rest)
-        chosen = selection.with_nuisances(picked)
+        chosen = ground.with_nuisances(picked)
         nuisances = chosen.problem
         whole = replace(
             problem,
@@ -151,7 +153,7 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
         state = refine(whole, chosen.state.theta)
         # With a drift beside it, a fit may still run off to where it is no process any more; and
         # where no structure holds what came, the simplest may leave all of it.
-        if selection.candidate(whole, state) is not None and (
+        if ground.candidate(whole, state) is not None and (
             known.structure or len(rest) == 1 or _responds(whole, state)
         ):
             return Fit(whole, state, (chosen,) if known.structure else tuple(rest), scale)
@@ -257,16 +259,16 @@ def _outliers(whole: Problem, problem: Problem, state: State) -> NDArray[np.bool
     return found
 
 
-def _candidates(selection: Selection, known: Known) -> list[Candidate]:
+def _candidates(ground: Ground, known: Known) -> list[Candidate]:
     if not known.structure:
-        candidates = selection.all()
+        candidates = fit_all(ground)
         if not candidates:
             raise IdentificationError(
                 "no structure explains the record with a gain in the direction of the relay: "
                 "check that command and measurement belong to one loop"
             )
         return candidates
-    found = selection.fit(known.structure, known.order)
+    found = fit_one(ground, known.structure, known.order)
     if found is None:
         raise IdentificationError(
             f"no {known.structure} model explains the record; leave the structure open to have "

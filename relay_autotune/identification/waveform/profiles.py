@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.identification.differences import jacobian, relative_steps
 from relay_autotune.identification.waveform.separable import Problem, State
 
 FloatArray = NDArray[np.float64]
@@ -147,6 +148,8 @@ def _hold(
         c[1:own] *= c[0]
         return x[k:], c
 
+    numbers = np.arange(point.size)
+    logarithms = (numbers == 0) | ((k <= numbers) & (numbers < point.size - 1))
     cost = math.inf
     for _ in range(_MOST_TRIALS):
         theta, coefficients = unpacked(point)
@@ -156,11 +159,12 @@ def _hold(
             y, columns, derivatives = (x * problem.weight for x in (y, columns, derivatives))
         by_theta = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
         residual = y - coefficients @ columns
-        jacobian = np.concatenate((columns, by_theta))
-        jacobian[0] = coefficients[:own] @ columns[:own]
-        jacobian[1:own] *= coefficients[0]
+        slopes = np.concatenate((columns, by_theta))
+        slopes[0] = coefficients[:own] @ columns[:own]
+        slopes[1:own] *= coefficients[0]
         miss = target - parameter(theta, coefficients)
-        gradient = _gradient(point, k, lambda x: parameter(*unpacked(x)))
+        steps = relative_steps(point, logarithms)
+        gradient = jacobian(lambda x: parameter(*unpacked(x)), point, steps)
         if not (math.isfinite(miss) and bool(np.all(np.isfinite(gradient)))):
             return None
         with np.errstate(over="ignore"):
@@ -170,7 +174,7 @@ def _hold(
         small = abs(miss) <= 1e-6 * (abs(target) or 1.0)
         if small and abs(previous - cost) <= _SETTLED * cost / residual.size:
             return theta, coefficients, cost
-        step = _constrained(jacobian, residual, gradient, miss)
+        step = _constrained(slopes, residual, gradient, miss)
         if step is None or float(np.abs(step[k:-1]).max(initial=0.0)) > _FAR:
             return None
         point = point + step
@@ -198,21 +202,3 @@ def _constrained(
         step = np.asarray((onto + along @ solved) / size)
     # A direction that the samples hardly show may ask for more than numbers hold.
     return step if np.all(np.isfinite(step)) else None
-
-
-def _gradient(point: FloatArray, k: int, parameter: Callable[[FloatArray], float]) -> FloatArray:
-    """Return the derivatives of a parameter, shape (p,).
-
-    :param point: shape (p,); the first k of them and the last are no logarithms.
-    """
-    found = np.zeros(point.size)
-    for i, value in enumerate(point):
-        h = 1e-6 * (abs(value) or 1.0)
-        h = max(h, 1e-6) if i == 0 or k <= i < point.size - 1 else h
-        ends = []
-        for side in (h, -h):
-            moved = point.copy()
-            moved[i] += side
-            ends.append(parameter(moved))
-        found[i] = (ends[0] - ends[1]) / (2.0 * h)
-    return found

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,7 @@ from relay_autotune.process.structures import (
     INTEGRATOR_LAG,
     IPDT,
     LAG_COMPLEX,
+    LAG_N,
     LAG_N_ZERO,
     SOPDT,
     SOPDT_ZERO,
@@ -65,8 +68,20 @@ _BEYOND_HOPE = 4.0
 # a smaller mean square of the range, what it leaves is curvature that the promise does not know.
 _NO_PROMISE = 6.0
 _CLEAN = 1e-6
+# In this order structures are fitted: those first that tell which others are hopeless.
+_TRIED = tuple(
+    s.name
+    for s in (
+        *(FOPDT, LAG_N, SOPDT, THREE_LAGS, TWO_EQUAL_ONE, LAG_N_ZERO, SOPDT_ZERO),
+        *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
+    )
+)
+_SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
 # What is asked for whatever it leaves.
-_ALWAYS = ("fopdt", "ipdt")
+_ALWAYS = (FOPDT.name, IPDT.name)
+
+# A structure, and where the starts of its fit lead at first.
+_Begun = tuple[Structure, list[State]]
 
 
 @dataclass(frozen=True)
@@ -90,44 +105,41 @@ class Candidate:
         return self.problem.structure
 
 
-class Selection:
-    """All structures on one record.
+@dataclass(frozen=True)
+class Ground:
+    """What structures are fitted to, and where their fits begin.
 
-    :param problem: samples and input, with a FOPDT structure.
+    :param problem: samples and input, drift and initial state, with a FOPDT structure.
+    :param fopdt: the FOPDT that fits best.
+    :param starts: of every structure.
     :param floor: sum of squares that is rounding.
     :param sign: the direction in which the relay worked, 1 or -1, which a model must share; 0:
         not known.
     """
 
-    def __init__(self, problem: Problem, floor: float, sign: int = 0) -> None:
-        self._problem, self._floor, self._sign = problem, floor, sign
-        # The least mean square so far.
-        self._least = math.inf
-        # How an unstable fit to a problem begins.
-        self._begun: tuple[Problem, list[State]] | None = None
-        self._fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
-        self._leave_out_the_unknown()
-        self._starts = Starts(self._problem, self._fopdt)
+    problem: Problem
+    fopdt: State
+    starts: Starts
+    floor: float
+    sign: int
 
-    def _leave_out_the_unknown(self) -> None:
-        """Begin later where a record that was cut out of a movement explains itself better so."""
-        whole = replace(self._problem, relaxation=True)
-        _, longest = time_scales(whole)
-        later = whole.part(whole.time >= whole.starts + longest)
-        if 2 * later.time.size < whole.time.size or not _is_driven(later):
-            return
-        first = refine(whole, self._fopdt.theta, tolerance=_TRIAL)
-        if first.cost <= _MUCH_BETTER * self._floor:
-            return
-        second = refine_best(later, start_fopdt(later, self._sign), tolerance=_TRIAL)
-        enough = _MUCH_BETTER * second.cost / later.time.size
-        if enough >= first.cost / whole.time.size:
-            return
-        # A long first swing from rest shows small lags, which a FOPDT lacks.
-        third = replace(self._problem, structure=THREE_LAGS)
-        flexible = refine_best(third, Starts(third, self._fopdt).third(), tolerance=_TRIAL)
-        if flexible.cost / third.time.size > enough:
-            self._problem, self._fopdt = later, second
+    @classmethod
+    def of(cls, problem: Problem, floor: float, sign: int = 0) -> Ground:
+        """Return the ground that a record gives.
+
+        :param problem: samples and input, with a FOPDT structure.
+        :param floor: sum of squares that is rounding.
+        :param sign: the direction in which the relay worked; 0: not known.
+        """
+        fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
+        problem, fopdt = _without_the_unknown(problem, fopdt, floor, sign)
+        return cls(problem, fopdt, Starts(problem, fopdt), floor, sign)
+
+    @cached_property
+    def unstable(self) -> list[State]:
+        """The beginning of an unstable FOPDT's fit, from which two structures go on."""
+        problem = replace(self.problem, structure=UNSTABLE_FOPDT)
+        return begin(problem, self.starts.unstable(problem))
 
     def candidate(self, problem: Problem, state: State) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure."""
@@ -136,16 +148,14 @@ class Selection:
         if model is None and structure == THREE_LAGS:
             problem = replace(problem, structure=LAG_COMPLEX)
             model = LAG_COMPLEX.model_at(state.theta, state.coefficients)
-        if model is None:
+        if model is None or (self.sign and model.process_sign != self.sign):
             return None
-        if self._sign and model.process_sign != self._sign:
-            return None
-        shortest, _ = time_scales(self._problem)
-        time = self._problem.time
+        shortest, _ = time_scales(self.problem)
+        time = self.problem.time
         if is_unseen(model, shortest, float(time[-1] - time[0])):
             return None
         criterion = information_criterion(
-            state.cost, problem.time.size, state.parameters, self._floor
+            state.cost, problem.time.size, state.parameters, self.floor
         )
         return Candidate(problem, state, model, criterion)
 
@@ -171,177 +181,218 @@ class Selection:
                     best = other
         return best
 
-    def fit(self, name: str, order: int = 0) -> Candidate | None:
-        """Fit one structure; None if the data cannot be read as it.
-
-        :param name: of the structure.
-        :param order: of equal lags; 0: the best of them.
-        """
-        found = [c for c in self._family(name, order) if c is not None]
-        return min(found, key=lambda c: c.criterion) if found else None
-
-    def all(self) -> list[Candidate]:
-        """Fit every structure; the best first."""
-        names = (
-            *("fopdt", "lag_n", "sopdt", "three_lags", "two_equal_one"),
-            *("lag_n_zero", "sopdt_zero", "ipdt", "integrator_lag", "integrator_inverse"),
-            *("unstable_fopdt", "unstable_sopdt"),
-        )
-        # Drift and initial state are decided with the better of two flexible structures, and with
-        # an integrator, to which a command off its balance is a drift.
-        simple = [c for name in ("fopdt", "sopdt") if (c := self.fit(name)) is not None]
-        integrator = self.fit("ipdt")
-        if not simple:
-            return []
-        whole = self._problem
-        decided = self.with_nuisances(min(simple, key=lambda c: c.criterion))
-        if integrator is not None:
-            other = self.with_nuisances(integrator)
-            decided = min(decided, other, key=lambda c: c.criterion)
-            simple.append(integrator)
-        base = decided.problem
-        found = self._fit_beside(base, names, simple)
-        if found and (base.drift or base.relaxation):
-            # What these two leave unexplained may pass for a drift: the best one is asked again.
-            best = found[0]
-            self._problem, self._least = whole, math.inf
-            plain = self._best(best.structure, [best.state.theta])
-            again = base if plain is None else self.with_nuisances(plain).problem
-            if (again.drift, again.relaxation) != (base.drift, base.relaxation):
-                return self._fit_beside(again, names, simple) or found
-        return found
-
-    def _fit_beside(
-        self, nuisances: Problem, names: tuple[str, ...], ready: list[Candidate]
-    ) -> list[Candidate]:
-        """Fit structures to all samples with the drift and initial state of a problem.
+    def beside(self, nuisances: Problem) -> Ground:
+        """Return the ground with the drift and initial state of a problem.
 
         :param nuisances: the problem.
-        :param names: of the structures.
-        :param ready: what was fitted before, perhaps to the same problem.
         """
         problem = replace(nuisances, structure=FOPDT)
         if problem.relaxation:
             # A FOPDT has the longest dead time of all, since it counts every small lag to it.
-            first = refine(problem, self._fopdt.theta, tolerance=_TRIAL)
+            first = refine(problem, self.fopdt.theta, tolerance=_TRIAL)
             problem = after_the_unknown(problem, first)
-        self._problem = problem
-        same = {
-            c.structure.name: c
-            for c in ready
-            if (c.problem.drift, c.problem.relaxation, c.problem.time.size)
-            == (problem.drift, problem.relaxation, problem.time.size)
-        }
-        self._least = math.inf
-        found: list[Candidate] = []
-        for name in names:
-            family = [same[name]] if name in same else self._family(name, 0)
-            found += [c for c in family if c is not None]
-        found.sort(key=lambda c: c.criterion)
-        return self._weighed(found)
+        return replace(self, problem=problem)
 
-    def _weighed(self, found: list[Candidate]) -> list[Candidate]:
-        """Return the candidates by what their samples are worth, the best first.
+    def fit(
+        self, names: Iterable[str], order: int = 0, ready: Sequence[Candidate] = ()
+    ) -> list[Candidate]:
+        """Fit structures, one after the other: a hopeless one is given up early.
 
-        Where even the best residual is correlated, it is by jitter or by what no structure holds.
+        :param names: of the structures.
+        :param order: of equal lags; 0: several.
+        :param ready: what was fitted before, perhaps to the same samples with the same terms.
         """
-        if not found or found[0].state.cost <= self._floor:
-            return found
-        n = found[0].problem.time.size
-        each = worth(found[0].state.residual, _CORRELATED)
-        if each == 1.0:
-            return found
-        weighed = [
-            replace(
-                c,
-                criterion=information_criterion(
-                    c.state.cost, n, c.state.parameters, self._floor, each
-                ),
-            )
-            for c in found
-        ]
-        return sorted(weighed, key=lambda c: c.criterion)
+        terms = _terms(self.problem)
+        same = {c.structure.name: c for c in ready if _terms(c.problem) == terms}
+        # The least mean square so far.
+        least = math.inf
+        found: list[Candidate | None] = []
+        for name in names:
+            if name in same:
+                found.append(same[name])
+                continue
+            for structure, begun in self._family(name, order):
+                problem = replace(self.problem, structure=structure)
+                state = _followed(problem, begun, least)
+                if state is not None:
+                    least = min(least, max(state.cost, self.floor) / problem.time.size)
+                    found.append(self.candidate(problem, state))
+        return [c for c in found if c is not None]
 
-    def _family(self, name: str, order: int) -> list[Candidate | None]:
-        starts = self._starts
+    def refit(self, found: Candidate) -> Candidate | None:
+        """Fit the structure of a candidate here, from where it is."""
+        for structure, begun in self._begun(found.structure, [found.state.theta]):
+            problem = replace(self.problem, structure=structure)
+            state = _followed(problem, begun, math.inf)
+            return None if state is None else self.candidate(problem, state)
+        return None
+
+    def _begun(self, structure: Structure, thetas: list[FloatArray]) -> Iterator[_Begun]:
+        """Begin fits; so few samples as may be tell no more than a first order."""
+        enough = _SAMPLES_EACH * (structure.order + 4) <= self.problem.time.size
+        if enough or structure.order <= 1:
+            yield structure, begin(replace(self.problem, structure=structure), thetas)
+
+    def _family(self, name: str, order: int) -> Iterator[_Begun]:
+        starts, begun = self.starts, self._begun
         match name:
-            case "fopdt":
-                return [self._best(FOPDT, [self._fopdt.theta])]
-            case "lag_n":
-                orders = [order] if order else range(2, MOST_LAGS + 1)
-                return [self._best(equal_lags(n), [starts.lag_n(n)]) for n in orders]
-            case "lag_n_zero":
-                orders = [order] if order else range(2, _MOST_LAGS_WITH_ZERO + 1)
-                return [self._best(LAG_N_ZERO.of_order(n), starts.lag_n_zero(n)) for n in orders]
-            case "sopdt":
-                return [self._best(SOPDT, starts.sopdt())]
-            case "sopdt_zero":
-                thetas = [*starts.sopdt(), self._two_equal_lags()]
-                return [self._best(SOPDT_ZERO, thetas)]
-            case "two_equal_one":
-                return [self._best(TWO_EQUAL_ONE, starts.two_equal_one())]
-            case "three_lags" | "lag_complex":
-                return [self._best(THREE_LAGS, starts.third())]
-            case "ipdt":
-                return [self._best(IPDT, [starts.integrator()])]
-            case "integrator_lag":
-                return [self._best(INTEGRATOR_LAG, starts.integrator_lag())]
-            case "integrator_inverse":
-                return [self._best(INTEGRATOR_INVERSE, starts.integrator_lag())]
-            case "unstable_fopdt":
-                return [self._continued(UNSTABLE_FOPDT, self._unstable())]
-            case "unstable_sopdt":
-                chosen = starts.unstable_second(self._unstable()[0].theta)
-                return [self._best(UNSTABLE_SOPDT, chosen)]
-        return []
+            case FOPDT.name:
+                yield from begun(FOPDT, [self.fopdt.theta])
+            case LAG_N.name:
+                for n in [order] if order else range(2, MOST_LAGS + 1):
+                    yield from begun(equal_lags(n), [starts.lag_n(n)])
+            case LAG_N_ZERO.name:
+                for n in [order] if order else range(2, _MOST_LAGS_WITH_ZERO + 1):
+                    yield from begun(LAG_N_ZERO.of_order(n), starts.lag_n_zero(n))
+            case SOPDT.name:
+                yield from begun(SOPDT, starts.sopdt())
+            case SOPDT_ZERO.name:
+                yield from begun(SOPDT_ZERO, [*starts.sopdt(), self._two_equal_lags()])
+            case TWO_EQUAL_ONE.name:
+                yield from begun(TWO_EQUAL_ONE, starts.two_equal_one())
+            case THREE_LAGS.name | LAG_COMPLEX.name:
+                yield from begun(THREE_LAGS, starts.third())
+            case IPDT.name:
+                yield from begun(IPDT, [starts.integrator()])
+            case INTEGRATOR_LAG.name:
+                yield from begun(INTEGRATOR_LAG, starts.integrator_lag())
+            case INTEGRATOR_INVERSE.name:
+                yield from begun(INTEGRATOR_INVERSE, starts.integrator_lag())
+            case UNSTABLE_FOPDT.name:
+                yield UNSTABLE_FOPDT, self.unstable
+            case UNSTABLE_SOPDT.name:
+                yield from begun(UNSTABLE_SOPDT, starts.unstable_second(self.unstable[0].theta))
 
     def _two_equal_lags(self) -> FloatArray:
         """Return a start of two lags and a zero: the two equal ones that fit best.
 
         From a FOPDT, which answers the right way at once, not every inverse response is found.
         """
-        problem = replace(self._problem, structure=LAG_N_ZERO.of_order(2))
-        best = go_on(problem, begin(problem, self._starts.lag_n_zero(2)))[0]
+        problem = replace(self.problem, structure=LAG_N_ZERO.of_order(2))
+        best = go_on(problem, begin(problem, self.starts.lag_n_zero(2)))[0]
         return np.array((best.theta[0], 0.0, best.theta[1]))
 
-    def _unstable(self) -> list[State]:
-        """Return the beginning of an unstable FOPDT's fit, from which two structures go on."""
-        if self._begun is None or self._begun[0] is not self._problem:
-            problem = replace(self._problem, structure=UNSTABLE_FOPDT)
-            self._begun = self._problem, begin(problem, self._starts.unstable(problem))
-        return self._begun[1]
 
-    def _best(self, structure: Structure, thetas: list[FloatArray]) -> Candidate | None:
-        problem = replace(self._problem, structure=structure)
-        if _SAMPLES_EACH * (structure.order + 4) > problem.time.size and structure.order > 1:
-            # So few samples tell no more than a first order.
+def fit_one(ground: Ground, name: str, order: int = 0) -> Candidate | None:
+    """Fit one structure; None if the data cannot be read as it.
+
+    :param ground: what it is fitted to.
+    :param name: of the structure.
+    :param order: of equal lags; 0: the best of them.
+    """
+    return min(ground.fit([name], order), key=lambda c: c.criterion, default=None)
+
+
+def fit_all(ground: Ground) -> list[Candidate]:
+    """Fit every structure; the best first.
+
+    :param ground: what they are fitted to.
+    """
+    # Drift and initial state are decided with the better of two flexible structures, and with
+    # an integrator, to which a command off its balance is a drift.
+    simple = ground.fit(_SIMPLE)
+    flexible = [c for c in simple if c.structure != IPDT]
+    if not flexible:
+        return []
+    decided = ground.with_nuisances(min(flexible, key=lambda c: c.criterion))
+    for integrator in simple:
+        if integrator.structure == IPDT:
+            other = ground.with_nuisances(integrator)
+            decided = min(decided, other, key=lambda c: c.criterion)
+    base = decided.problem
+    found = _sorted(ground.beside(base), simple)
+    if found and (base.drift or base.relaxation):
+        # What these two leave unexplained may pass for a drift: the best one is asked again.
+        plain = ground.refit(found[0])
+        again = base if plain is None else ground.with_nuisances(plain).problem
+        if (again.drift, again.relaxation) != (base.drift, base.relaxation):
+            return _sorted(ground.beside(again), simple) or found
+    return found
+
+
+def _sorted(ground: Ground, ready: Sequence[Candidate]) -> list[Candidate]:
+    """Fit all structures, and return them by what their samples are worth, the best first.
+
+    Where even the best residual is correlated, it is by jitter or by what no structure holds.
+    """
+    found = sorted(ground.fit(_TRIED, ready=ready), key=lambda c: c.criterion)
+    if not found or found[0].state.cost <= ground.floor:
+        return found
+    n = found[0].problem.time.size
+    each = worth(found[0].state.residual, _CORRELATED)
+    if each == 1.0:
+        return found
+
+    def weighed(c: Candidate) -> Candidate:
+        criterion = information_criterion(c.state.cost, n, c.state.parameters, ground.floor, each)
+        return replace(c, criterion=criterion)
+
+    return sorted(map(weighed, found), key=lambda c: c.criterion)
+
+
+def _terms(problem: Problem) -> tuple[bool, bool, int]:
+    """Return what two problems of one record may differ in, beside the structure."""
+    return problem.drift, problem.relaxation, problem.time.size
+
+
+def _followed(problem: Problem, begun: list[State], least: float) -> State | None:
+    """Return the best fit that a beginning leads to; None where it is hopeless.
+
+    :param problem: the problem.
+    :param begun: the beginning.
+    :param least: the least mean square of another structure.
+    """
+    asked = problem.structure.name in _ALWAYS
+
+    def promises_nothing(states: list[State]) -> bool:
+        return least_promised(problem, states) > _NO_PROMISE * max(least, _CLEAN)
+
+    def is_hopeless(state: State) -> bool:
+        return state.cost / state.residual.size > _BEYOND_HOPE * least
+
+    if not asked and promises_nothing(begun):
+        return None
+    rough = go_on(problem, begun)
+    if not asked and is_hopeless(rough[0]):
+        if promises_nothing(rough[:1]):
             return None
-        return self._continued(structure, begin(problem, thetas))
-
-    def _continued(self, structure: Structure, begun: list[State]) -> Candidate | None:
-        """Return the best fit that a beginning leads to; None where it is hopeless."""
-        problem = replace(self._problem, structure=structure)
-        asked = structure.name in _ALWAYS
-        if not asked and self._promises_nothing(problem, begun):
+        # Unless it was on its way still.
+        best = rough[0]
+        rough = [refine(coarse(problem), best.theta, tolerance=_TRIAL, damping=best.damping)]
+        if is_hopeless(rough[0]):
             return None
-        rough = go_on(problem, begun)
-        if not asked and self._is_hopeless(rough[0]):
-            if self._promises_nothing(problem, rough[:1]):
-                return None
-            # Unless it was on its way still.
-            best = rough[0]
-            rough = [refine(coarse(problem), best.theta, tolerance=_TRIAL, damping=best.damping)]
-            if self._is_hopeless(rough[0]):
-                return None
-        state = refine_all(problem, rough, _TRIAL)
-        self._least = min(self._least, max(state.cost, self._floor) / problem.time.size)
-        return self.candidate(problem, state)
+    return refine_all(problem, rough, _TRIAL)
 
-    def _promises_nothing(self, problem: Problem, begun: list[State]) -> bool:
-        return least_promised(problem, begun) > _NO_PROMISE * max(self._least, _CLEAN)
 
-    def _is_hopeless(self, rough: State) -> bool:
-        return rough.cost / rough.residual.size > _BEYOND_HOPE * self._least
+def _without_the_unknown(
+    problem: Problem, fopdt: State, floor: float, sign: int
+) -> tuple[Problem, State]:
+    """Begin later where a record that was cut out of a movement explains itself better so.
+
+    :param problem: all samples.
+    :param fopdt: the FOPDT that fits them best.
+    :param floor: sum of squares that is rounding.
+    :param sign: the direction in which the relay worked; 0: not known.
+    :return: the samples to be fitted, and the FOPDT that fits these best.
+    """
+    whole = replace(problem, relaxation=True)
+    _, longest = time_scales(whole)
+    later = whole.part(whole.time >= whole.starts + longest)
+    if 2 * later.time.size < whole.time.size or not _is_driven(later):
+        return problem, fopdt
+    first = refine(whole, fopdt.theta, tolerance=_TRIAL)
+    if first.cost <= _MUCH_BETTER * floor:
+        return problem, fopdt
+    second = refine_best(later, start_fopdt(later, sign), tolerance=_TRIAL)
+    enough = _MUCH_BETTER * second.cost / later.time.size
+    if enough >= first.cost / whole.time.size:
+        return problem, fopdt
+    # A long first swing from rest shows small lags, which a FOPDT lacks.
+    third = replace(problem, structure=THREE_LAGS)
+    flexible = refine_best(third, Starts(third, fopdt).third(), tolerance=_TRIAL)
+    if flexible.cost / third.time.size <= enough:
+        return problem, fopdt
+    return later, second
 
 
 def after_the_unknown(problem: Problem, state: State) -> Problem:

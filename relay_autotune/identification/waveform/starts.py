@@ -228,7 +228,6 @@ class Starts:
     """
 
     def __init__(self, problem: Problem, fopdt: State) -> None:
-        self._unstable: list[FloatArray] | None = None
         shortest, self.longest = time_scales(problem)
         # A FOPDT that fits badly may run off to an integrator, which tells the others nothing.
         self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
@@ -303,8 +302,6 @@ class Starts:
 
         :param problem: with an unstable FOPDT structure.
         """
-        if self._unstable is not None:
-            return self._unstable
         few = coarse(problem)
         grid = [
             np.array((math.log(tau * self.longest), share * self.longest))
@@ -312,8 +309,7 @@ class Starts:
             for share in (0.05, 0.2, 0.4, 0.7)
         ]
         states = [evaluate(few, theta) for theta in grid]
-        self._unstable = [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
-        return self._unstable
+        return [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
 
     def unstable_second(self, first: FloatArray) -> list[FloatArray]:
         """Return starts of an unstable pole with a lag, from an unstable FOPDT's theta."""
