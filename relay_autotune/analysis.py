@@ -467,7 +467,7 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
         options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
     if options.sample_period == 0.0 and len(record) > 1:
         # The controller will see the same measurement.
-        options = replace(options, sample_period=float(np.median(np.diff(record.time))))
+        options = replace(options, sample_period=record.interval)
     return options
 
 

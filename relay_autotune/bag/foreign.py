@@ -9,7 +9,7 @@ import numpy as np
 
 from relay_autotune.bag.fields import split_name
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
-from relay_autotune.bag.signals import Signal, cut, join
+from relay_autotune.bag.signals import Signal, join
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.excitation import find_experiments
@@ -74,7 +74,7 @@ def take_apart(record: Record, *, whole: bool = False) -> tuple[list[Record], li
             "give a wrong model; record an experiment, or name a part to be used all the same "
             "with --start and --end"
         )
-    records = [cut(record, stretch.first, stretch.last + 1) for stretch in stretches]
+    records = [record.part(stretch.first, stretch.last + 1) for stretch in stretches]
     if len(stretches) == 1 and len(records[0]) == len(record):
         return records, []
     begins = record.time[[stretch.first for stretch in stretches]]

@@ -97,36 +97,7 @@ def window(record: Record, start: float | None, end: float | None) -> Record:
             f"no sample lies between --start {0.0 if start is None else start:g} s and "
             f"--end {time[-1] if end is None else end:g} s; the recording is {time[-1]:g} s long"
         )
-    return cut(record, low, high)
-
-
-def cut(record: Record, low: int, high: int) -> Record:
-    """Return some of the samples of a record; the command's history is kept.
-
-    :param record: the record.
-    :param low: index of the first sample to keep.
-    :param high: index of the first one after it not to keep.
-    """
-    if low == 0 and high == len(record):
-        return record
-    origin = float(record.time[low])
-    held = record.held_input
-    if low > 0 or held is not None:
-        # Without what came before, the process would seem to begin at rest.
-        whole = record.input()
-        held = PiecewiseConstant(whole.times - origin, whole.values, whole.initial)
-    part = slice(low, high)
-    return replace(
-        record,
-        time=record.time[part] - origin,
-        measurement=record.measurement[part],
-        command=record.command[part],
-        receive_time=record.receive_time[part] - origin,
-        command_time=record.command_time[part] - origin,
-        cycle_start=tuple(i - low for i in record.cycle_start if low <= i < high),
-        start=record.start + origin if record.start else 0.0,
-        held_input=held,
-    )
+    return record.part(low, high)
 
 
 def _check(signal: Signal, role: str) -> None:

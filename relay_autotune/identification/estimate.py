@@ -206,14 +206,19 @@ class Estimate:
         size = np.maximum(np.abs(values), np.where(structure.logarithmic, 0.0, radian))
         size = step * np.where(size == 0.0, radian, size)
         steps = exact_steps(values, size, structure.least)
-        change = jacobian(lambda x: log_response(x, frequency), values, *steps)
-        by_frequency_of = -change.imag / by_frequency.imag
-        by_gain_of = -gain * (change.real + by_frequency.real * by_frequency_of)
+
+        def size_and_phase(x: FloatArray) -> tuple[float, float]:
+            found = log_response(x, frequency)
+            return found.real, found.imag
+
+        size_changes, phase_changes = jacobian(size_and_phase, values, *steps)
+        frequency_changes = -phase_changes / by_frequency.imag
+        gain_changes = -gain * (size_changes + by_frequency.real * frequency_changes)
 
         def deviation(gradient: FloatArray) -> float:
             return math.sqrt(max(float(gradient @ self.covariance @ gradient), 0.0))
 
-        return deviation(by_gain_of), deviation(by_frequency_of)
+        return deviation(gain_changes), deviation(frequency_changes)
 
     def draws(self, count: int, rng: np.random.Generator) -> Iterator[TransferFunction]:
         """Draw models from the uncertainty.

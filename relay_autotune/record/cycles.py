@@ -11,7 +11,14 @@ import numpy as np
 
 from relay_autotune.errors import RecordError
 from relay_autotune.record.foreign import find_cycles, settings_of
-from relay_autotune.record.record import Cycle, CycleFeatures, FloatArray, Outcome, Record
+from relay_autotune.record.record import (
+    Cycle,
+    CycleFeatures,
+    FloatArray,
+    Outcome,
+    Record,
+    asked_once,
+)
 
 __all__ = [
     "MIN_CYCLES",
@@ -189,6 +196,7 @@ def next_cycle(
     return replace(cycle, converged=True)
 
 
+@asked_once
 def cycles_of(
     record: Record, *, min_cycles: int = MIN_CYCLES, tolerance: float = TOLERANCE
 ) -> tuple[Cycle, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.record.record import FloatArray, IntArray, Record
+from relay_autotune.record.record import FloatArray, IntArray, Record, roughness
 
 # Switches between two levels that make a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
@@ -229,7 +229,7 @@ def _follows(record: Record, at: IntArray, up: np.ndarray) -> bool:
 def _settled(record: Record, last: int, changes: _Changes) -> FloatArray:
     """Return when the measurement has come to rest after each change [s], shape (m,)."""
     ends = np.append(changes.times[1:], record.time[last])
-    noise = _noise(record.measurement)
+    noise = roughness(record.measurement)
     settled = np.empty(changes.times.size)
     for k, (begin, end) in enumerate(zip(changes.times, ends, strict=True)):
         low, high = np.searchsorted(record.time, (begin, end), side="right")
@@ -278,7 +278,7 @@ def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, fl
     time, y = record.time[first : last + 1], record.measurement[first : last + 1]
     edges = np.unique(np.linspace(0, y.size, min(_BLOCKS, max(y.size // 5, 1)) + 1).astype(int))
     means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
-    noise = _noise(y)
+    noise = roughness(y)
     reach = max(_NOISE * noise, _SHARE * float(np.ptp(y)))
     if float(np.ptp(y)) < 2.5 * reach:
         return []
@@ -320,7 +320,7 @@ def _with_rest(
 ) -> list[Stretch]:
     """Add the rest before and after each experiment, and drop those that move nothing."""
     stretches = []
-    noise = _noise(record.measurement[first : last + 1])
+    noise = roughness(record.measurement[first : last + 1])
     for k, (begin, end, kind, reason) in enumerate(found):
         length = max(end - begin, 0.0)
         earliest = found[k - 1][1] if k else float(record.time[first])
@@ -333,11 +333,3 @@ def _with_rest(
             continue
         stretches.append(Stretch(low, high, kind, reason))
     return stretches
-
-
-def _noise(y: FloatArray) -> float:
-    """Estimate the standard deviation of white noise from second differences, robustly."""
-    if y.size < 4:
-        return 0.0
-    second = y[2:] - 2.0 * y[1:-1] + y[:-2]
-    return float(np.median(np.abs(second))) / (0.6745 * np.sqrt(6.0))

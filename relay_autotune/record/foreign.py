@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.record.record import FloatArray, IntArray, Record, RelaySettings
+from relay_autotune.record.record import FloatArray, IntArray, Record, RelaySettings, asked_once
 
 # Two commands nearer than this, relative to the range of the command, are one level.
 _LEVEL_TOLERANCE = 1e-6
@@ -39,6 +39,7 @@ class RelayStretch:
     down: IntArray
 
 
+@asked_once
 def find_cycles(record: Record) -> tuple[int, ...]:
     """Return the samples at which cycles begin, from the switches of the command alone.
 
@@ -88,6 +89,7 @@ def infer_settings(record: Record) -> RelaySettings | None:
     )
 
 
+@asked_once
 def settings_of(record: Record) -> RelaySettings | None:
     """Return the settings of a record's relay: its own, or else what its data tell.
 

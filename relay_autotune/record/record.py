@@ -5,7 +5,10 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,40 @@ _STRAIGHT = 1e-12
 IntArray = NDArray[np.int64]
 # No quantity of a process is larger, and the squares of smaller ones can be added.
 LARGEST = 1e152
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def asked_once(
+    question: Callable[Concatenate[Record, P], T],
+) -> Callable[Concatenate[Record, P], T]:
+    """Let a record remember the answer to a question, since it cannot change.
+
+    :param question: a function of a record, and of arguments that can be compared.
+    """
+
+    @wraps(question)
+    def ask(record: Record, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        key = (question, args, tuple(kwargs.items()))
+        if key not in record.answers:
+            record.answers[key] = question(record, *args, **kwargs)
+        answer: T = record.answers[key]
+        return answer
+
+    return ask
+
+
+def roughness(y: FloatArray) -> float:
+    """Estimate white noise from second differences, of which a smooth signal has little [y].
+
+    :param y: samples, shape (n,).
+    """
+    second = np.diff(y, 2)
+    return (
+        0.0 if second.size == 0 else float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))
+    )
 
 
 class Outcome(enum.IntEnum):
@@ -236,6 +273,7 @@ class Record:
         ``command`` and ``command_time`` say.
     :param continuous_command: True: the command moved along straight lines from one of its
         instants to the next, as an analogue controller's does; False: it was held.
+    :ivar answers: what was asked of the record before, see :func:`asked_once`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
         goes backwards, or the noise is negative.
     """
@@ -255,6 +293,9 @@ class Record:
     lost_samples: int = 0
     held_input: PiecewiseConstant | None = None
     continuous_command: bool = False
+    answers: dict[Hashable, Any] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         time = _as_column("time", self.time, None)
@@ -297,6 +338,10 @@ class Record:
                 f"{LARGEST:g}, or NaN where it was not measured"
             )
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy is asked anew.
+        return {**self.__dict__, "answers": {}}
+
     def __len__(self) -> int:
         return int(self.time.size)
 
@@ -305,6 +350,45 @@ class Record:
         """Time from the first sample to the last [s]."""
         return float(self.time[-1] - self.time[0])
 
+    @property
+    def interval(self) -> float:
+        """Median time between samples [s]."""
+        return _interval(self)
+
+    @property
+    def noise(self) -> float:
+        """The noise measured before the test, else what second differences show of it [y]."""
+        return self.noise_std if math.isfinite(self.noise_std) else _roughness(self)
+
+    def part(self, low: int, high: int) -> Record:
+        """Return some of the samples; the command's history is kept.
+
+        Without what came before, the process would seem to begin at rest.
+
+        :param low: index of the first sample to keep.
+        :param high: index of the first one after it not to keep.
+        """
+        if low == 0 and high == len(self):
+            return self
+        origin = float(self.time[low])
+        held = self.held_input
+        if low > 0 or held is not None:
+            whole = self.input()
+            held = PiecewiseConstant(whole.times - origin, whole.values, whole.initial)
+        kept = slice(low, high)
+        return replace(
+            self,
+            time=self.time[kept] - origin,
+            measurement=self.measurement[kept],
+            command=self.command[kept],
+            receive_time=self.receive_time[kept] - origin,
+            command_time=self.command_time[kept] - origin,
+            cycle_start=tuple(i - low for i in self.cycle_start if low <= i < high),
+            start=self.start + origin if self.start else 0.0,
+            held_input=held,
+        )
+
+    @asked_once
     def input(self) -> PiecewiseConstant:
         """Return the command as the process saw it, on the clock of the samples.
 
@@ -333,3 +417,13 @@ class Record:
         offset = float(np.min(self.receive_time - self.time))
         sent = np.maximum.accumulate(self.command_time - offset)
         return PiecewiseLinear.from_samples(sent, self.command)
+
+
+@asked_once
+def _interval(record: Record) -> float:
+    return float(np.median(np.diff(record.time)))
+
+
+@asked_once
+def _roughness(record: Record) -> float:
+    return roughness(record.measurement)

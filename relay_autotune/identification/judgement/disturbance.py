@@ -11,7 +11,7 @@ import numpy as np
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification import Identification
 from relay_autotune.identification.judgement.quality import is_contradicted, misfit
-from relay_autotune.record.record import Cycle, PiecewiseConstant, Record
+from relay_autotune.record.record import Cycle, Record
 
 # The end of a record alone is better if what it leaves beyond the noise is so much less.
 _BETTER = 0.5
@@ -42,21 +42,7 @@ def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
     if len(cycles) < KEPT_CYCLES + 1 or len(starts) < len(cycles) + 1:
         return None
     first = starts[-(KEPT_CYCLES + 1)]
-    origin = float(record.time[first])
-    held = record.held_input
-    if held is not None:
-        held = PiecewiseConstant(held.times - origin, held.values, held.initial)
-    return replace(
-        record,
-        time=record.time[first:] - origin,
-        measurement=record.measurement[first:],
-        command=record.command[first:],
-        receive_time=record.receive_time[first:] - origin,
-        command_time=record.command_time[first:] - origin,
-        cycle_start=tuple(s - first for s in starts if s >= first),
-        start=record.start + origin if record.start else 0.0,
-        held_input=held,
-    )
+    return record.part(first, len(record))
 
 
 def without_disturbance(

@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.symmetric_cycle import roughness
 from relay_autotune.record.record import Record
 
 # The noise is known to 10 % from the 50 samples before a test, so that a residual of 1.3 times
@@ -36,11 +35,6 @@ def misfit(found: Identification, record: Record, *, noise: float | None = None)
     return residual / allowed if allowed > 0.0 else (math.inf if residual > 0.0 else 0.0)
 
 
-def noise_of(record: Record) -> float:
-    """Return the noise measured before the test, else what second differences show of it [y]."""
-    return record.noise_std if math.isfinite(record.noise_std) else roughness(record)
-
-
 def is_contradicted(found: Identification, record: Record) -> bool:
     """Return whether what a model leaves is clearly no noise.
 
@@ -62,7 +56,7 @@ def unexplained_share(found: Identification, record: Record) -> float:
     :param record: the record.
     """
     variance = float(np.var(record.measurement))
-    left = found.fit.residual_rms**2 - noise_of(record) ** 2
+    left = found.fit.residual_rms**2 - record.noise**2
     return max(left, 0.0) / variance if variance > 0.0 else math.nan
 
 
@@ -72,4 +66,4 @@ def is_far_off(found: Identification, record: Record) -> bool:
     :param found: what was identified.
     :param record: the record.
     """
-    return misfit(found, record, noise=noise_of(record)) > _FAR_OFF
+    return misfit(found, record, noise=record.noise) > _FAR_OFF

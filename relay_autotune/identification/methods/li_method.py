@@ -134,7 +134,7 @@ def _errors(test: RelayTest) -> tuple[float, float]:
     """Relative errors of the averaged period and amplitude."""
     whole = test.whole
     values = features(whole)
-    interval = float(np.median(np.diff(whole.record.time)))
+    interval = whole.record.interval
     covariance, _ = test.scatter(features)
     spread = np.zeros(2) if covariance is None else np.sqrt(np.diag(covariance))
     period, amplitude = (spread / values).tolist()

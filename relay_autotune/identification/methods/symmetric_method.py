@@ -251,7 +251,7 @@ def _choice(
         return asked, ""
     if math.isnan(gain):
         return _choose_without_gain(method, cycle, test.whole)
-    interval = float(np.median(np.diff(test.whole.record.time)))
+    interval = test.whole.record.interval
 
     def tolerance(order: int) -> float:
         """Allow for the scatter of the cycles, and half a sample interval of dead time."""

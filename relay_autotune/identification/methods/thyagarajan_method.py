@@ -112,7 +112,6 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
     test = relay_test(METHOD, record)
     settings = test.whole.settings
     require_unbiased(METHOD, settings)
-    record = replace(record, settings=settings)
     reading = read_shape(record)
     if known.structure in (FOPDT.name, UNSTABLE_FOPDT.name) and reading.shape.category in (
         "2",

@@ -27,7 +27,7 @@ from relay_autotune.identification.methods.wang1997 import (
 )
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
-from relay_autotune.identification.shown.fold import Fold, as_switched, fold
+from relay_autotune.identification.shown.fold import Fold, as_switched, fold, fold_without
 from relay_autotune.identification.shown.steady_state import (
     UNKNOWN_REST,
     StaticGain,
@@ -36,7 +36,6 @@ from relay_autotune.identification.shown.steady_state import (
 )
 from relay_autotune.identification.shown.symmetric_cycle import require_unbiased
 from relay_autotune.process.structures import FOPDT
-from relay_autotune.record.cycles import find_cycles
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -158,10 +157,8 @@ def _likely_ratio(test: RelayTest, record: Record) -> tuple[float, float] | None
     cycles = test.whole.cycle.cycles
     if len(cycles) < _LEAST_CYCLES:
         return None
-    record = replace(record, settings=test.whole.settings, cycle_start=_bounds(record))
-    whole = fold(record, cycles)
-    seen = _ratio(whole)
-    parts = np.array([_ratio(part) for part in _without_each(whole, record, cycles)])
+    seen = _ratio(fold(record, cycles))
+    parts = np.array([_ratio(part) for part in _without_each(record, cycles)])
     scatter = math.sqrt(float(np.var(parts)) * (len(cycles) - 1))
     room = INTEGRATOR_RATIO - seen
     if room > 0.0:
@@ -179,10 +176,10 @@ def _ratio(seen: Fold) -> float:
     return 0.5 * (up - down) / (as_switched(seen).amplitude * abs(seen.fundamental()))
 
 
-def _without_each(whole: Fold, record: Record, cycles: tuple[int, ...]) -> Iterator[Fold]:
+def _without_each(record: Record, cycles: tuple[int, ...]) -> Iterator[Fold]:
     """Yield the averages without one cycle after the other, of some where they are many."""
     for left_out in cycles[:: -(-len(cycles) // _MOST_PARTS)]:
-        yield fold(record, tuple(c for c in cycles if c != left_out), whole)
+        yield fold_without(record, cycles, left_out)
 
 
 def _from_biased(seen: Fold, facts: _Facts) -> FloatArray:
@@ -233,7 +230,6 @@ def _identified(
     :param remark: for the user; may be empty.
     """
     settings = test.whole.settings
-    record = replace(record, settings=settings, cycle_start=_bounds(record))
     cycles = test.whole.cycle.cycles
     whole = fold(record, cycles)
 
@@ -247,7 +243,6 @@ def _identified(
     covariance = None
     if len(cycles) >= _LEAST_CYCLES:
         covariance = _jackknife(
-            whole,
             record,
             cycles,
             lambda part: values(part, facts),
@@ -265,12 +260,7 @@ def _identified(
     )
 
 
-def _bounds(record: Record) -> tuple[int, ...]:
-    return record.cycle_start or find_cycles(record)
-
-
 def _jackknife(
-    whole: Fold,
     record: Record,
     cycles: tuple[int, ...],
     measure: Callable[[Fold], FloatArray],
@@ -282,7 +272,7 @@ def _jackknife(
     :param partly: True: some need not solve.
     """
     parts, tried = [], 0
-    for part in _without_each(whole, record, cycles):
+    for part in _without_each(record, cycles):
         tried += 1
         try:
             parts.append(measure(part))

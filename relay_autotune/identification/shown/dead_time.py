@@ -101,8 +101,7 @@ def _scatter_of_edge(test: RelayTest, noisy: bool) -> float:
     In noise single cycles tell it; without, it is somewhere between two samples.
     """
     if not noisy:
-        interval = float(np.median(np.diff(test.whole.record.time)))
-        return interval / math.sqrt(12.0 * len(test.whole.cycle.cycles))
+        return test.whole.record.interval / math.sqrt(12.0 * len(test.whole.cycle.cycles))
     stride = -(-len(test.singles) // _MOST_SINGLES)
     edges = np.array([_edge(single)[0] for single in test.singles[::stride]])
     edges = edges[np.isfinite(edges)]

@@ -12,7 +12,7 @@ from scipy.special import fdtrc
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.record.cycles import cycles_of, settings_of
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import Record, asked_once
 
 FloatArray = NDArray[np.float64]
 
@@ -36,6 +36,7 @@ class Envelope:
     height: FloatArray
 
 
+@asked_once
 def envelope(record: Record) -> Envelope:
     """Return the peaks of all whole cycles of a record.
 

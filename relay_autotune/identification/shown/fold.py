@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.periodic_spline import Basis, Kinks, Spline
 from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
-from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, asked_once
 
 FloatArray = NDArray[np.float64]
 
@@ -144,30 +144,48 @@ class Fold:
         return np.asarray(y / unit if derivative else y)
 
 
-def fold(
-    record: Record,
-    cycles: tuple[int, ...] = (),
-    like: Fold | None = None,
-    *,
-    sharp: bool = False,
-) -> Fold:
+def fold(record: Record, cycles: tuple[int, ...] = (), *, sharp: bool = False) -> Fold:
     """Average the steady cycles of a relay test.
 
     :param record: with at least one whole cycle.
     :param cycles: numbers of the cycles to be averaged; default: those of the limit cycle.
-    :param like: an average whose knots are kept, and near whose kink that of this one is sought.
     :param sharp: True if there is a kink for certain, so that only its place is decided.
     :raises IdentificationError: if the record holds no whole cycle, or too few samples in it.
     """
-    settings = settings_of(record)
-    bounds = record.cycle_start or find_cycles(record)
-    if settings is None or len(bounds) < 2:
+    if settings_of(record) is None or len(record.cycle_start or find_cycles(record)) < 2:
         raise IdentificationError(
             "the shape of a limit cycle needs at least one whole cycle of a relay test and the "
             "record holds none: use the method waveform, which takes any input"
         )
-    chosen = cycles or limit_cycle(record).cycles
-    since, is_high, y, high, low = _overlaid(record, settings, bounds, chosen)
+    return _averaged(record, cycles or limit_cycle(record).cycles, sharp)
+
+
+@asked_once
+def fold_without(
+    record: Record, cycles: tuple[int, ...], left_out: int, sharp: bool = False
+) -> Fold:
+    """Average all but one of some cycles, with the knots of the average of all.
+
+    :param record: with whole cycles.
+    :param cycles: numbers of the cycles.
+    :param left_out: number of the cycle that is left out; the kink is sought near that of all.
+    :param sharp: as for :func:`fold`.
+    :raises IdentificationError: if there are too few samples in the others.
+    """
+    rest = tuple(c for c in cycles if c != left_out)
+    return _average(record, rest, fold(record, cycles, sharp=sharp), sharp=False)
+
+
+@asked_once
+def _averaged(record: Record, cycles: tuple[int, ...], sharp: bool) -> Fold:
+    return _average(record, cycles, None, sharp=sharp)
+
+
+def _average(record: Record, cycles: tuple[int, ...], like: Fold | None, *, sharp: bool) -> Fold:
+    settings = settings_of(record)
+    assert settings is not None
+    bounds = record.cycle_start or find_cycles(record)
+    since, is_high, y, high, low = _overlaid(record, settings, bounds, cycles)
     mirrored = abs(settings.bias) <= _NO_BIAS * settings.amplitude and abs(
         high - low
     ) <= _SYMMETRIC * (high + low)

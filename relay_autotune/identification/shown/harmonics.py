@@ -17,7 +17,6 @@ from relay_autotune.identification.shown.fourier import (
     fourier_integral_sampled,
     frequency_point,
 )
-from relay_autotune.identification.shown.symmetric_cycle import roughness
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -43,7 +42,7 @@ def measured_points(whole: Stretch) -> Points:
         frequency drowns in noise.
     """
     record = whole.record
-    interval = float(np.median(np.diff(record.time)))
+    interval = record.interval
     fundamental = 2.0 * math.pi / whole.cycle.period
     if fundamental * interval > _COARSEST:
         raise IdentificationError(
@@ -51,10 +50,9 @@ def measured_points(whole: Stretch) -> Points:
             f"samples; Fourier integrals need at least {2.0 * math.pi / _COARSEST:.0f}: sample "
             "faster, or use the method waveform"
         )
-    noise = record.noise_std if math.isfinite(record.noise_std) else roughness(record)
     first, last = record.cycle_start[0], record.cycle_start[-1]
     # White noise in n samples h apart has integrals whose parts have the variance std^2 h^2 n/2.
-    part = noise * interval * math.sqrt(0.5 * (last - first))
+    part = record.noise * interval * math.sqrt(0.5 * (last - first))
     found = []
     for harmonic in range(1, int(_COARSEST / (fundamental * interval)) + 1)[:_MOST]:
         try:
@@ -92,7 +90,7 @@ def with_noise_about(model: TransferFunction, whole: Stretch, points: Points) ->
     start, end, cycles = cycle_window(record)
     if cycles < 2:
         return points
-    interval = float(np.median(np.diff(record.time)))
+    interval = record.interval
     inside = slice(record.cycle_start[0], record.cycle_start[-1] + 1)
     time = record.time[inside]
     left = record.measurement[inside] - response(model, time, record.input())

@@ -19,10 +19,10 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.envelope import envelope, growth_time, normalised_growth
-from relay_autotune.identification.shown.fold import Fold, fold
+from relay_autotune.identification.shown.fold import Fold, fold, fold_without
 from relay_autotune.process.half_cycle import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import Record, asked_once
 
 FloatArray = NDArray[np.float64]
 
@@ -248,6 +248,7 @@ _VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_h
 _LEAST_CYCLES = 3
 
 
+@asked_once
 def shape_of_record(record: Record) -> Shape:
     """Return the shape of a relay test, the mean of its two halves.
 
@@ -270,8 +271,7 @@ def read_shape(record: Record, *, sharp: bool = False) -> Reading:
     shape = shape_of_fold(whole, _growth(record, whole.period))
     parts = []
     for left_out in cycles if len(cycles) >= _LEAST_CYCLES else ():
-        rest = tuple(c for c in cycles if c != left_out)
-        part = shape_of_fold(fold(record, rest, whole))
+        part = shape_of_fold(fold_without(record, cycles, left_out, sharp))
         parts.append([getattr(part, name) for name in _VARYING])
     covariance = None
     if parts:

@@ -10,8 +10,7 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.cycle_scatter import RelayTest, Stretch
 from relay_autotune.identification.shown.fourier import cycle_means
-from relay_autotune.identification.shown.symmetric_cycle import roughness
-from relay_autotune.record.record import FloatArray, Record, RelaySettings
+from relay_autotune.record.record import FloatArray, Record, RelaySettings, asked_once
 
 _LEAST_BIAS = 0.02
 _LEAST_SAMPLES = 8
@@ -54,6 +53,7 @@ class StaticGain:
         return math.hypot(self.scatter, rest.std / self.excursion)
 
 
+@asked_once
 def steady_state(record: Record, settings: RelaySettings) -> SteadyState:
     """Return the measurement at rest.
 
@@ -69,8 +69,7 @@ def steady_state(record: Record, settings: RelaySettings) -> SteadyState:
         return SteadyState(settings.setpoint, math.nan, measured=False)
     # The sample that was answered by the kick was itself taken at rest.
     y = record.measurement[: resting + 1]
-    known = record.noise_std if math.isfinite(record.noise_std) else roughness(record)
-    noise = float(np.std(y, ddof=1)) if y.size >= _LEAST_SAMPLES else known
+    noise = float(np.std(y, ddof=1)) if y.size >= _LEAST_SAMPLES else record.noise
     return SteadyState(float(np.mean(y)), noise / math.sqrt(y.size), measured=True)
 
 

@@ -12,7 +12,7 @@ from scipy.special import log_ndtr
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.shown.cycle_scatter import Stretch
-from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune.record.record import RelaySettings
 
 FloatArray = NDArray[np.float64]
 
@@ -108,7 +108,7 @@ class CycleReader:
         :param whole: all of them.
         """
         record = whole.record
-        noise = record.noise_std if math.isfinite(record.noise_std) else roughness(record)
+        noise = record.noise
         _, amplitude = features(whole)
         if noise <= _QUIET * amplitude:
             return cls(0.0, False)
@@ -176,14 +176,6 @@ def half_cycles(stretch: Stretch) -> tuple[FloatArray, FloatArray]:
     side = np.where(high != settings.reverse_acting, -1.0, 1.0)
     inside = (index >= 0) & (since < 0.5 * stretch.cycle.period)
     return since[inside], (side * (record.measurement[first:last] - middle))[inside]
-
-
-def roughness(record: Record) -> float:
-    """Estimate white noise from second differences, of which a smooth signal has little [y]."""
-    second = np.diff(record.measurement, 2)
-    return (
-        0.0 if second.size == 0 else float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))
-    )
 
 
 def _excess_of_peaks(whole: Stretch, noise: float) -> float:
