@@ -23,24 +23,24 @@ IntArray = NDArray[np.int64]
 LARGEST = 1e152
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 def asked_once(
-    question: Callable[Concatenate[Record, P], T],
-) -> Callable[Concatenate[Record, P], T]:
+    question: Callable[Concatenate[Record, _P], _T],
+) -> Callable[Concatenate[Record, _P], _T]:
     """Let a record remember the answer to a question, since it cannot change.
 
     :param question: a function of a record, and of arguments that can be compared.
     """
 
     @wraps(question)
-    def ask(record: Record, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def ask(record: Record, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         key = (question, args, tuple(kwargs.items()))
         if key not in record.answers:
             record.answers[key] = question(record, *args, **kwargs)
-        answer: T = record.answers[key]
+        answer: _T = record.answers[key]
         return answer
 
     return ask

@@ -11,8 +11,12 @@ from hypothesis import strategies as st
 
 from relay_autotune.analysis import analyse, analyse_alone, model_so_far
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification import Known, identify
+from relay_autotune.identification.judgement.disturbance import last_cycles
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.tuning import RULES
 
@@ -163,3 +167,19 @@ def test_a_running_test_forgets_a_disturbance_of_its_beginning():
     assert found is not None
     assert found.ultimate_gain == pytest.approx(2.3069, rel=0.01)
     assert found.ultimate_gain_std < 0.01 * found.ultimate_gain
+
+
+def test_the_end_of_a_disturbed_record_remembers_what_drove_the_process_before():
+    """A slow process still answers the commands of the cycles that are left out."""
+    slow = TransferFunction.sopdt(1.0, (60.0, 3.0), 3.0)
+    draws = 0.02 * np.random.default_rng(0).standard_normal(1500)
+    draws[150:220] += 0.5
+    relay = RelaySettings(0.0, 0.0, 1.0, 0.3, 0.1)
+    whole = replace(simulate_sampled_relay(slow, relay, period=0.2, noise=draws), noise_std=0.02)
+    end = last_cycles(whole, cycles_of(whole))
+    assert end is not None
+    origin = whole.time[len(whole) - len(end)]
+    earlier = end.time - 50.0
+    np.testing.assert_array_equal(end.input()(earlier), whole.input()(earlier + origin))
+    found = identify(end, known=Known(structure="sopdt"))
+    assert found.ultimate_gain == pytest.approx(ultimate_point(slow).gain, rel=0.2)
