@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.markdown import table
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import analyse_alone
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
@@ -110,7 +110,7 @@ def main(runs: int = 20) -> None:
         verdicts: Counter[Verdict] = Counter()
         wrong: Counter[Verdict] = Counter()
         for seed in range(runs):
-            found = analyse(record_of(kind, seed), alone=True)
+            found = analyse_alone(record_of(kind, seed))
             verdicts[found.verdict] += 1
             gains = found.best_gains
             if gains is None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from report_cases import completed
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.identification import identify
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import CHECKS
@@ -44,7 +44,7 @@ def record():
 
 @pytest.fixture(scope="module")
 def gains(record):
-    return analyse(record, alone=True).best_gains
+    return analyse_alone(record).best_gains
 
 
 def test_the_visible_error_is_the_difference_of_two_processes(record):
@@ -110,5 +110,5 @@ def test_steps_and_relays_of_ordinary_processes_are_trusted(record):
 def test_a_record_that_is_mostly_another_input_is_doubtful():
     record = steps(PROCESS, noise=0.0)
     other = np.cumsum(np.random.default_rng(8).normal(0.0, 0.35, len(record)))
-    found = analyse(replace(record, measurement=record.measurement + other), alone=True)
+    found = analyse_alone(replace(record, measurement=record.measurement + other))
     assert found.verdict is not Verdict.TRUSTED
