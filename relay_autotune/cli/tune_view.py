@@ -168,7 +168,8 @@ def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
-    first, *rest = textwrap.wrap(f"{outcome}: {result.reason}", _TEXT)
+    told = outcome if result.reason == outcome else f"{outcome}: {result.reason}"
+    first, *rest = textwrap.wrap(told, _TEXT)
     first = paint(outcome, f"{_BOLD};{colour}") + first.removeprefix(outcome)
     lines = [f"  {'tune':<16} {first}", *_continued(rest)]
     if outcome != "completed":

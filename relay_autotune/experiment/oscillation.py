@@ -296,15 +296,15 @@ class Oscillation:
         elif noise := self._only_noise(TELL):
             self._end(Outcome.FAILED, noise)
         elif self._until_converged and cycle.converged:
+            n = len(self.cycles)
+            which = f"{n}" if n == p.min_cycles else f"the last {p.min_cycles} of {n}"
             self._complete(
-                f"{len(self.cycles)} cycles, of which the last {p.min_cycles} agree within "
-                f"{p.cycle_tolerance:g} of half period and amplitude, noise and sample interval "
-                f"allowed for",
+                f"{which} cycles agree within {100.0 * p.cycle_tolerance:g} %, allowing for noise"
             )
         elif len(self.cycles) + self._turns.lost >= p.max_cycles:
             self._complete(
-                f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} do not agree "
-                f"within {p.cycle_tolerance:g} of half period and amplitude"
+                f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} cycles do not "
+                f"agree within {100.0 * p.cycle_tolerance:g} %"
                 if self._until_converged
                 else f"max_cycles, {p.max_cycles}, reached",
             )
@@ -427,8 +427,8 @@ class Oscillation:
         disturbed = sum(cycle.disturbed for cycle in self.cycles)
         if outcome is Outcome.COMPLETED and disturbed:
             self.notes.append(
-                f"{disturbed} of the cycles have a long gap in their samples, or a load came, or "
-                "they could not be told for a while"
+                f"{disturbed} of {len(self.cycles)} cycles disturbed: a long gap in the samples, "
+                "a load step, or switches that formed no clear cycle"
             )
         self.verdict = outcome, reason
 

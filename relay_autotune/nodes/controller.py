@@ -384,7 +384,9 @@ class ControllerNode(ServedNode):
             raise NotVerifiable("a tune is running")
         self._verifier.require_samples()
         if self._model is None:
-            raise NotVerifiable("no model has come that could predict anything")
+            raise NotVerifiable(
+                "no model has come, so the step cannot be predicted; run a tune first"
+            )
         if self._model_doubt and not self.get_parameter("accept_doubtful").value:
             raise NotVerifiable(
                 f"the model that would predict the step is {self._model_doubt}; set the parameter "

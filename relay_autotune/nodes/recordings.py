@@ -157,8 +157,10 @@ class Recordings:
 
         def late() -> None:
             missing = " and ".join(recording.missing)
-            recording.reason = recording.reason or f"not come within {timeout:g} s"
-            self.close(experiment_id, f"without {missing}, {recording.reason}")
+            recording.reason = (
+                recording.reason or f"identifier_node did not send them within {timeout:g} s"
+            )
+            self.close(experiment_id, f"without {missing}: {recording.reason}")
 
         recording.until = time.monotonic() + LONGEST * timeout
         recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=self._steady)
@@ -175,9 +177,9 @@ class Recordings:
         if recording.timer is not None:
             self._node.destroy_timer(recording.timer)
         if recording.closed is not None:
-            missing = " and ".join(recording.missing)
+            missing = " and no ".join(recording.missing)
             cause = f": {recording.reason}" if recording.reason else ""
-            recording.closed(f"{missing} did not come{cause}" if missing else "")
+            recording.closed(f"no {missing}{cause}" if missing else "")
         log, lacks = self._node.get_logger(), recording.waiting and recording.missing
 
         def say() -> None:

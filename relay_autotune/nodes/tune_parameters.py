@@ -92,7 +92,7 @@ NODE_PARAMETERS = (
         0.0,
         "u",
         "How far command_feedback may be from the command, where that topic is published; 0: "
-        "half of the amplitude, from the first cycle on where that finds itself.",
+        "half of the amplitude, and no check before the first cycle where the tune finds it.",
         0.0,
     ),
     Quantity(

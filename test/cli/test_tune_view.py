@@ -264,7 +264,7 @@ def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_pa
 def test_a_tune_without_gains_offers_none() -> None:
     stopped = result(outcome=Tune.Result.ABORTED, reason="cancelled", bag="/records/x")
     text = "\n".join(result_lines(stopped, True, Paint()))
-    assert "cancelled: cancelled" in text
+    assert "cancelled" in text and "cancelled: cancelled" not in text
     assert "safe command; no gains are given" in text
     assert [c for _, c in next_commands(stopped, ["/c"])] == ["replay /records/x"]
     assert document(stopped, "/relay_node", True)["gains"] is None

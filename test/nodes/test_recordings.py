@@ -53,7 +53,7 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
             if closed:
                 break
             executor.spin_once(timeout_sec=0.02)
-        assert ("did not come" in closed[0]) is not complete
+        assert ("no transfer_function and no pi_gains" in closed[0]) is not complete
         recordings.close_all("", 10.0)
         assert recordings.problem() == ""
     executor.shutdown()

@@ -314,7 +314,10 @@ def test_without_an_identifier_the_bag_is_closed_with_the_reason(rig: Rig) -> No
     start_plant(rig)
     relay = rig.relay(amplitude=1.0, baseline=0.0, sample_period=0.1, model_timeout=0.5)
     answer = rig.tune()
-    said = "is closed without transfer_function and pi_gains, not come within 0.5 s"
+    said = (
+        "is closed without transfer_function and pi_gains: "
+        "identifier_node did not send them within 0.5 s"
+    )
     rig.until(lambda: said in relay.log, "the end of the recording")
     (record,) = read_experiments(rig.bag(answer)).experiments
     assert record.experiment_id == answer.experiment_id
@@ -346,7 +349,7 @@ def test_an_identifier_that_takes_long_is_waited_for_and_says_if_nothing_comes(r
     relay.wait()
     relay = rig.relay(**limits, min_cycles=8)
     rig.tune()
-    said = "is closed without transfer_function and pi_gains, the experiment could not be analysed"
+    said = "is closed without transfer_function and pi_gains: the experiment could not be analysed"
     rig.until(lambda: said in relay.log, "the end of the recording")
 
 
