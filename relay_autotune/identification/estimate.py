@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.differences import exact_steps, jacobian
-from relay_autotune.process.structures import Structure
+from relay_autotune.process.structures import GivenModel, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.float64]
@@ -74,6 +74,11 @@ class Estimate:
         return cls(structure, values, covariance)
 
     @classmethod
+    def of_model(cls, model: TransferFunction) -> Estimate:
+        """Return a model of which only the transfer function is known."""
+        return cls.of(GivenModel.of(model), np.empty(0))
+
+    @classmethod
     def of_root(cls, structure: Structure, values: FloatArray, root: FloatArray) -> Estimate:
         """Return values with the covariance B B'.
 
@@ -96,7 +101,7 @@ class Estimate:
     @property
     def known(self) -> bool:
         """True if a covariance was estimated."""
-        return bool(np.all(np.isfinite(self.covariance)))
+        return self.values.size > 0 and bool(np.all(np.isfinite(self.covariance)))
 
     @property
     def std(self) -> FloatArray:

@@ -215,8 +215,7 @@ def _identification(m: dict[str, Any]) -> Identification:
 
 
 def _rival(r: dict[str, Any]) -> Rival:
-    alone = GivenModel.of(_model(r))
-    return Rival(Estimate.of(alone, np.empty(0)), _number(r["support"]))
+    return Rival(Estimate.of_model(_model(r)), _number(r["support"]))
 
 
 def _validation(v: dict[str, Any] | None) -> Validation | None:

@@ -10,7 +10,7 @@ import pytest
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Rival, identified
-from relay_autotune.process.structures import IPDT, SOPDT, GivenModel
+from relay_autotune.process.structures import IPDT, SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 
 LONG = TransferFunction.lag_complex(-0.4356, 148.123, 0.0123456, 0.345678, 15.8612)
@@ -19,9 +19,9 @@ ZERO = TransferFunction.sopdt(1234.5, (123.45, 12.345), 1.2345, -98.765)
 
 @pytest.mark.parametrize("model", [LONG, ZERO], ids=["long", "zero"])
 def test_no_model_is_wider_than_the_page(model):
-    rival = Rival(Estimate.of(GivenModel.of(LONG), np.empty(0)), 0.123)
+    rival = Rival(Estimate.of_model(LONG), 0.123)
     found = replace(
-        identified("waveform", Estimate.of(GivenModel.of(model), np.empty(0))),
+        identified("waveform", Estimate.of_model(model)),
         rivals=(rival,),
         warnings=("a sentence " * 30,),
     )

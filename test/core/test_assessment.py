@@ -14,7 +14,7 @@ from relay_autotune.analysis import Analysis
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.messages import fill_transfer_function
-from relay_autotune.identification import Known, identify
+from relay_autotune.identification import Estimate, Known, identify
 from relay_autotune.identification.judgement.assessment import assess, fit_of_model
 from relay_autotune.identification.judgement.validation import DIFFERENCES, integrated_error
 from relay_autotune.identification.waveform.residuals import noise_to_signal
@@ -75,7 +75,7 @@ def test_an_unstable_model_follows_no_open_loop(record):
 
 
 def test_a_model_without_limit_cycle_says_so(record, models):
-    wrong = replace(models[0], model=TransferFunction.fopdt(-1.0, 2.0, 1.0))
+    wrong = replace(models[0], estimate=Estimate.of_model(TransferFunction.fopdt(-1.0, 2.0, 1.0)))
     against = assess((wrong,), record)[0]
     assert "against the direction" in against.validation.reason
     assert against.validation.worst == math.inf

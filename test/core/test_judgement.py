@@ -9,12 +9,13 @@ import pytest
 from report_cases import completed
 
 from relay_autotune.analysis import analyse, analyse_alone
-from relay_autotune.identification import identify
+from relay_autotune.identification import Estimate, identify
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.judgement.visible import visible_error
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import GivenModel
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict, judge
@@ -30,8 +31,15 @@ def steps(process, *, noise=0.02, seed=3, until=200.0):
     return Record(time=time, measurement=y, command=u(time), held_input=u)
 
 
+def other_model(found, model):
+    """Return what was identified with another model in its place."""
+    own = found.estimate
+    structure = GivenModel.of(model, found.parameters)
+    return replace(found, estimate=Estimate(structure, own.values, own.covariance))
+
+
 def findings(record, model, gains, **more):
-    found = replace(identify(record, "waveform"), model=model)
+    found = other_model(identify(record, "waveform"), model)
     loop = Loop(gains, lambda m: ms_on(gains, m), gains.ms, gains.ms_95)
     evidence = Evidence(record, found, loop=loop, **more)
     return {f.name: f for f in judge(CHECKS, evidence)}
@@ -79,9 +87,7 @@ def test_a_response_that_is_not_the_models_makes_its_gains_doubtful(record, gain
 
 
 def test_a_model_that_would_have_run_away_is_refused(record, gains):
-    growing = TransferFunction.from_structure(
-        "unstable_fopdt", gain=2.0, time_constants=[5.0], dead_time=1.0
-    )
+    growing = TransferFunction.unstable_fopdt(2.0, 5.0, 1.0)
     found = findings(record, growing, gains)["growth"]
     # The command stood still for 60 s.
     assert found.value == pytest.approx(60.0 / 5.0, rel=1e-9)
@@ -93,7 +99,7 @@ def test_a_rival_on_which_the_loop_is_unstable_makes_gains_doubtful(record, gain
     own = identify(record, "waveform")
     same = findings(record, own.model, gains, others=(own,))["rivals"]
     assert same.value == pytest.approx(1.0, abs=0.1)
-    other = replace(own, model=TransferFunction.fopdt(-2.0, 10.0, 3.0))
+    other = other_model(own, TransferFunction.fopdt(-2.0, 10.0, 3.0))
     found = findings(record, own.model, gains, others=(other,))["rivals"]
     assert found.value == np.inf
     assert found.result is Result.DOUBTFUL
