@@ -165,9 +165,11 @@ def _cannot_hold(search: Search, kind: str, least: float) -> str:
 
 def _promise(attempt: _Attempt, search: Search) -> str:
     bounds, around = attempt.bounds, search.models
-    where = f"on the model and 95 % of {len(around)} around it" if around else "on the model"
+    where = "on the model"
+    if around:
+        where += f" and on 95 % of {len(around)} models within its uncertainty"
     promise = (
-        f"{_KINDS[attempt.derivative]} of least IAE after a load step with Ms <= "
+        f"{_KINDS[attempt.derivative]} with the smallest IAE after a load step, with Ms <= "
         f"{bounds.ms:.3g} and Mt <= {bounds.mt:.3g} {where}"
     )
     return "; ".join((promise, *attempt.warnings))
