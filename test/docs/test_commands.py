@@ -26,6 +26,7 @@ VERBS = {
     "service call": set(),
     "action send_goal": {"--feedback"},
     "topic echo": {"--once", "--field", "--no-arr"},
+    "topic info": {"--verbose"},
     "topic pub": {"--once"},
     "param dump": set(),
     "param describe": set(),
