@@ -40,18 +40,18 @@ from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
-# How long the end waits for its last message to be acknowledged.
+# How long the end of the process waits for the acknowledgement of its last message.
 ACKNOWLEDGE = Duration(seconds=0.2)
 NAMES_OF_GAINS = frozenset(entry.name for entry in GAINS)
-# How long the end of the process may wait for another node to take its gains back [s].
+# How long the end of the process may wait for another node to restore its gains [s].
 END_WITHIN = 5.0
 
 
 class ControllerNode(ServedNode):
-    """Answers each measurement with a command.
+    """Answer each measurement with a command.
 
-    New gains wait until they are applied, and the ones before are kept for ``~/revert``. While a
-    tune runs (``hold_request``), it tracks ``command``, so that it goes on from there.
+    New gains wait until they are applied, and the previous gains are kept for ``~/revert``. While
+    a tune runs (``hold_request``), the controller tracks ``command``, for a bumpless return.
     """
 
     def __init__(self) -> None:
@@ -64,9 +64,9 @@ class ControllerNode(ServedNode):
         if gains is not None:
             bounds_from(values).require(gains)
         self._results = Results(self, is_stable)
-        # The experiment that gains are of, and the gains.
+        # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
-        # Why they are not to be used without being told to; empty: they are trusted.
+        # Why the waiting gains are doubtful; empty: they are trusted.
         self._doubt = ""
         self._applying = False
         self._model: TransferFunction | None = None
@@ -86,9 +86,9 @@ class ControllerNode(ServedNode):
         self._count = 0
         self._ending = False
         self._held = False
-        # What a verification adds to set-point and command.
+        # Steps that a verification adds to set-point and command.
         self._offset = self._load = 0.0
-        # True while the parameters follow the gains, not the gains the parameters.
+        # True while this node writes its gains into its own parameters.
         self._following = False
         self._message = Float64()
         self._commanded = False
@@ -131,7 +131,7 @@ class ControllerNode(ServedNode):
         )
         self.create_subscription(PidGains, "pi_gains", self._on_gains, quality.RESULT)
         self.create_subscription(ModelMessage, "transfer_function", self._on_model, quality.RESULT)
-        # The loop goes on while these wait for the disk, or for another node.
+        # The loop must keep running while these services wait for the disk or another node.
         waiting = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/apply", self._on_apply, callback_group=waiting)
         self.create_service(Trigger, "~/discard", self._on_discard)
@@ -169,7 +169,7 @@ class ControllerNode(ServedNode):
             at = self._count * self._period
             self._count += 1
         elif self._simulated or self._repeater is not None:
-            # A repetition has no time but that of this clock.
+            # A repeated value has no stamp of its own.
             at = self.get_clock().now().nanoseconds * 1e-9
         elif self._stamp is not None:
             at = self._stamp(message) * 1e-9
@@ -178,9 +178,9 @@ class ControllerNode(ServedNode):
         self._take(at, value)
 
     def _on_silence(self, value: float, ago: float) -> None:
-        """Take the last measurement again, which a sensor that is silent stands by."""
+        """Take the last measurement again: a silent sensor means that it has not changed."""
         assert self._repeater is not None
-        # Without a sensor the integral would run away on a value that nobody stands by.
+        # A dead sensor must not be repeated: the integral would run away on an old value.
         if not self._repeater.why_dead():
             self._take(self.get_clock().now().nanoseconds * 1e-9 - ago, value)
 
@@ -297,7 +297,7 @@ class ControllerNode(ServedNode):
         self._apply_by_itself()
 
     def _apply_by_itself(self) -> None:
-        """Apply gains where that is wanted, once record and model of their experiment are here."""
+        """Apply gains if auto_apply is set and record and model of their experiment are here."""
         if self._pending is None or self._doubt or not self.get_parameter("auto_apply").value:
             return
         name, gains = self._pending
@@ -337,7 +337,7 @@ class ControllerNode(ServedNode):
             done = await self._keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
             return False, f"the gains of {name} are not in force: {error}"
-        # Others may have come meanwhile.
+        # Newer gains may have arrived meanwhile.
         if self._pending is pending:
             self._pending = None
         return True, f"gains of {name}: {done}; ~/revert brings back those before"
@@ -454,7 +454,7 @@ class ControllerNode(ServedNode):
     # The end.
 
     def end(self, reason: str) -> None:
-        """Take back what a verification moves, and leave a command and gains that may stay."""
+        """Undo the steps of a verification, and leave a safe command and trusted gains."""
         rested = self._verifier.rested_at
         at_work = self._verifier.is_running or self._keeper.is_at_work
         self._ending = True
@@ -473,12 +473,12 @@ class ControllerNode(ServedNode):
             self._undo()
 
     def _undo(self) -> None:
-        """Bring back another node's gains where they are on trial, and end the verification."""
+        """Restore another node's gains if a trial is running, and end the verification."""
         undone = self.executor.create_task(self._keeper.abandon)
         deadline = time.monotonic() + END_WITHIN
         while time.monotonic() < deadline and (self._verifier.is_running or not undone.done()):
             self.executor.turn(0.02)
-        # Who asked for the verification gets its result.
+        # Give the action's client its result.
         for _ in range(20):
             self.executor.turn(0.01)
 
@@ -530,7 +530,7 @@ class OwnGains:
         self._use = use
 
     async def read(self) -> GainSet | None:
-        """Return None: nobody else changes these gains."""
+        """Return None: no other node changes these gains."""
         return None
 
     async def put(self, gains: GainSet | None) -> None:
@@ -538,11 +538,11 @@ class OwnGains:
         self._use(gains)
 
     def set_of(self, controller: Controller) -> GainSet:
-        """Return the numbers of a controller."""
+        """Return the gains of a controller as a set."""
         return set_of(controller)
 
     def controller_of(self, gains: GainSet) -> Controller:
-        """Return the controller that numbers make."""
+        """Return the controller with these gains."""
         return controller_of(gains)
 
     def said(self, gains: GainSet | None) -> str:
@@ -572,7 +572,7 @@ def gains_from(values: dict[str, Any]) -> Controller | None:
     """Return the gains that the parameters give, None if there are none.
 
     :param values: the parameters by name.
-    :raises RelayAutotuneError: if they cannot be.
+    :raises RelayAutotuneError: if they are not valid.
     """
     if values["kc"] == 0.0:
         return None
@@ -580,7 +580,7 @@ def gains_from(values: dict[str, Any]) -> Controller | None:
 
 
 def why_doubtful(message: Any) -> str:
-    """Return why a result is not to be used without being told to; empty: it is trusted.
+    """Return why a result needs accept_doubtful before it is used; empty: it is trusted.
 
     :param message: the `PidGains` or `TransferFunction`.
     """
@@ -595,7 +595,7 @@ def limits_from(values: dict[str, Any]) -> Limits:
     """Return the range of the command.
 
     :param values: the parameters by name.
-    :raises RelayAutotuneError: if they leave none.
+    :raises RelayAutotuneError: if the range is empty.
     """
     return Limits(values["command_min"], values["command_max"])
 
@@ -604,7 +604,7 @@ def range_from(values: dict[str, Any]) -> Limits:
     """Return the range of the measurement.
 
     :param values: the parameters by name.
-    :raises ParameterError: if they leave none.
+    :raises ParameterError: if the range is empty.
     """
     low, high = values["measurement_min"], values["measurement_max"]
     if not low < high:
@@ -615,7 +615,7 @@ def range_from(values: dict[str, Any]) -> Limits:
 
 
 def bounds_from(values: dict[str, Any]) -> GainBounds:
-    """Return what gains may be put in force.
+    """Return the bounds for new gains.
 
     :param values: the parameters by name.
     """

@@ -29,14 +29,14 @@ OTHERS = (
         "safe_command",
         math.nan,
         "u",
-        "Command that is left when the node ends; NaN: the last one, and where a verification was "
-        "running, the one at which the loop rested before.",
+        "Command when the node ends; NaN: the last command, or during a verification the command "
+        "before its step.",
     ),
     Quantity(
         "measurement_min",
         -math.inf,
         "y",
-        "A measurement below this is a fault of the sensor: it is passed over, and the command is "
+        "A measurement below this is a fault of the sensor: it is ignored, and the command is "
         "held.",
     ),
     Quantity("measurement_max", math.inf, "y", "Likewise above this."),
@@ -60,20 +60,20 @@ OTHERS = (
         "auto_apply",
         False,
         "",
-        "True: gains that come are put in force at once; false: only when ~/apply is called.",
+        "True: new gains are applied at once; false: only when ~/apply is called.",
     ),
     Quantity(
         "accept_doubtful",
         False,
         "",
-        "True: ~/apply and ~/verify take gains and models whose verdict is not trusted, too; "
+        "True: ~/apply and ~/verify also accept gains and models whose verdict is not trusted; "
         "auto_apply never does.",
     ),
     Quantity(
         "verify_step",
         0.0,
         "y",
-        "Height of the set-point step of ~/verify, where the request gives none.",
+        "Height of the set-point step of ~/verify, if the request does not give it.",
         -LARGEST_VALUE,
         LARGEST_VALUE,
     ),
@@ -117,22 +117,22 @@ FIXED = (
         "repeat_period",
         0.0,
         "s",
-        "For a sensor that publishes only when its value changes: after each such time of silence "
-        "the last value is a sample again; 0: only what comes is one.",
+        "For a sensor that publishes only on change: after this time of silence the last value "
+        "counts as a new sample; 0: no repetition.",
         0.0,
     ),
     Quantity(
         "apply_to",
         "",
         "",
-        "Name of a node that shall get the gains by its parameters, such as /pid_controller; "
-        "empty: this node controls.",
+        "Node that gets the gains through its parameters, such as /pid_controller; empty: this "
+        "node controls.",
     ),
     Quantity(
         "apply_parameters",
         "p:p,i:i,d:d",
         "",
-        "Which gain goes into which of that node's parameters, separated by commas, such as "
+        "That node's parameter for each gain, separated by commas, such as "
         "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d.",
     ),
     Quantity(

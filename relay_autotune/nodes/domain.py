@@ -1,4 +1,4 @@
-"""A ROS domain of one's own, so that a demo or a test meets no other loop."""
+"""A free ROS domain, so that a demo or a test does not meet another loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from relay_autotune.errors import RelayAutotuneError
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """Take a domain from 1 to 101 whose lock nobody holds and whose ports nobody uses.
+    """Take a domain from 1 to 101 whose lock is free and whose ports are unused.
 
     :raises RelayAutotuneError: if there is none.
     """

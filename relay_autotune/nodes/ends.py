@@ -1,4 +1,4 @@
-"""The topics of relay_node: what it hears and says, and with which quality of service."""
+"""Publishers and subscriptions of relay_node, with their quality of service."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from relay_autotune.nodes import quality, signs_of_life
 from relay_autotune.nodes.live_types import Reader, command_setter
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
-# The safe command is repeated at this interval until it is acknowledged, so many times at most.
+# Interval and largest number of repeats of the safe command until it is acknowledged.
 # Fast DDS asks for acknowledgements when the publisher's history is full, else every 3 s.
 REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
@@ -30,7 +30,7 @@ class Ends:
     :param on_measurement: called with each measurement and the middleware's facts about it.
     :param on_result: called with the topic's unresolved name and each model or gains.
     :param on_status: called with each sign of life of the identifier.
-    :param cycles_kept: cycles that wait for who comes late.
+    :param cycles_kept: number of cycles kept for late subscribers (depth of the latched topic).
     :param reader: how the measurement is read from its messages.
     :param command_type: message type of the command.
     :param relay_on_setpoint: True if the relay publishes set-points.
@@ -49,8 +49,8 @@ class Ends:
         relay_on_setpoint: bool = False,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
-        # Each event that an end watches costs every turn of the executor; incompatible ends are
-        # named by /diagnostics and by the answer to a start.
+        # No event callbacks: each one costs time in every turn of the executor. /diagnostics and
+        # the answer to a start report an incompatible QoS.
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
         self.setpoint = None
@@ -103,12 +103,12 @@ class Ends:
             event_callbacks=unheard,
         )
         self.sent: Callable[[float], None] | None = None
-        """Told each command before it goes out."""
-        # Bound once: this is called for each measurement.
+        """Called with each command before it is published."""
+        # Looked up once, because it is called for each measurement.
         self._publish = self.command.publish
 
     def recorded(self) -> dict[str, Any]:
-        """Return what a recording holds, by the topics' unresolved names."""
+        """Return the publishers and subscriptions to record, by the topics' unresolved names."""
         return {
             "measurement": self.measurement,
             "command": self.command,
@@ -132,14 +132,14 @@ class Ends:
         self.setpoint.publish(self._setpoint_message)
 
     def relay(self, value: float) -> None:
-        """Publish what the relay answers: a command, or a set-point."""
+        """Publish the relay's output: a command, or a set-point."""
         if self.setpoint is None:
             self.send(value)
         else:
             self.send_setpoint(value)
 
     def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
-        """Publish what the relay answers until every subscriber has acknowledged it.
+        """Publish the relay's output until every subscriber has acknowledged it.
 
         :param command: the command [u], or the set-point [y].
         :return: how often it was published, and whether it was acknowledged.

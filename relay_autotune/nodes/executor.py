@@ -1,8 +1,8 @@
-"""A single-threaded executor with a short way for the messages of one subscription.
+"""A single-threaded executor with a fast path for the messages of one subscription.
 
-rclpy's executor looks at every service, timer and event of a node before each message, twice.
-While messages of the favoured subscription follow each other closely, this one waits for that
-subscription alone, and looks at everything else a few hundred times a second.
+rclpy's executor checks every service, timer and event of a node twice for each message. This
+executor waits for the favoured subscription alone while its messages follow each other closely,
+and checks everything else a few hundred times a second.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
-# Messages further apart than this take the ordinary way [s].
+# Messages further apart than this take the ordinary path [s].
 CLOSE = 0.002
-# While they follow closely, everything else is looked at this often [s].
+# Interval at which everything else is checked while messages follow closely [s].
 LOOK_AROUND = 0.005
-# Where nothing comes for so long, nothing that was begun is left; it gives the last message time
-# to leave, too.
+# After this time without a callback all work is done; it also lets the last message leave [s].
 _NOTHING_MORE = 0.02
 
 
@@ -40,7 +39,7 @@ class Executor(SingleThreadedExecutor):
         self._look_around_at = 0.0
 
     def favour(self, subscription: Subscription) -> None:
-        """Give the messages of a subscription the short way.
+        """Give the messages of a subscription the fast path.
 
         :param subscription: one whose callback takes the message and the middleware's facts, and
             does not rely on what other callbacks do in between, such as that of /clock.
@@ -66,12 +65,12 @@ class Executor(SingleThreadedExecutor):
         return self._any(timeout_sec)
 
     def finish(self, within: float) -> None:
-        """Do what was begun, such as to answer a goal that has ended; hear nothing new.
+        """Finish pending tasks, such as the answer to an ended goal; take no new messages.
 
         :param within: how long it may take [s].
         """
         deadline = time.monotonic() + within
-        # Without a wait, what one task begins would not be looked for.
+        # A wait is needed to see work that one task has started.
         while time.monotonic() < deadline and self._any(_NOTHING_MORE, []):
             pass
 
@@ -100,7 +99,7 @@ class Executor(SingleThreadedExecutor):
         error = handler.exception()
         if error is not None:
             raise error
-        # A task has no entity, and a node may have no favourite.
+        # A task has no entity, and a node may have no favoured subscription.
         if entity is not None and entity is self._favoured:
             self._flowing = True
         return True

@@ -1,7 +1,7 @@
-"""The history of a controller's gains on disk, so that it outlives a kill and a loss of power.
+"""The history of a controller's gains on disk; it survives a kill and a loss of power.
 
-Each state replaces the one before as a whole: a temporary file is written and forced to the disk,
-renamed over the old one, and the folder is forced to the disk, too. One process at a time has it.
+Each state replaces the previous one in one step: write a temporary file, fsync it, rename it over
+the old file, fsync the folder. A lock lets one process at a time use the file.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ _VERSION = 1
 
 
 class JournalError(RelayAutotuneError):
-    """A journal that cannot be read, written or had."""
+    """A journal that cannot be read, written or locked."""
 
 
 class GainsJournal:
     """The file of one controller's gains.
 
-    :param folder: where it lies; made where it is not there.
+    :param folder: folder of the file; created if missing.
     :param node: fully qualified name of the node, which names the file.
-    :param domain: the ROS domain, in which names are unique.
+    :param domain: the ROS domain: node names are unique only within a domain.
     :param loop: what the node controls, such as its measurement; the file of another loop is
         refused.
-    :raises JournalError: if another process has it.
+    :raises JournalError: if another process uses the file.
     """
 
     def __init__(self, folder: Path, node: str, domain: int, loop: str) -> None:
         within = f".domain{domain}" if domain else ""
-        # No name of a node has a dot.
+        # A node name never contains a dot, so the replacement is unique.
         self.path = folder / f"gains{node.replace('/', '.')}{within}.json"
         self._loop = loop
         self._lock = threading.Lock()
         self._newest = 0
         self._held: int | None = None
-        # Where nothing can be written, `save` says so; some file systems have no locks.
+        # A folder that is not writable is reported by `save`; some file systems have no locks.
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             self._held = os.open(
@@ -69,7 +69,7 @@ class GainsJournal:
             self._held = None
 
     def load(self) -> GainsHistory | None:
-        """Return what was saved last, None if nothing was.
+        """Return the state saved last, None if there is no file.
 
         :raises JournalError: if the file is not a journal of this loop.
         """
@@ -100,11 +100,11 @@ class GainsJournal:
         return self._newest
 
     def save(self, history: GainsHistory, ticket: int) -> None:
-        """Write a state and wait until the disk has it; may be called by any thread.
+        """Write a state and wait until it is on the disk; may be called by any thread.
 
         :param history: the state.
-        :param ticket: its number; once a later one is asked for, an earlier one is left out.
-        :raises JournalError: if it is not on the disk; then the state before is.
+        :param ticket: its number; a state is skipped once a later ticket was issued.
+        :raises JournalError: if it cannot be written; the previous state stays on the disk.
         """
         document = {"version": _VERSION, "loop": self._loop, **_values_of(history)}
         text = json.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -139,7 +139,7 @@ class GainsJournal:
 
 
 def _values_of(value: Any) -> Any:
-    """Return a history, or a part of it, as JSON has it."""
+    """Return a history, or a part of it, as JSON values."""
     if isinstance(value, GainSet):
         return value.by_name()
     if isinstance(value, (Standing, Work)):

@@ -1,4 +1,4 @@
-"""The one owner of a controller's gains: puts them in force, and keeps on disk which they are."""
+"""The single owner of a controller's gains: applies them and keeps a journal on disk."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.lifetime import ServedNode
 
-# A place that did not answer is asked again so often [s].
+# Time between attempts when the place of the gains does not answer [s].
 _ASK_AGAIN = 1.0
 
 
 class Place(Protocol):
-    """Where gains are in force: this node's controller, or another node's parameters."""
+    """Where gains act: this node's controller, or another node's parameters."""
 
     name: str
     outlives: bool
@@ -36,24 +36,24 @@ class Place(Protocol):
         """Return the gains in force, None if the command is held."""
 
     async def put(self, gains: GainSet | None) -> None:
-        """Put gains in force, all or none.
+        """Apply gains, all or none.
 
-        :param gains: None: hold the command, where that can be done.
-        :raises RelayAutotuneError: if they are not in force, or that is not known.
+        :param gains: None: hold the command, if the place can.
+        :raises RelayAutotuneError: if they are not in force, or it is unknown whether they are.
         """
 
     def said(self, gains: GainSet | None) -> str:
-        """Say which gains are in force now, for people."""
+        """Return a sentence on the gains in force now."""
 
 
 class GainsKeeper:
-    """Put gains in force, take them back, and mark those that are proven or failed.
+    """Apply gains, revert them, and mark those that are proven or failed.
 
-    The journal is ahead of what is done: it says what is about to be put in force before that is
-    sent, so that whatever ends the process, the next one knows what to undo.
+    The journal is written first: it names the new gains before they are sent. So if the process
+    is killed, its successor knows what to undo.
 
     :param node: the node.
-    :param place: where the gains are in force.
+    :param place: where the gains act.
     :param journal: where their history is kept.
     :param given: gains of the node's configuration.
     :raises RelayAutotuneError: if the journal cannot be read.
@@ -66,7 +66,7 @@ class GainsKeeper:
         self._place = place
         self._journal = journal
         self._busy = self._abandoned = False
-        # What the place is still to be brought to, and whether another's gains may be there.
+        # The state that the place must still reach, and whether it may hold foreign gains.
         self._goal: GainsHistory | None = None
         self._anothers = True
         self._timer: Timer | None = None
@@ -86,7 +86,7 @@ class GainsKeeper:
 
     @property
     def gains(self) -> GainSet | None:
-        """The gains in force, as far as is known."""
+        """The gains in force, as far as known."""
         return self.history.gains
 
     @property
@@ -94,14 +94,14 @@ class GainsKeeper:
         """True while gains are being put in force or verified, or are still to be undone."""
         return self._busy or self.history.work is not Work.NOTHING or self._goal is not None
 
-    # What people ask for.
+    # Requests.
 
     async def apply(self, gains: GainSet) -> str:
-        """Put gains in force and return what to say.
+        """Apply gains and return a sentence for the user.
 
-        :param gains: all of them.
-        :raises RelayAutotuneError: if they are not; then those before are, as soon as the place
-            answers.
+        :param gains: the whole set.
+        :raises RelayAutotuneError: if they are not in force; the previous gains are restored as
+            soon as the place answers.
         """
         with self._alone():
             now = self._observed(await self._place.read())
@@ -121,9 +121,9 @@ class GainsKeeper:
         return f"{self._place.said(gains)}{kept}"
 
     async def revert(self) -> str:
-        """Go back to the whole set that was in force before, and return what to say.
+        """Return to the previous whole set, and return a sentence for the user.
 
-        :raises RelayAutotuneError: if there is none, or it is not in force.
+        :raises RelayAutotuneError: if there is no previous set, or it is not in force.
         """
         with self._alone():
             wanted = self.history.revert()
@@ -133,25 +133,25 @@ class GainsKeeper:
         return f"{self._place.said(wanted.gains)} again{kept}"
 
     def require_editable(self, gains: GainSet | None) -> None:
-        """Refuse gains that were set by hand.
+        """Refuse a change by hand that is not allowed now.
 
-        :raises RelayAutotuneError: if they failed a verification, or something is being done.
+        :raises RelayAutotuneError: if the gains failed a verification, or a change is in progress.
         """
         if self._busy:
             raise HistoryError("gains are being put in force; wait for the end of that")
         self.history.edit(gains)
 
     def edited(self, gains: GainSet | None) -> None:
-        """Take what was set by hand and is in force already."""
+        """Note gains that were set by hand and are in force already."""
         self.history = self.history.edit(gains)
         self._node.compute(self._writing(self.history), self._wrote)
 
     # Proof.
 
     async def begin_verification(self) -> GainSet:
-        """Return the gains that are verified from now on.
+        """Begin the verification of the gains in force and return them.
 
-        :raises RelayAutotuneError: if there are none, or the journal cannot be written.
+        :raises RelayAutotuneError: if no gains are in force, or the journal cannot be written.
         """
         with self._alone():
             wanted = self._observed(await self._place.read()).verify()
@@ -161,30 +161,30 @@ class GainsKeeper:
             return wanted.gains
 
     async def end_verification(self, passed: bool | None) -> str:
-        """Take the verdict, and bring back the gains before where they failed.
+        """Take the verdict, and restore the previous gains if these failed.
 
-        :param passed: None: it ended without a verdict; the gains stay.
-        :return: what to say, "" if there is nothing.
+        :param passed: None: the verification ended without a verdict, and the gains stay.
+        :return: a sentence for the user, or "".
         """
         if self.history.work is not Work.VERIFY:
             return ""
         if passed is not False:
             self.history = self.history.passed() if passed else self.history.settled()
             return await self._kept(self.history)
-        # The gains go first: the journal says already that these are not to be trusted.
+        # Gains before journal: the journal already marks these gains as not trusted.
         self._goal, self._anothers = self.history.fail(), False
         await self._settle()
         return self._open() or f"; {self._place.said(self.history.gains)} again"
 
     async def abandon(self) -> None:
-        """Undo what is being done with gains that outlive the process, which is about to end."""
+        """Undo an unfinished change, before the end of the process, if the gains outlive it."""
         goal = self.history.after_interruption()
         if self._place.outlives and goal is not self.history:
             self._abandoned = True
             self._goal, self._anothers = goal, False
             await self._settle()
 
-    # Within.
+    # Helpers.
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
@@ -202,7 +202,7 @@ class GainsKeeper:
         return self.history if found is None else self.history.observe(found)
 
     def _open(self) -> str:
-        """Say what is still to be brought back, "" if nothing is."""
+        """Return a sentence on gains that are still to be restored, or ""."""
         if self._goal is None:
             return ""
         return (
@@ -211,7 +211,7 @@ class GainsKeeper:
         )
 
     async def _settle(self) -> None:
-        """Bring the place to where it is to be; if it does not answer, ask again later."""
+        """Apply the goal state to the place; if it does not answer, try again later."""
         goal, left = self._goal, self.history.gains
         if goal is None:
             return
@@ -220,7 +220,7 @@ class GainsKeeper:
                 found = await self._place.read()
                 if found is not None and not found.is_mixture(goal.gains, left):
                     self._node.get_logger().error(
-                        f"{self._place.name} has gains of another hand, {found}: they stay"
+                        f"{self._place.name} has gains that someone else set, {found}: they stay"
                     )
                     goal = goal.observe(found)
             await self._place.put(goal.gains)
@@ -281,9 +281,9 @@ class GainsKeeper:
             self._node.get_logger().error(str(error))
 
     async def _save(self, history: GainsHistory) -> None:
-        """Wait until the disk has a state, while the callbacks go on.
+        """Save a state while the callbacks go on; return once it is on the disk.
 
-        :raises JournalError: if it has not.
+        :raises JournalError: if it cannot be written.
         """
         done: Future = Future()
         self._node.compute(self._writing(history), done.set_result)

@@ -1,4 +1,4 @@
-"""How the goal of an action ends."""
+"""The end of an action's goal."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Any
 
 
 def conclude(goal: Any, result: Any, *, succeeded: bool) -> None:
-    """End an accepted goal: cancelled where that was asked for, else succeeded or aborted.
+    """End an accepted goal: cancelled if the client asked for that, else succeeded or aborted.
 
     :param goal: its handle.
-    :param result: what its client gets.
+    :param result: the result for its client.
     :param succeeded: False: it is aborted.
     """
 

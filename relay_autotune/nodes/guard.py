@@ -1,4 +1,4 @@
-"""What is watched while a tune runs, besides the samples themselves."""
+"""Checks of graph, controller, actuator and clock while a tune runs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from rclpy.subscription import Subscription
 
 from relay_autotune.experiment.experiment import RelayExperiment
 
-# The guard looks so often [s], and at the graph every so many looks.
+# Interval of the checks [s]; the graph is checked once in _GRAPH_EVERY of them.
 LOOK_EVERY = 0.05
 _GRAPH_EVERY = 4
-# What the middleware says of a publisher whose node it has not heard of yet.
+# Name that the middleware gives to a publisher whose node is not discovered yet.
 _UNKNOWN = "NODE_NAME_UNKNOWN"
 
-# The time of the samples may stand still for so many times measurement_timeout or repeat_period,
-# and for so long at least [s]; and go so many times slower than the steady clock: with gaps in the
-# samples, or on the clock of a simulation.
+# Longest time for which the samples' time may stand still: a multiple of measurement_timeout or
+# repeat_period, and at least a number of seconds. Then the largest ratio of steady time to the
+# samples' time: for gaps in the samples, and for the clock of a simulation.
 _STANDING, _LEAST_STANDING = 2.0, 5.0
 _SLACK, _SLACK_SIMULATED = 3.0, 100.0
 
-# An actuator that is too slow for the time limit is seen by so many of its last stays in which it
-# never came to the level it was told.
+# A slow actuator under a fast relay missed the level in 3 of its last 6 half cycles.
 _STAYS = 6
 _MISSED = 3
 
@@ -35,12 +34,13 @@ _MISSED = 3
 class FollowWatch:
     """Recognise an actuator that does not follow, from a feedback of its position.
 
-    The fault is a position that is further than the tolerance from the command for longer than
-    the timeout; or, where the relay switches faster than that, three of the last six stays at a
-    level in which the position never came near it, while it has not followed a switch for as long:
-    what a busy machine tells late is no fault of the actuator.
+    The actuator is faulty if its position is outside the tolerance for longer than the timeout.
+    If the relay switches faster than that, it is faulty when both are true: it missed the level in
+    three of the last six half cycles, and it followed no switch for the timeout. The second
+    condition excuses positions that a busy machine delivers late.
 
-    :param tolerance: tells the distance that counts as there [u], asked at each position.
+    :param tolerance: returns the largest distance that counts as "at the command" [u]; called at
+        each position.
     :param timeout: longest time that the actuator may take [s].
     """
 
@@ -57,7 +57,7 @@ class FollowWatch:
 
     @property
     def rail(self) -> str:
-        """What to add where it moves, but each time ends short of the command: a sentence part."""
+        """Sentence part for an actuator that moves but always stops short of the command."""
         ends = {**self._ends, self._command: self._position}
         told = sorted(command for command in ends if not math.isnan(command))
         if len(told) < 2:
@@ -75,8 +75,8 @@ class FollowWatch:
         """Take a position; return True if the actuator does not follow.
 
         :param now: the time [s].
-        :param command: what it was told [u].
-        :param position: where it says it is [u].
+        :param command: the command in force [u].
+        :param position: the reported position [u].
         """
         if command != self._command:
             self._ends[self._command] = self._position
@@ -97,10 +97,10 @@ class FollowWatch:
 
 
 class Guard:
-    """Look at the graph, the controller and the actuator every 50 ms while a tune runs.
+    """Check the graph, the controller and the actuator every 50 ms while a tune runs.
 
     :param node: the node that tunes.
-    :param stop: called with the reason when the tune is to end.
+    :param stop: called with the reason when a check ends the tune.
     """
 
     def __init__(self, node: Node, stop: Callable[[str], None]) -> None:
@@ -113,7 +113,7 @@ class Guard:
         )
 
     def begin(self, checks: list[Callable[[], str]]) -> None:
-        """Begin to look.
+        """Start the checks.
 
         :param checks: each returns a reason to end the tune, or "".
         """
@@ -121,12 +121,12 @@ class Guard:
         self._timer.reset()
 
     def end(self) -> None:
-        """Stop looking."""
+        """Stop the checks."""
         self._checks = []
         self._timer.cancel()
 
     def every_look_at_the_graph(self, check: Callable[[], str]) -> Callable[[], str]:
-        """Make a check rarer, since it asks the middleware."""
+        """Run a check less often, since it queries the middleware."""
         return lambda: check() if self._looks % _GRAPH_EVERY == 0 else ""
 
     def _look(self) -> None:
@@ -139,7 +139,7 @@ class Guard:
 
 
 def second_publisher(node: Node, topic: str) -> str:
-    """Return a sentence if somebody else publishes a topic of the node, else "".
+    """Return a sentence if another node publishes a topic of the node, else "".
 
     :param node: the node.
     :param topic: resolved name of a topic that it publishes.
@@ -154,12 +154,12 @@ def second_publisher(node: Node, topic: str) -> str:
 
 
 def second_source(node: Node, subscription: Subscription) -> str:
-    """Return a sentence if a subscription hears several publishers, else "".
+    """Return a sentence if a subscription has several publishers, else "".
 
-    One of a type or a quality of service that does not fit is not heard.
+    A publisher of another type or an incompatible QoS does not count.
 
     :param node: the node.
-    :param subscription: one of its own.
+    :param subscription: one of the node's subscriptions.
     """
     count = subscription.get_publisher_count()
     if count <= 1:
@@ -167,8 +167,8 @@ def second_source(node: Node, subscription: Subscription) -> str:
     topic = subscription.topic_name
     return (
         f"{topic} is published by {count} publishers, {_named(_publishers(node, topic))}, "
-        f"expected one: the relay would act on a mixture; end what is left over (what was killed "
-        f"is forgotten after 20 s)"
+        f"expected one: the relay would act on a mixture; end the others (a killed one leaves the "
+        f"graph after 20 s)"
     )
 
 
@@ -180,15 +180,15 @@ def namesake(node: Node) -> str:
         return ""
     return (
         f"{count} nodes have the name {node.get_fully_qualified_name()}, expected one: a "
-        f"call reaches any of them; end what is left over (what was killed is forgotten after "
-        f"20 s), or give it another name"
+        f"call reaches any of them; end the others (a killed one leaves the graph after 20 s), or "
+        f"give them other names"
     )
 
 
 def _publishers(node: Node, topic: str) -> list[str]:
-    """Return the full names of the nodes that publish a topic, each as often as it does."""
+    """Return the full names of a topic's publishing nodes, one for each publisher."""
     return [
-        # The node of an end is heard of a little later than the end.
+        # A publisher is discovered a little earlier than its node.
         "a node not known yet"
         if _UNKNOWN in end.node_name
         else f"{end.node_namespace.rstrip('/')}/{end.node_name}"
@@ -201,11 +201,11 @@ def _named(names: list[str]) -> str:
 
 
 class Silence:
-    """A limit on how long something may stay silent, on the steady clock.
+    """A limit on the silence of a signal, on the steady clock.
 
     :param what: subject of the sentence.
     :param timeout: the limit [s].
-    :param age: returns the time since it was last heard [s].
+    :param age: returns the time since the last message [s].
     """
 
     def __init__(self, what: str, timeout: float, age: Callable[[], float]) -> None:
@@ -220,11 +220,11 @@ class Silence:
 
 
 class Overtime:
-    """A limit on a tune by the steady clock, whatever the clock of its samples does.
+    """A limit on the duration of a tune by the steady clock, for any clock of its samples.
 
-    The samples' time may stand still, as a stuck ``/clock`` does, or go slowly: no longer than
-    ``standing``, and altogether no longer than ``slack`` times as long as the experiment and its
-    present part may take by that time.
+    The samples' time may stand still for ``standing`` seconds, as with a stuck ``/clock``. The
+    tune may take ``slack`` times as long as the experiment and its present part may take by the
+    samples' time.
 
     :param experiment: the tune.
     :param standing: longest time without progress of the samples' time [s].
@@ -240,7 +240,7 @@ class Overtime:
 
     @classmethod
     def of(cls, experiment: RelayExperiment, node: Node) -> Overtime:
-        """Return the limit by the node's parameters."""
+        """Return the limit that follows from the node's parameters."""
         pauses = [
             float(node.get_parameter(name).value)
             for name in ("measurement_timeout", "repeat_period")

@@ -1,4 +1,4 @@
-"""The way of the present controller's command through relay_node, out of it and back."""
+"""Pass the present controller's command through, interrupt it for a tune, and return to it."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-# So many of the controller's last commands make its mean.
+# Number of the controller's last commands that are averaged.
 _KEPT = 200
-# Where no oscillation says how fast the process is, a return takes so long [s].
+# Return time when no oscillation has shown how fast the process is [s].
 _RETURN_TIME = 5.0
 
 
 class Handover:
-    """What the present controller wants, and what the actuator is told when no tune runs.
+    """The present controller's command, and the command to the actuator when no tune runs.
 
-    Idle, each command of the controller is passed on as it comes. When a tune has ended, the
-    controller may want something else than the actuator has; the difference is taken back over
-    the return time, in a straight line, so that the actuator sees no bump.
+    Without a tune, each command of the controller is passed on at once. After a tune, the
+    controller's command may differ from the actuator's. The difference shrinks to zero along a
+    straight line over the return time, so that the actuator sees no bump.
 
     :param send: publishes a command.
     """
@@ -36,12 +36,12 @@ class Handover:
 
     @property
     def age(self) -> float:
-        """Time since the controller's last command [s]; inf: none has come."""
+        """Time since the controller's last command [s]; inf before the first."""
         return time.monotonic() - self._arrived
 
     @property
     def last(self) -> float:
-        """The controller's last command [u]; NaN: none has come."""
+        """The controller's last command [u]; NaN before the first."""
         return self._last
 
     def is_connected(self, timeout: float) -> bool:
@@ -52,11 +52,11 @@ class Handover:
         return self.age <= timeout
 
     def mean(self) -> float:
-        """Return the mean of the controller's last commands [u]; NaN: none has come."""
+        """Return the mean of the controller's last commands [u]; NaN before the first."""
         return sum(self._kept) / len(self._kept) if self._kept else math.nan
 
     def hear(self, command: float) -> float | None:
-        """Take a command of the controller; return what went to the actuator, None: nothing did.
+        """Take a command of the controller; return the command sent to the actuator, or None.
 
         :param command: [u]; one that is not finite is not passed on.
         """
@@ -67,7 +67,7 @@ class Handover:
         if self._active:
             return None
         if not math.isnan(self._left_at):
-            # The first command after a tune: what it lacks of the last one is the bump.
+            # First command after a tune: its difference from the last one would be the bump.
             self._offset, self._return_from = self._left_at - command, now
             self._left_at = math.nan
         self._kept.append(command)
@@ -76,20 +76,20 @@ class Handover:
         return passed
 
     def note(self, command: float) -> None:
-        """Take a command that the controller has sent to the actuator by itself [u]."""
+        """Note a command that the controller has sent to the actuator directly [u]."""
         self._last, self._arrived = command, time.monotonic()
         self._kept.append(command)
 
     def take_over(self) -> None:
-        """Keep the controller's commands back from now on."""
+        """Stop passing on the controller's commands."""
         self._active = True
         self._offset = 0.0
 
     def give_back(self, command: float, return_time: float) -> None:
         """Pass the controller's commands on again.
 
-        :param command: what the actuator has now [u]; NaN: whatever that is, without a return.
-        :param return_time: time over which the difference is taken back [s]; 0: 5 s.
+        :param command: the actuator's present command [u]; NaN: change over without a return.
+        :param return_time: time in which the difference shrinks to zero [s]; 0: 5 s.
         """
         self._active = False
         self._left_at = command

@@ -16,8 +16,8 @@ def diagnostics(
 
     :param name: the node's fully qualified name without the leading slash.
     :param stamp_ns: the present time [ns since the epoch].
-    :param problems: what an operator must act on; none: the status is OK.
-    :param summary: what is said if there is no problem.
+    :param problems: problems that an operator must act on; empty: the status is OK.
+    :param summary: message if there is no problem.
     :param values: facts by name.
     """
     status = DiagnosticStatus(

@@ -35,20 +35,20 @@ from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
 
-# Latched cycles that may wait for an identifier that comes late.
+# Depth of the subscription, for latched cycles from before the identifier started.
 CYCLE_DEPTH = 1000
 
 
-# Requests of ~/identify that may wait; each takes seconds.
+# Largest number of waiting requests of ~/identify; each takes seconds.
 _MOST_WAITING = 10
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Something to compute beside the callbacks, and who takes what came of it.
+    """A computation in another thread, and the callback for its result.
 
-    :param work: computes it, in another thread; it must not touch the node.
-    :param taken: takes what it returned or raised, as a callback of the node.
+    :param work: the computation; it must not touch the node.
+    :param taken: called by the node's executor with what ``work`` returned or raised.
     """
 
     work: Callable[[], Analysis]
@@ -56,12 +56,11 @@ class _Fit:
 
 
 class IdentifierNode(ServedNode):
-    """Fits a model at each cycle, and model and gains at the end of an experiment.
+    """Fit a model at each cycle, and model and gains at the end of an experiment.
 
-    A message only notes what is to be done. Fits are computed beside the callbacks, one at a time:
-    first those of whole records, in the order in which they came, then that of the experiment that
-    runs, once no message waits any more, so that of several cycles that came during a fit only the
-    newest one leads to another.
+    A message only adds work to a queue. One fit at a time runs in another thread: whole records
+    first, in order of arrival, then the running experiment. A fit starts only when no message
+    waits. So when several cycles arrive during a fit, only the newest one is fitted next.
     """
 
     def __init__(self) -> None:
@@ -97,11 +96,11 @@ class IdentifierNode(ServedNode):
             f"go to {self._models.topic_name} and {self._gains.topic_name}"
         )
 
-    # What comes.
+    # Input.
 
     def _on_cycle(self, message: Any) -> None:
         if message.experiment_id in (self._ended, self._running):
-            # It has ended, or its progress tells more than its cycles.
+            # The experiment has ended, or its progress messages say more than its cycles.
             return
         if message.experiment_id != self._cycles_of:
             self._cycles_of = message.experiment_id
@@ -113,7 +112,7 @@ class IdentifierNode(ServedNode):
         self._look()
 
     def _on_progress(self, message: Any) -> None:
-        """Take an experiment that is under way, to be fitted once nothing else waits."""
+        """Note a running experiment; it is fitted once nothing else waits."""
         if message.experiment_id == self._ended:
             return
         if message.experiment_id != self._running:
@@ -164,7 +163,7 @@ class IdentifierNode(ServedNode):
             return response
         name, stamp = record.experiment_id, _last_stamp(record)
         response.success, response.reason = found.model is not None, found.reason
-        # Only what counts was judged.
+        # Only the selected model was judged.
         for number, identification in enumerate(found.models):
             message = TransferFunction()
             fill_transfer_function(
@@ -197,7 +196,7 @@ class IdentifierNode(ServedNode):
         self._look()
 
     def _look(self) -> None:
-        """Begin a fit once no message waits any more, unless one is being computed."""
+        """Start a fit once no message waits, unless one is running."""
         if not (self._is_fitting or self._is_asked):
             self._is_asked = True
             self.defer_until_idle(self._begin)
@@ -219,7 +218,7 @@ class IdentifierNode(ServedNode):
         self.compute(fit.work, taken)
 
     def _of_running(self) -> _Fit | None:
-        """Return the fit of the experiment that runs, None if there is nothing new."""
+        """Return the fit of the running experiment, None if there is nothing new."""
         progress, self._progress = self._progress, None
         try:
             if progress is not None and progress.experiment_id != self._ended:
@@ -240,7 +239,7 @@ class IdentifierNode(ServedNode):
         return None
 
     def _whole(self, record: Record) -> Callable[[], Analysis]:
-        """Return what analyses the record of an experiment that has ended."""
+        """Return the function that analyses the record of a finished experiment."""
         earlier, asked = self._earlier, vars(self._task())
         if record.outcome == Outcome.COMPLETED:
             self._earlier = record
@@ -248,16 +247,16 @@ class IdentifierNode(ServedNode):
             return partial(analyse_jointly, (record, earlier), **asked)
         return partial(analyse, record, **asked)
 
-    # What came of it.
+    # Output.
 
     def _fitted(self, name: str, found: Any) -> None:
-        """Publish the model of an experiment that runs, unless it has ended meanwhile."""
+        """Publish the model of a running experiment, unless it has ended meanwhile."""
         analysis = self._analysis(name, found)
         if name != self._ended and analysis is not None and analysis.model is not None:
             self._publish_model(analysis, final=False)
 
     def _identified(self, name: str, found: Any) -> None:
-        """Publish model and gains of an experiment, and why one of them does not come."""
+        """Publish model and gains of an experiment, and the reason if one is missing."""
         self._signs.done(name, self._published(name, self._analysis(name, found)))
 
     def _published(self, name: str, analysis: Analysis | None) -> str:
@@ -330,7 +329,7 @@ class IdentifierNode(ServedNode):
 
 
 def _sought(progress: Any) -> tuple[str, float]:
-    """Return what ends an experiment, and how narrow its interval has to be."""
+    """Return the quantity whose interval ends an experiment, and the wanted width."""
     return progress.sought or ULTIMATE_GAIN, progress.sought_width
 
 

@@ -1,4 +1,4 @@
-"""The parameters of identifier_node: method, rule, what is known, what a controller shall do."""
+"""The parameters of identifier_node: method, rule, known process values, design options."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from relay_autotune.quantities import Quantity, declared
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune.tuning.task import DesignOptions
 
-# A recording tells these.
+# Measured by the experiment, so they are no parameters.
 _MEASURED = ("noise_std", "amplitude")
-# Names that stand for something else beside those of a controller.
+# Renamed, because the plain name would mean something else beside a controller's parameters.
 _PREFIXED = {"gain": "known_gain", "dead_time": "known_dead_time"}
 
 KNOWN = tuple(
@@ -36,7 +36,7 @@ PARAMETERS = (
 
 
 def known_from(values: Mapping[str, Any]) -> Known:
-    """Return what is known of the process.
+    """Return the known values of the process.
 
     :param values: of the parameters, by name.
     :raises ParameterError: if a value is out of its range, or the gain is zero.
@@ -45,7 +45,7 @@ def known_from(values: Mapping[str, Any]) -> Known:
 
 
 def options_from(values: Mapping[str, Any]) -> DesignOptions:
-    """Return what the parameters ask of a controller.
+    """Return the design options of the controller.
 
     :param values: of the parameters, by name.
     :raises TuningError: if a value is out of its range.

@@ -32,11 +32,11 @@ from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.nodes.signals import ending_signals, never_wait_for, signal_name
 from relay_autotune.quantities import Quantity
 
-# How long a thread that only computes may keep a measurement waiting [s]; the default is 5 ms.
+# Longest delay of a measurement by a computing thread [s]; Python's default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
-# What the end of a node has begun, such as the answer to a goal, may take so long [s].
+# Time limit for tasks at the end of a node, such as the answer to a goal [s].
 _FINISH_WITHIN = 0.2
-# What the pipe of signals says at the end.
+# Byte that ends the thread at the pipe of signals.
 _NO_SIGNAL = 0
 
 
@@ -47,21 +47,21 @@ class ServedNode(Node):
         super().__init__(name)
         self._deferred: deque[Callable[[], None]] = deque()
         self.favoured: Subscription | None = None
-        """The subscription whose messages follow closely, see `Executor.favour`."""
+        """The subscription with the fast path, see `Executor.favour`."""
         self._when_idle: deque[Callable[[], None]] = deque()
 
     def defer(self, work: Callable[[], None]) -> None:
-        """Do ``work`` outside of the callback that asks for it, in the order of asking."""
+        """Do ``work`` after the present callback, in the order of the calls."""
         self._deferred.append(work)
 
     def defer_until_idle(self, work: Callable[[], None]) -> None:
-        """Do ``work`` once no message, timer or request waits any more."""
+        """Do ``work`` once no message, timer or request waits."""
         self._when_idle.append(work)
 
     def work(self, *, idle: bool) -> bool:
         """Do one piece of deferred work; return True if there is more.
 
-        :param idle: True if nothing else is to be done now.
+        :param idle: True if nothing else waits, so that idle work may be done.
         """
         if self._deferred:
             self._deferred.popleft()()
@@ -70,31 +70,31 @@ class ServedNode(Node):
         return bool(self._deferred or self._when_idle)
 
     def work_off(self) -> None:
-        """Do all deferred work, except what waits for an idle moment."""
+        """Do all deferred work, and drop the idle work."""
         self._when_idle.clear()
         while self.work(idle=False):
             pass
 
     def compute(self, work: Callable[[], Any], taken: Callable[[Any], None]) -> None:
-        """Do ``work`` in a thread while the callbacks go on, then hand over what came of it.
+        """Do ``work`` in a thread while the callbacks go on, then hand over its result.
 
         :param work: called in the thread; it must not touch the node.
-        :param taken: called as a callback of the node, with what ``work`` returned or raised.
+        :param taken: called by the node's executor with what ``work`` returned or raised.
         """
         executor = self.executor
 
         def run() -> None:
             try:
                 found = work()
-            except Exception as error:  # whoever asked for the work judges it
+            except Exception as error:  # `taken` handles it
                 found = error
             executor.create_task(taken, found)
 
-        # Nobody waits for a computation when the process ends.
+        # A daemon thread, so that a running computation does not delay the end of the process.
         threading.Thread(target=run, name="computation", daemon=True).start()
 
     def end(self, reason: str) -> None:
-        """Bring the loop to a safe state first of all, then finish what is open.
+        """Bring the loop to a safe state first, then finish open work.
 
         :param reason: why the process ends, for people.
         """
@@ -111,18 +111,18 @@ def run(
     :param create: makes the node.
     :param name: name of the executable, for messages on standard error.
     :param args: command line; default: that of the process.
-    :param parameters: those of the node, for ``--help`` and to tell names that are not among them.
+    :param parameters: parameters of the node, for ``--help`` and to find unknown names.
     :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
     """
     words = sys.argv[1:] if args is None else list(args)
     own = _outside_of_ros(words)
     if {"-h", "--help"} & set(own):
-        # Whoever pages through it may have seen enough.
+        # A pager may have been closed early.
         with contextlib.suppress(BrokenPipeError):
             print(_help(name, str(sys.modules[create.__module__].__doc__), parameters), flush=True)
         return 0
     if own:
-        # ROS would pass over them without a word, and over the limits that they may be.
+        # ROS ignores them without a message; an ignored limit is dangerous.
         return _refuse(
             name,
             f"{' '.join(own)} has no effect outside of --ros-args; expected such as "
@@ -148,7 +148,7 @@ def run(
         return _refuse(name, str(error))
     try:
         for unknown in unknown_parameters(list(node._parameter_overrides), parameters):
-            # A file may hold what is meant for others.
+            # Only a warning: a file may hold parameters of other nodes.
             node.get_logger().warning(unknown)
         return _serve(node, signals)
     finally:
@@ -158,7 +158,7 @@ def run(
 
 def _refuse(name: str, why: str) -> int:
     """Say why a node cannot run; return the exit status."""
-    # Nobody may be there to read it.
+    # Standard error may be closed.
     with contextlib.suppress(OSError):
         print(f"{name}: {why}", file=sys.stderr)
     return 2
@@ -181,7 +181,7 @@ def _typed_parameters(words: Sequence[str]) -> list[str]:
     """Return the names of the parameters that were given with ``-p``."""
     pairs = itertools.pairwise(words)
     given = [after.split(":=")[0] for flag, after in pairs if flag in ("-p", "--param")]
-    # NODE:NAME is for one node of a process.
+    # NODE:NAME addresses one node of a process.
     return [name.rsplit(":", maxsplit=1)[-1] for name in given]
 
 
@@ -209,7 +209,7 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
     if node.favoured is not None:
         executor.favour(node.favoured)
     signals.wake(executor)
-    # What was imported stays: the collector need not look at it again and again.
+    # Imported objects stay for ever, so keep the garbage collector away from them.
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
@@ -222,7 +222,7 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
         reason = f"the node was stopped by {signal_name(signals.came[0])}"
     except Exception as error:
         status, reason = 1, f"the node failed: {_where(error)}"
-    # The safe command goes out before anything is said about why.
+    # The safe command goes out before the reason is logged.
     try:
         node.end(reason)
     except Exception as error:
@@ -241,12 +241,12 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
 
 
 class _Signals:
-    """The signals that end a process, from now on: which came, in their order.
+    """Record the signals that would end the process, in order of arrival.
 
-    A second one changes nothing: the end of a node is bounded in time. A handler in Python waits
-    until the main thread is back from C, where the executor waits. The interpreter writes the
-    number of a signal into a pipe at once; a thread reads it and gives the executor something to
-    do.
+    A second signal changes nothing, because the end of a node is bounded in time. A Python handler
+    runs only when the main thread returns from C code, and the executor waits in C code. But the
+    interpreter writes the signal's number into a pipe at once. A thread reads the pipe and wakes
+    the executor.
     """
 
     def __init__(self) -> None:
@@ -257,12 +257,12 @@ class _Signals:
         signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         for number in self._heeded:
             signal.signal(number, lambda n, _: self.came.append(n))
-        # It would stop a node in the background that says something on its terminal.
+        # The default action would stop a background node that writes to its terminal.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         self._thread: threading.Thread | None = None
 
     def wake(self, executor: Executor) -> None:
-        """Give an executor something to do as soon as one comes, or has come."""
+        """Wake an executor at each signal, also for signals that came before this call."""
 
         def read() -> None:
             while _NO_SIGNAL not in os.read(self._reader, 64):
@@ -272,14 +272,13 @@ class _Signals:
         self._thread.start()
 
     def end(self) -> None:
-        """Ignore those that still come."""
-        # `ros2 launch` sends a second SIGINT beside the terminal's, which may come as late as
-        # while the interpreter ends: there a handler of Python's is undone, and the signal would
-        # kill.
+        """Ignore further signals."""
+        # `ros2 launch` sends a second SIGINT besides the terminal's. It may arrive while the
+        # interpreter shuts down, after Python has removed its handlers, and would kill the node.
         for number in self._heeded:
             signal.signal(number, signal.SIG_IGN)
         signal.set_wakeup_fd(-1)
-        # The pipe stays open: a handler that has begun in another thread may still write to it.
+        # The pipe stays open: a handler that has already started may still write to it.
         os.write(self._writer, bytes([_NO_SIGNAL]))
         if self._thread is not None:
             self._thread.join()

@@ -1,4 +1,4 @@
-"""Message types of a loop's own topics: which number is the measurement, and when it was taken."""
+"""Message types of measurement and command: how value and stamp are read and written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEP = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
 
 @dataclass(frozen=True)
 class Reader:
-    """How a number is read from a message.
+    """Access to a number in a message.
 
     :param kind: the message class.
     :param type_name: its name, such as ``sensor_msgs/msg/Temperature``.
@@ -39,11 +39,11 @@ class Reader:
 
 
 def reader_of(type_name: str, field: str) -> Reader:
-    """Return how the measurement is read from a message type.
+    """Return the reader of the measurement for a message type.
 
     :param type_name: such as ``sensor_msgs/msg/Temperature``.
     :param field: path of a numeric field, such as ``position[2]`` or ``twist.linear.x``.
-    :raises ParameterError: if there is no such type, or it has no such number.
+    :raises ParameterError: if the type does not exist, or the field is no number.
     """
     package, _, rest = type_name.partition("/")
     try:
@@ -70,7 +70,7 @@ def reader_of(type_name: str, field: str) -> Reader:
 
 
 def command_setter(type_name: str) -> tuple[Any, Callable[[Any, float], None]]:
-    """Return a message of a command type, and what writes a command into it.
+    """Return a message of a command type, and the function that writes a command into it.
 
     :param type_name: one of `COMMAND_TYPES`.
     """
@@ -112,7 +112,7 @@ def _check(example: Any, path: list[str | int], type_name: str, field: str) -> N
     found = example
     for step in path:
         if isinstance(step, int):
-            # An array's length is known when a message comes.
+            # An array's length is known only when a message comes.
             return
         if not hasattr(found, step) or step.startswith("_"):
             known = ", ".join(getattr(found, "get_fields_and_field_types", dict)())

@@ -1,4 +1,4 @@
-"""The loop around relay_node: the present controller, the actuator, and who else commands."""
+"""The loop around relay_node: the present controller, the actuator, other publishers."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from relay_autotune.nodes.guard import (
 from relay_autotune.nodes.handover import Handover
 from relay_autotune.nodes.readiness import NotReadyError
 
-# In takeover, the node's own last commands, which come back to it by the topic.
+# In takeover, number of the node's own last commands; they return to it over the topic.
 _OWN_KEPT = 256
-# How often the controller is looked after while it is passed through [s].
+# Interval of the check of a controller that is passed through [s].
 _LOOK_EVERY = 0.05
 
 
 class LoopEnds:
-    """Watch what else acts on the loop, and hand the command over and back.
+    """Watch the other nodes of the loop, and hand the command over and back.
 
     :param node: relay_node.
     :param ends: its topics.
-    :param takeover: True if the controller publishes the command by itself.
-    :param stop: ends a running tune with a reason.
+    :param takeover: True if the controller publishes the command itself.
+    :param stop: ends a running tune; takes the reason.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class LoopEnds:
         self._gives_back = False
         self._driven = False
         self._silent = ""
-        # When it was heard last; inf: there is none to be heard.
+        # Time of the last feedback; inf: there is no feedback.
         self._feedback_at = math.inf
         self._follow: FollowWatch | None = None
         self._own: deque[float] = deque(maxlen=_OWN_KEPT)
@@ -95,31 +95,32 @@ class LoopEnds:
 
     @property
     def is_driven(self) -> bool:
-        """True while somebody else's commands reach the actuator."""
+        """True while another node's commands reach the actuator."""
         tuning = self._experiment is not None and self._ends.setpoint is None
         return self._driven and not tuning
 
     @property
     def is_connected(self) -> bool:
-        """True if a present controller's commands come on controller_command."""
+        """True if commands of a present controller arrive on controller_command."""
         return not self._takeover and self.handover.is_connected(self._value("controller_timeout"))
 
     def mean_command(self) -> float:
-        """Return the mean of the present controller's last commands [u]; NaN: there is none.
+        """Return the mean of the present controller's last commands [u]; NaN without controller.
 
-        In takeover the controller has fallen silent by then, and its last commands still count.
+        In takeover the controller is already silent here, and its last commands still count.
         """
         known = self._takeover or self.is_connected
         return self.handover.mean() if known else math.nan
 
     def problem(self) -> str:
-        """Return what an operator must act on, "" if nothing."""
+        """Return a problem that an operator must act on, or ""."""
         return self._silent
 
     def require_alone(self) -> None:
-        """Refuse a start while somebody else commands the actuator, or measures, or is called so.
+        """Refuse a start if another node publishes command or measurement, or has this name.
 
-        :raises NotReadyError: with who does; or with what a relay on the set-point lacks.
+        :raises NotReadyError: with the name of that node, or because a relay on the set-point has
+            no controller.
         """
         if several := self._several():
             raise NotReadyError(several)
@@ -143,7 +144,7 @@ class LoopEnds:
             )
 
     def _several(self) -> str:
-        """Return a sentence if there are two of what there may be one of, else ""."""
+        """Return a sentence on a second sensor, controller or relay_node, or ""."""
         several = second_source(self._node, self._ends.measurement)
         if not several and not self._takeover:
             several = second_source(self._node, self._controller)
@@ -153,7 +154,7 @@ class LoopEnds:
         """Take the command for a tune.
 
         :param experiment: the tune.
-        :param gives_back: True if the controller gets it back at once, however the tune ends.
+        :param gives_back: True if the controller gets the command back at once at any end.
         """
         connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
@@ -178,7 +179,7 @@ class LoopEnds:
         self._follow = None
         if self._ends.setpoint is None:
             if not self._node.count_publishers("command_feedback"):
-                # What has left is not late; what comes during the tune is heeded from then on.
+                # No feedback now is no fault; feedback that starts later is checked from then on.
                 self._feedback_at = math.inf
             self._follow = FollowWatch(self._tolerance(experiment), timeout)
             checks.append(
@@ -192,22 +193,22 @@ class LoopEnds:
         self._hold.publish(Bool(data=self._ends.setpoint is None))
 
     def _tolerance(self, experiment: RelayExperiment) -> Callable[[], float]:
-        """Return what tells how far the actuator may be from the command [u]."""
+        """Return the function that gives the largest distance of actuator and command [u]."""
         given = float(self._value("feedback_tolerance")) or 0.5 * experiment.parameters.amplitude
 
         def tolerance() -> float:
-            # An amplitude that is still found may be too small for a valve that sticks, and
-            # grows therefore; the first cycle that counts is of the one that was found.
+            # While the amplitude still grows, it may be too small for a sticking valve. The first
+            # cycle that counts has the final amplitude.
             settings = experiment.settings if experiment.cycle_count else None
             return math.inf if settings is None else 0.5 * settings.amplitude
 
         return (lambda: given) if given else tolerance
 
     def give_back(self, experiment: RelayExperiment, command: float) -> None:
-        """Give the command back after a tune, without a bump unless it hurries.
+        """Give the command back after a tune: bumpless, or at once if the process cannot wait.
 
         :param experiment: the tune that ended.
-        :param command: what the actuator has now [u].
+        :param command: the actuator's present command [u].
         """
         self._guard.end()
         self._hold.publish(Bool(data=False))
@@ -217,7 +218,7 @@ class LoopEnds:
         self.handover.give_back(left, self._value("return_time") or period)
         self._driven = self._driven and not self._takeover
 
-    # What comes in.
+    # Callbacks.
 
     def _on_controller(self, message: Float64) -> None:
         passed = self.handover.hear(message.data)
@@ -227,7 +228,7 @@ class LoopEnds:
             self._experiment.safe_command = self.handover.last
 
     def _on_command(self, message: Float64) -> None:
-        """Take a message on the command topic, where others may publish, too."""
+        """Take a message on the command topic, where other nodes may publish, too."""
         if message.data in self._own:
             return
         if self._experiment is not None:
@@ -235,7 +236,7 @@ class LoopEnds:
                 f"another node commanded {message.data:g} on {self._topic} during the tune: the "
                 "controller must hold or track"
             )
-        # Whoever commands has the loop again.
+        # A foreign command means that its sender controls the loop again.
         self._driven = True
         self.handover.note(message.data)
 
@@ -258,7 +259,7 @@ class LoopEnds:
         given = self._value("safe_command")
         safe = self.handover.mean() if math.isnan(given) else given
         self._driven = False
-        # The safe command comes first.
+        # The safe command goes out before the log message.
         self._node.hold(safe)
         self._silent = (
             f"{self._controller.topic_name} has been silent for more than {timeout:g} s; the "

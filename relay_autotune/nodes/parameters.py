@@ -1,4 +1,4 @@
-"""Declaring a node's parameters from a table, and refusing values with a sentence."""
+"""Declare a node's parameters from a table, and explain refused values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from relay_autotune.errors import ParameterError
 from relay_autotune.quantities import Quantity
 
-# What rclpy adds to every node.
+# Parameters that rclpy adds to every node.
 _EVERY_NODE = ("use_sim_time", "start_type_description_service")
 _QOS_OVERRIDES = "qos_overrides."
 _LARGEST_INTEGER = 2**62
@@ -79,11 +79,11 @@ def declare(node: Node, table: Iterable[Quantity], *, read_only: bool = False) -
 
 
 def unknown_parameters(names: Iterable[str], table: Iterable[Quantity]) -> list[str]:
-    """Return a sentence on each name that no parameter has.
+    """Return a sentence on each name that is no parameter.
 
-    rclpy passes over them without a word, and over the limits that they may have been.
+    rclpy ignores unknown names without a message; an ignored limit is dangerous.
 
-    :param names: of the values that were given at the start.
+    :param names: names of the values given at the start.
     :param table: the node's parameters.
     """
     known = [*(entry.name for entry in table), *_EVERY_NODE]
@@ -98,7 +98,7 @@ def unknown_parameters(names: Iterable[str], table: Iterable[Quantity]) -> list[
 
 
 def value_of(node: Node, entry: Quantity) -> Any:
-    """Return the present value of a parameter, () for an array that is not given."""
+    """Return the present value of a parameter; () for an array that was not given."""
     if entry.default == ():
         given = node.get_parameter_or(entry.name, None)
         return () if given is None or given.value is None else tuple(given.value)
@@ -115,7 +115,7 @@ def merged(node: Node, table: Sequence[Quantity], changes: Iterable[Parameter]) 
 
     :param node: the node.
     :param table: its parameters.
-    :param changes: what is about to be set; names that are not in the table are left alone.
+    :param changes: the changes about to be made; names that are not in the table are ignored.
     :raises ParameterError: if a changed value is out of range.
     """
     values = values_of(node, table)

@@ -30,7 +30,7 @@ from relay_autotune.quantities import Quantity
 
 MODES = ("realtime", "clock", "lockstep")
 
-# Simulated time waits so long for a command [s].
+# Longest time that simulated time waits for a command [s].
 LONGEST_WAIT = 0.2
 
 # Simulated time begins here [s]: zero means "no time yet" to ROS.
@@ -129,7 +129,7 @@ def process_from(values: dict[str, Any]) -> VirtualProcess:
     """Build the process that a node's parameters describe.
 
     :param values: the parameters by name.
-    :raises RelayAutotuneError: if they describe none.
+    :raises RelayAutotuneError: if they do not describe a process.
     """
     point = values["operating_point"] or (0.0, 0.0)
     if len(point) != 2:
@@ -163,7 +163,7 @@ def model_from(values: dict[str, Any]) -> TransferFunction:
     """Build the model that a node's parameters describe, by polynomials or by structure.
 
     :param values: the parameters by name.
-    :raises RelayAutotuneError: if both are given, or none, or they contradict themselves.
+    :raises RelayAutotuneError: if both are given, or neither, or the values contradict each other.
     """
     polynomials = bool(values["numerator"] or values["denominator"])
     if polynomials == bool(values["structure"]):
@@ -179,10 +179,10 @@ def model_from(values: dict[str, Any]) -> TransferFunction:
 
 
 class Sensor:
-    """What a real sensor does besides measuring: it comes late, loses samples, repeats none.
+    """Imperfections of a real sensor: late samples, lost samples, samples only on change.
 
     :param values: the node's parameters.
-    :raises ParameterError: in lockstep, where each sample has to come.
+    :raises ParameterError: if one is asked for in lockstep, where every sample must arrive.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
@@ -197,7 +197,7 @@ class Sensor:
             )
 
     def wait(self) -> None:
-        """Come late, as the jitter says."""
+        """Delay a sample by a random part of the jitter."""
         if self._jitter > 0.0:
             time.sleep(float(self._random.uniform(0.0, self._jitter)))
 
@@ -232,10 +232,10 @@ class PlantNode(ServedNode):
         self._message = Float64()
         self._sensor = Sensor(values)
         self._position: Any = None
-        # Each event that an end watches costs every turn of the executor a little.
+        # No event callbacks: each one costs time in every turn of the executor.
         overridable = QoSOverridingOptions.with_default_policies()
         unseen = PublisherEventCallbacks(use_default_callbacks=False)
-        # What is said only once has to stay for who comes later.
+        # A value that is published only on change must be latched for late subscribers.
         depth = quality.MEASUREMENT.depth
         offered = quality.latched(depth) if values["on_change"] else quality.MEASUREMENT
         self._measurement = self.create_publisher(
@@ -274,7 +274,7 @@ class PlantNode(ServedNode):
             self._value = self._process.measure(0.0)
             self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=self._steady)
         elif values["mode"] == "clock":
-            # Whether the last sample is to be waited for, and whether it was answered.
+            # Whether an answer to the last sample is expected, and whether it has come.
             self._waiting = self._answered = False
             self._ticked = 0.0
             self._clock = self.create_publisher(
@@ -290,7 +290,7 @@ class PlantNode(ServedNode):
             f"measurement on {self._measurement.topic_name}, command on {self._command.topic_name}"
         )
 
-    # Real time: both sides act when they come.
+    # Real time: samples by a timer, commands on arrival.
 
     def _sample(self) -> None:
         self._sensor.wait()
@@ -306,11 +306,11 @@ class PlantNode(ServedNode):
         if self._position is not None:
             self._position.publish(Float64(data=self._process.position))
 
-    # Simulated time: it stands still between two messages of /clock.
+    # Simulated time: constant between two messages of /clock.
 
     def _tick(self) -> None:
-        # Who has answered so far is waited for: on a busy machine simulated time runs slower,
-        # instead of the answers taking effect later.
+        # Wait for a controller that answered the last sample: on a busy machine simulated time
+        # then runs slower, and the commands do not come later in simulated time.
         wall = time.monotonic()
         if self._waiting and wall - self._ticked < LONGEST_WAIT:
             return
@@ -321,7 +321,7 @@ class PlantNode(ServedNode):
         message = ClockMessage()
         set_stamp(message.clock, round((CLOCK_START + now) * 1e9))
         self._clock.publish(message)
-        # Nobody need answer what is not said.
+        # A sample that is not published needs no answer.
         self._waiting = False
         if self._sensor.speaks(value):
             self._waiting, self._answered = self._answered, False
@@ -332,11 +332,11 @@ class PlantNode(ServedNode):
         self._tell_position()
         self._waiting, self._answered = False, True
 
-    # Lockstep: each command is a step.
+    # Lockstep: each command advances the process by one sample.
 
     def _repeat(self) -> None:
         if not self._waiting:
-            # Who commanded has left: whoever comes next must hear the present measurement.
+            # The controller has left: its successor needs the present measurement.
             self._waiting = self._command.get_publisher_count() == 0
         elif self._measurement.get_subscription_count() and self._command.get_publisher_count():
             self._publish(self._value)

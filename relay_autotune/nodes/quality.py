@@ -1,4 +1,4 @@
-"""The quality of service of each topic, and why two ends of a topic do not find each other."""
+"""The quality of service of each topic, and why a publisher and a subscriber do not match."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ COMMAND = QoSProfile(
 
 
 def latched(depth: int) -> QoSProfile:
-    """Return the profile of what stays for who comes late.
+    """Return the profile of a topic whose last messages reach late subscribers (latched).
 
-    :param depth: how many messages stay.
+    :param depth: number of messages kept.
     """
     return QoSProfile(
         depth=depth,
@@ -44,8 +44,8 @@ def latched(depth: int) -> QoSProfile:
 
 RESULT = latched(1)
 
-# A process that is killed stays in the graph for some 20 s. Its middleware says at shorter
-# intervals that it lives; who asks for that hears of its end after this time [s].
+# A killed process stays in the graph for some 20 s. With this liveliness lease a subscriber
+# notices its end sooner [s].
 _ALIVE_WITHIN = 1.0
 STATUS = QoSProfile(
     depth=1,
@@ -54,11 +54,11 @@ STATUS = QoSProfile(
     liveliness=LivelinessPolicy.AUTOMATIC,
     liveliness_lease_duration=Duration(seconds=_ALIVE_WITHIN),
 )
-"""Of what tells whether a tune runs, and whether relay_node lives."""
+"""Profile of the status that shows whether a tune runs, and whether relay_node lives."""
 
 
 def for_bag(profile: QoSProfile) -> Qos:
-    """Return a profile in the words of a recording's metadata."""
+    """Return a profile as a recording's metadata describe it."""
     best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     keep_all = profile.history == HistoryPolicy.KEEP_ALL
@@ -71,11 +71,11 @@ def for_bag(profile: QoSProfile) -> Qos:
 
 
 def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
-    """Say why nothing arrives on a topic, as far as the graph tells.
+    """Return why nothing arrives on a topic, as far as the graph shows.
 
     :param node: the node that subscribes.
     :param topic: resolved name of the topic.
-    :param kind: the message type that is expected.
+    :param kind: the expected message type.
     """
     ends = node.get_publishers_info_by_topic(topic)
     if not ends:
@@ -88,7 +88,7 @@ def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
 
 
 def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
-    """Say why nobody takes what is published on a topic, as far as the graph tells.
+    """Return why a topic has no connected subscriber, as far as the graph shows.
 
     :param node: the node that publishes.
     :param topic: resolved name of the topic.
@@ -105,7 +105,7 @@ def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
 
 
 def _own(node: Node, ends: Sequence[Any]) -> Any:
-    # The profile as it is in force: what it was made from leaves deadlines to the middleware.
+    # The profile in force; the requested one leaves deadlines to the middleware.
     for end in ends:
         if (end.node_namespace, end.node_name) == (node.get_namespace(), node.get_name()):
             return end.qos_profile

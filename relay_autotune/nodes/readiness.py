@@ -1,4 +1,4 @@
-"""Whether a tune can start, and the sentence that says why not."""
+"""Check whether a tune can start, and say why not."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.silence import Sensor
 from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
 
-# Levels so many times as far from zero as the baseline may be beyond the actuator's ends.
+# Levels this many times the baseline may be beyond the ends of the actuator.
 _FAR = 10.0
 
 
@@ -28,13 +28,13 @@ class NotReadyError(RelayAutotuneError):
 
 
 def require_connections(node: Node, ends: Ends, sensor: Sensor, timeout: float) -> None:
-    """Refuse a start without measurements, or with nobody who takes the commands.
+    """Refuse a start without measurements, or without a subscriber to the commands.
 
     :param node: the node that would tune.
     :param ends: its topics.
-    :param sensor: tells whether measurements come.
-    :param timeout: the greatest age of the last one that counts as "arriving" [s].
-    :raises NotReadyError: with the reason, as far as the graph tells it.
+    :param sensor: gives the age of the last measurement.
+    :param timeout: largest age of the last measurement that counts as "arriving" [s].
+    :raises NotReadyError: with the reason, as far as the graph shows it.
     """
     if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
         raise NotReadyError("use_sim_time is true, but no time has come on /clock")
@@ -55,9 +55,9 @@ def baseline_from(parameter: float, mean: float, held: float | None) -> float:
     """Return the command of the operating point.
 
     :param parameter: the parameter ``baseline`` [u]; NaN: not given.
-    :param mean: mean of the present controller's commands [u]; NaN: none is connected.
-    :param held: the command that the node holds now [u]; None: it has sent none.
-    :raises NotReadyError: if none of them is known.
+    :param mean: mean of the present controller's commands [u]; NaN: no controller is connected.
+    :param held: the command that the node holds now [u]; None: it has not sent a command.
+    :raises NotReadyError: if the baseline is not known from any of them.
     """
     if not math.isnan(parameter):
         return parameter
@@ -72,11 +72,11 @@ def baseline_from(parameter: float, mean: float, held: float | None) -> float:
 
 
 def policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
-    """Return how the process will be left when the tune ends.
+    """Return how the process is left at the end of a tune.
 
     :param values: the node's parameters.
-    :param connected: True if a present controller's commands come.
-    :raises NotReadyError: if the process would not stay where it is, and nothing could hold it.
+    :param connected: True if commands of a present controller arrive.
+    :raises NotReadyError: if the process would drift or run away, and nothing could hold it.
     """
     safe = values["safe_command"]
     low, high = values["command_min"], values["command_max"]
@@ -100,14 +100,14 @@ def policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
 
 
 def require_known_range(parameters: ExperimentParameters, baseline: float) -> None:
-    """Refuse levels far beyond the baseline where no limit says that the actuator goes so far.
+    """Refuse levels far beyond the baseline if no command limit confirms such a range.
 
-    An actuator that is at its end passes on less than it is told, and nothing in the record of two
-    levels need show it: the model has too small a gain then, and the gains are too large by as
-    much.
+    A saturated actuator moves less than its command, and a record of two levels need not show it.
+    The model's gain is then too small, and the controller gains are too large by the same factor.
 
     :param parameters: the experiment's parameters, valid.
-    :param baseline: command of the operating point, as the user gave it [u]; 0 tells no size.
+    :param baseline: command of the operating point, as the user gave it [u]; with 0 there is no
+        scale to compare with, and no refusal.
     :raises NotReadyError: with the limit to give.
     """
     if parameters.finds_amplitude or baseline == 0.0 or math.isnan(baseline):
@@ -120,14 +120,14 @@ def require_known_range(parameters: ExperimentParameters, baseline: float) -> No
         if abs(level) > most and math.isinf(limit):
             raise NotReadyError(
                 f"a level of the relay is {level:g}, more than {_FAR:g} times the baseline "
-                f"{baseline:g}, and {name} is not given: what the actuator does not follow makes "
-                f"gains that are too large; give command_min and command_max, the ends of the "
+                f"{baseline:g}, and {name} is not given: if the actuator does not go so far, the "
+                f"gains become too large; give command_min and command_max, the ends of the "
                 f"actuator, or a smaller amplitude"
             )
 
 
 def plan_of(parameters: ExperimentParameters, baseline: float, policy: SafePolicy) -> str:
-    """Say what a tune will command.
+    """Return a sentence on the commands of a tune.
 
     :param parameters: the experiment's parameters.
     :param baseline: command of the operating point [u].
@@ -153,8 +153,8 @@ def why_not_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     """Return why parameters cannot be changed now, "" if they can.
 
     :param node: relay_node.
-    :param changes: what is about to be set.
-    :param running: id of the tune that runs; empty: none.
+    :param changes: the changes about to be made.
+    :param running: id of the running tune; empty: no tune runs.
     """
     names = {entry.name for entry in TUNE_PARAMETERS}
     if running and any(change.name in names for change in changes):
@@ -165,7 +165,7 @@ def why_not_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     try:
         values = merged(node, TUNE_PARAMETERS, changes)
         experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
-        # Without an amplitude, which a request may bring, the rest is judged at the start.
+        # A start request may still give the amplitude; then all is checked at the start.
         if experiment["amplitude"] > 0.0:
             ExperimentParameters(**experiment).validate()
     except ParameterError as error:

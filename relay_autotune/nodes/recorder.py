@@ -16,23 +16,23 @@ from rclpy.serialization import serialize_message
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import BagError
 
-# What a killed process may lose at most [s].
+# Flush interval: the longest part that a killed process can lose [s].
 FLUSH_PERIOD = 0.5
 
-# The thread writes so many samples at a time and then lets the relay have the interpreter [s].
+# The thread writes PORTION samples at a time and then yields the interpreter to the relay [s].
 PORTION = 8
 PAUSE = 5e-4
 
-# The writer is loaded before the first experiment, not by its thread.
+# Load the writer now, and not in the thread of the first experiment.
 with contextlib.suppress(ImportError):
     import mcap.writer  # noqa: F401
 
 
 class Recorder:
-    """Record an experiment; whatever goes wrong is a sentence in `failure`, never an exception.
+    """Record an experiment; any error becomes a sentence in `failure`, never an exception.
 
-    :param path: the folder to make.
-    :param topics: what will be recorded; the first is the measurement, the second the command.
+    :param path: the folder to create.
+    :param topics: the topics to record; the first is the measurement, the second the command.
     :param start_ns: the present time [ns since the epoch].
     :param facts: facts about the bag, for its metadata.
     """
@@ -52,7 +52,7 @@ class Recorder:
         self._closing = threading.Event()
         self._finished: Callable[[], object] = bool
         self._writer: BagWriter | None = None
-        # Bound once: this is called for each sample.
+        # Looked up once, because it is called for each sample.
         self.sample = self._samples.put
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -70,13 +70,13 @@ class Recorder:
         self._messages.put((topic, time_ns, message))
 
     def wait_until_open(self, timeout: float) -> None:
-        """Wait for the folder to be made, or refused, for ``timeout`` seconds at most."""
+        """Wait at most ``timeout`` seconds until the folder was created or could not be."""
         self._opened.wait(timeout)
 
     def close(self, finished: Callable[[], None]) -> None:
-        """Ask for the bag to be finished; returns at once.
+        """Request the end of the bag; returns at once.
 
-        :param finished: called by the recorder's thread once the bag is whole.
+        :param finished: called by the recorder's thread once the bag is complete.
         """
         self._finished = finished
         self._closing.set()
@@ -97,7 +97,7 @@ class Recorder:
             self._opened.set()
         closing = False
         while not closing:
-            # A period of sleep, not a wake-up for each sample, which would compete with the relay.
+            # Sleep for a period: a wake-up for each sample would compete with the relay.
             closing = self._closing.wait(FLUSH_PERIOD)
             self._guarded(self._drain)
         self._guarded(self._finish)
@@ -110,7 +110,7 @@ class Recorder:
             except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
                 self.failure = str(error) or type(error).__name__
         if self.failure is not None:
-            # Nothing will be written any more, so nothing may pile up either.
+            # Nothing is written after a failure, so empty the queues.
             self._discard()
 
     def _drain(self, writer: BagWriter) -> None:

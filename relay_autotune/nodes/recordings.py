@@ -26,9 +26,9 @@ RESULTS = ("transfer_function", "pi_gains")
 
 # How long a start waits for the recording's folder [s].
 OPEN_WITHIN = 0.3
-# While the identifier gives signs of life, it is waited for so many times as long as without.
+# With signs of life of the identifier, the wait may take this many times the timeout.
 LONGEST = 30.0
-# When it says that no more will come, what it has sent may still be on its way [s].
+# Wait after the identifier has finished, for messages that are still on their way [s].
 ON_THE_WAY = 0.5
 
 
@@ -69,7 +69,7 @@ class Recordings:
 
         :param experiment_id: its id, which names the folder.
         :param directory: where the folder is made.
-        :return: what takes each sample, and a sentence on where it is recorded, or why not.
+        :return: the function that records a sample, and a sentence on the folder or the failure.
         """
         recorder = Recorder(
             Path(directory).expanduser() / experiment_id,
@@ -88,7 +88,7 @@ class Recordings:
         return recorder.sample, said
 
     def problem(self) -> str:
-        """Say what is wrong with the newest recording, "" if nothing; logged when it is new."""
+        """Return what is wrong with the newest recording, or ""; a new problem is logged."""
         problem = self._last.failure if self._last is not None else None
         if problem and problem != self._reported:
             self._reported = problem
@@ -96,12 +96,12 @@ class Recordings:
         return problem or ""
 
     def message(self, experiment_id: str, name: str, time_ns: int, message: Any) -> None:
-        """Record a message of an experiment; one of none that is open is left alone.
+        """Record a message of an experiment; ignore it if no such recording is open.
 
         :param experiment_id: the id of the experiment.
         :param name: unresolved name of the topic.
-        :param time_ns: when it was sent or came [ns since the epoch].
-        :param message: the message, not to be changed afterwards.
+        :param time_ns: when it was sent or received [ns since the epoch].
+        :param message: the message, which must not be changed afterwards.
         """
         recording = self._open.get(experiment_id)
         if recording is None:
@@ -115,16 +115,16 @@ class Recordings:
     def path_of(self, experiment_id: str) -> str:
         """Return the folder of a recording; "" if nothing could be recorded.
 
-        :param experiment_id: the id of the experiment, one of the newest two.
+        :param experiment_id: the id of the experiment; only the newest two are known.
         """
         return self._paths.get(experiment_id, "") if not self.problem() else ""
 
     def told(self, experiment_id: str, working: bool, lacking: str) -> None:
         """Take a sign of life of the identifier.
 
-        :param experiment_id: what it works on, or has finished.
+        :param experiment_id: the experiment that it works on, or has finished.
         :param working: True if it still works on it.
-        :param lacking: why model or gains will not come; "": they have been sent.
+        :param lacking: why model or gains will not come; "": both were sent.
         """
         recording = self._open.get(experiment_id)
         if recording is None or recording.timer is None:
@@ -140,11 +140,11 @@ class Recordings:
     def close_with_results(
         self, experiment_id: str, timeout: float, closed: Callable[[str], None]
     ) -> None:
-        """Close a recording once model and gains are in it, or after a time without them.
+        """Close a recording once model and gains are in it, or after a timeout.
 
         :param experiment_id: the id of the experiment.
         :param timeout: how long to wait from the end, or from the last sign of life [s].
-        :param closed: called with a sentence on what is missing, "" if nothing is.
+        :param closed: called with a sentence on the missing results, "" if none is missing.
         """
         recording = self._open.get(experiment_id)
         if recording is None:

@@ -59,16 +59,16 @@ from relay_autotune.nodes.tune_parameters import (
 from relay_autotune.record.record import Outcome
 from relay_autotune_msgs.srv import StartTune
 
-# How long the end of the process waits for the record to be acknowledged
+# How long the end of the process waits for the acknowledgement of the record.
 ACKNOWLEDGE = Duration(seconds=0.2)
-# Cycles that wait for who comes late, or max_cycles at the node's start if that is more.
+# Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
 # How long the end of the process may wait for the last bytes of a recording [s].
 CLOSE_WITHIN = 3.0
 
 
 class RelayNode(ServedNode):
-    """Answers each measurement with a command while a tune runs, and holds the process after."""
+    """Answer each measurement with a command during a tune, and hold the process after it."""
 
     def __init__(self) -> None:
         super().__init__("relay_node")
@@ -106,7 +106,7 @@ class RelayNode(ServedNode):
         )
         self._hear = self._sensor.hear
         if not self._simulated:
-            # With /clock, the time of a sample comes by another callback.
+            # Not with /clock: there another callback delivers the time of a sample.
             self.favoured = self._ends.measurement
         self._recordings = Recordings(self, self._ends.recorded())
         self._results = OwnResults(self)
@@ -143,14 +143,14 @@ class RelayNode(ServedNode):
         self._counter.add(info["publication_sequence_number"])
 
     def _on_silence(self, value: float, ago: float) -> None:
-        """Take the last measurement again, which a sensor that is silent stands by."""
+        """Take the last measurement again: a silent sensor means that it has not changed."""
         if (session := self._session) is not None:
             self._respond(session, session.repeat(value, ago))
         elif not self._loop.is_driven:
             self._answer_idle(value)
 
     def _respond(self, session: Session, command: float) -> None:
-        # Nothing comes before this: the actuator waits for it.
+        # Publish first, because the actuator waits for it.
         self._relay(command)
         session.answered()
         self._loop.commanded = command
@@ -268,7 +268,7 @@ class RelayNode(ServedNode):
     def _publish_cycle(self, session: Session, index: int) -> None:
         self._action.tell(session.experiment)
         if self._on_setpoint:
-            # What the controller commanded is known at the end.
+            # The controller's commands are known only at the end.
             return
         message = cycle_message(session, index)
         self._ends.cycles.publish(message)
@@ -326,12 +326,12 @@ class RelayNode(ServedNode):
     def _send_safe(self, command: float) -> bool:
         count, acknowledged = self._ends.send_until_acknowledged(command)
         if self.get_parameter("sample_period").value > 0.0:
-            # A plant in lockstep answers each of these with a measurement, which wants no more.
+            # A plant in lockstep answers each repeat with a measurement; these need no answer.
             self._ahead = count
         return acknowledged
 
     def _leave(self, session: Session, command: float) -> None:
-        # The safe command is out. All that takes time waits until the callback has returned.
+        # The safe command is out. Slow work is deferred until the callback has returned.
         if not self._on_setpoint:
             self._held, self._after = command, session.experiment.after_end
         self._session = None
@@ -379,10 +379,10 @@ class RelayNode(ServedNode):
         finally:
             self._recordings.close_all(f"because {reason}", CLOSE_WITHIN)
 
-    # Telling.
+    # Status.
 
     def _lost(self) -> int:
-        # Numbers of several publishers cannot be told apart.
+        # Sequence numbers of several publishers cannot be distinguished.
         alone = self._ends.measurement.get_publisher_count() <= 1
         return self._counter.lost if alone else 0
 

@@ -1,4 +1,4 @@
-"""Gains for a controller in another node, set through its parameters: all of them or none."""
+"""Gains of a controller in another node, set through its parameters: all of them or none."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.loop.gains import Controller
 
-# What may be sent, by the names of the gains in both forms.
+# Names of the gains that may be sent, of the ISA and of the parallel form.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
 
-# How long an answer is waited for [s].
+# Longest wait for an answer [s].
 TIMEOUT = 2.0
 
 
 class RemoteError(RelayAutotuneError):
-    """Another node that did not take the gains."""
+    """Another node did not take the gains."""
 
 
 def mapping_of(texts: Sequence[str]) -> dict[str, str]:
-    """Return which gain goes into which parameter.
+    """Return the parameter name for each gain.
 
-    :param texts: such as ``p:gains.heater.p``.
-    :raises ParameterError: if a text is no such pair.
+    :param texts: pairs such as ``p:gains.heater.p``.
+    :raises ParameterError: if a text is not such a pair.
     """
     found = {}
     for text in texts:
@@ -46,16 +46,15 @@ def mapping_of(texts: Sequence[str]) -> dict[str, str]:
 
 
 def controller_of(gains: Mapping[str, float]) -> Controller:
-    """Return the controller that gains by name make, in the ISA or the parallel form.
+    """Return the controller with gains given by name, in the ISA or the parallel form.
 
-    :param gains: some of `NAMES`; without a derivative, filter or set-point weight, there is
-        none, none, and 1.
-    :raises RelayAutotuneError: if they make none.
+    :param gains: some of `NAMES`; defaults: no derivative, no filter, set-point weight 1.
+    :raises RelayAutotuneError: if they are not enough for a controller.
     """
     proportional = gains.get("kc", gains.get("p"))
     if proportional is None or not {"ti", "i"} & set(gains):
         raise RemoteError(
-            f"of the gains only {', '.join(gains)} are known, expected kc or p, and ti or i: name "
+            f"only the gains {', '.join(gains)} are known, expected kc or p, and ti or i: name "
             "their parameters in apply_parameters"
         )
     integral, derivative = gains.get("i", 0.0), gains.get("d", 0.0)
@@ -71,11 +70,11 @@ def controller_of(gains: Mapping[str, float]) -> Controller:
 class RemoteGains:
     """The parameters of another node as a place for gains: all of them or none.
 
-    Each question is given up after `TIMEOUT`, so that a node that hangs keeps nobody waiting.
+    Each service call is given up after `TIMEOUT`, because the other node may hang.
 
-    :param node: the node that asks.
-    :param target: name of the node that controls.
-    :param mapping: which gain goes into which of its parameters.
+    :param node: the calling node.
+    :param target: name of the controlling node.
+    :param mapping: its parameter name for each gain.
     """
 
     outlives = True
@@ -85,7 +84,7 @@ class RemoteGains:
         self._node = node
         self._mapping = dict(mapping)
         base = target.rstrip("/")
-        # The answers must come while the callback that waits for them has not returned.
+        # Answers must be handled while the callback that waits for them is still running.
         self._group = ReentrantCallbackGroup()
         self._get, self._set = (
             node.create_client(kind, f"{base}/{name}", callback_group=self._group)
@@ -96,17 +95,17 @@ class RemoteGains:
         )
 
     def set_of(self, controller: Controller) -> GainSet:
-        """Return the parameters that make a controller.
+        """Return the parameters of a controller.
 
         :param controller: the gains.
         """
         return GainSet.of({t: getattr(controller, name) for name, t in self._mapping.items()})
 
     def controller_of(self, gains: GainSet) -> Controller:
-        """Return the controller that parameters make.
+        """Return the controller with these parameters.
 
         :param gains: the parameters.
-        :raises RelayAutotuneError: if they make none.
+        :raises RelayAutotuneError: if they are not enough for a controller.
         """
         values = gains.by_name()
         return controller_of({name: values[target] for name, target in self._mapping.items()})
@@ -114,7 +113,7 @@ class RemoteGains:
     def said(self, gains: GainSet | None) -> str:
         """Say which gains are in force."""
         if gains is None:
-            return f"{self.name} keeps its gains, since none before them are known: see to it"
+            return f"{self.name} keeps its gains, since no earlier gains are known: check them"
         return f"{self.name} has {gains}"
 
     async def read(self) -> GainSet:
@@ -137,7 +136,7 @@ class RemoteGains:
         """Set the parameters and read them back.
 
         :param gains: None: leave them as they are, since another node's command cannot be held.
-        :raises RelayAutotuneError: if they are not as they were set, or that is not known.
+        :raises RelayAutotuneError: if the values read back differ, or cannot be read.
         """
         if gains is None:
             return

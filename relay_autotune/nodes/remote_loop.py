@@ -1,4 +1,4 @@
-"""A loop whose controller is another node: gains by its parameters, the set-point by a topic."""
+"""A loop whose controller is another node: gains by parameters, the set-point by a topic."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.remote_gains import RemoteGains
 from relay_autotune.nodes.verifier import NotVerifiable
 
-# A controller that says nothing for so long commands no more [s].
+# A controller without a command for this time counts as silent [s].
 _SILENCE = 2.0
 
 
 class RemoteLoop:
     """Hear another node's controller, and move its set-point.
 
-    :param node: the node that does.
+    :param node: this node.
     :param gains: the other node's parameters.
-    :param setpoint: its set-point until one is heard [y]; NaN: not known.
-    :param disturbed: called with the reason when somebody else moves the set-point.
+    :param setpoint: its set-point until one is received [y]; NaN: not known.
+    :param disturbed: called with the reason when another node moves the set-point.
     """
 
     def __init__(
         self, node: Node, gains: RemoteGains, setpoint: float, disturbed: Callable[[str], None]
     ) -> None:
         self.command = math.nan
-        """The last command heard [u]; NaN: none."""
+        """The last command received [u]; NaN before the first."""
         self._gains = gains
         self._heard_at = 0.0
         self.setpoint = setpoint
         """The set-point in force [y]; NaN: not known."""
         self._disturbed = disturbed
         self._offset = 0.0
-        # What was published comes back by the topic, where others publish, too.
+        # Own set-points that have not come back yet over the topic, where others may publish, too.
         self._on_the_way: list[float] = []
         self._publisher = node.create_publisher(
             Float64,
@@ -63,14 +63,14 @@ class RemoteLoop:
             self._heard_at = time.monotonic()
 
     def why_silent(self) -> str:
-        """Return a sentence if the other node commands no more, else ""."""
+        """Return a sentence if the other node has stopped sending commands, else ""."""
         silent = time.monotonic() - self._heard_at
         if silent < _SILENCE:
             return ""
         return f"no command of {self._gains.name} for {silent:.3g} s"
 
     def require_ready(self) -> None:
-        """Refuse a loop where it could not be seen what a step of the set-point does.
+        """Refuse a loop in which the effect of a set-point step could not be seen.
 
         :raises NotVerifiable: with the reason.
         """
@@ -80,7 +80,7 @@ class RemoteLoop:
                 f"the set-point of {target} is not known: publish it on {topic}, or give "
                 "initial_setpoint"
             )
-        # One of the subscriptions is the node's own.
+        # One subscription is the node's own.
         if self._publisher.get_subscription_count() < 2:
             raise NotVerifiable(
                 f"nobody takes a set-point from {topic}: remap it to the topic of {target}"
@@ -113,7 +113,7 @@ class RemoteLoop:
         if not is_usable(message.data):
             return
         changed = message.data != self.setpoint + self._offset
-        # It is in force already: there is nothing to go back to.
+        # The new set-point is in force already, so there is no step to take back.
         self.setpoint, self._offset = message.data, 0.0
         if changed:
             self._disturbed(f"another node set the set-point to {message.data:g}")

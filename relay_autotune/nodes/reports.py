@@ -1,4 +1,4 @@
-"""What relay_node tells of a tune: its cycles, its record, its state."""
+"""Messages of relay_node about a tune: cycles, record, state."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def experiment_message(session: Session, *, arrays: bool = True) -> Any:
     try:
         fill_experiment(message, session.record(), arrays=arrays)
     except RecordError:
-        # Ended before the first sample: there is an outcome, but nothing was recorded.
+        # The tune ended before its first sample: an outcome, but no record.
         fill_settings(message.settings, experiment.settings)
         message.experiment_id = session.id
         message.outcome = int(experiment.outcome)
@@ -62,7 +62,7 @@ def experiment_message(session: Session, *, arrays: bool = True) -> Any:
 
 
 class Counter:
-    """Count what arrives: how often, how long ago, and what the middleware lost on the way."""
+    """Count arrivals: their number, the time since the last, and losses in the middleware."""
 
     def __init__(self) -> None:
         self.lost = 0
@@ -73,7 +73,7 @@ class Counter:
 
     @property
     def age(self) -> float:
-        """Time since the last arrival [s]; inf: none."""
+        """Time since the last arrival [s]; inf before the first."""
         return time.monotonic() - self._last_arrival
 
     def begin(self) -> None:
@@ -106,8 +106,8 @@ def state_values(
     """Return the facts of relay_node for /diagnostics.
 
     :param counter: of the measurements.
-    :param session: the tune that runs; None: none does.
-    :param idle: what the node does while none runs.
+    :param session: the running tune; None: no tune runs.
+    :param idle: state of the node without a tune.
     :param lost: samples that the middleware has lost during this tune.
     """
     values: dict[str, object] = {

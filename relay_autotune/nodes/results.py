@@ -1,8 +1,7 @@
-"""What nodes take from the topics of results: checked, or refused with a reason.
+"""Check records, models and gains from topics, or refuse them with a reason.
 
-Any node of the network can publish a record, a model or gains. Here each becomes a checked object
-of the core and is compared with what is known of its experiment, before it ends, applies or stores
-anything.
+Any node of the network can publish them. Here each message becomes a checked object of the core
+and is compared with the known facts of its experiment, before it has any effect.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
-# Experiments that are remembered, and reasons that are logged; somebody may send any number.
+# Limits on remembered experiments and logged reasons, since a node may send any number.
 _MOST = 8
 _MOST_REASONS = 50
 MODEL = "transfer_function"
@@ -38,7 +37,7 @@ _NUMBER = re.compile(r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|\binf\b|\bnan\b)", re.IGNO
 class Refusals:
     """Log why something is refused, once for each cause.
 
-    :param node: whose log is used.
+    :param node: the node whose log is used.
     """
 
     def __init__(self, node: Node) -> None:
@@ -48,9 +47,9 @@ class Refusals:
     def say(self, what: str, experiment_id: str, error: RelayAutotuneError) -> None:
         """Log a refusal, unless this cause was logged before.
 
-        :param what: is refused, such as ``gains``.
-        :param experiment_id: that it claims to be of.
-        :param error: why.
+        :param what: the refused thing, such as ``gains``.
+        :param experiment_id: its experiment, according to the message.
+        :param error: the reason.
         """
         # The same fault with other numbers is the same cause.
         cause = f"{what}: {_NUMBER.sub('#', str(error))}"
@@ -67,9 +66,9 @@ class Refusals:
 class Results:
     """Judge models and gains by the records of their experiments.
 
-    :param node: whose log tells refusals.
-    :param is_stable: tells whether gains make a stable loop with a model; None: it is not asked,
-        since what tells it takes long to load.
+    :param node: the node that logs refusals.
+    :param is_stable: returns whether gains make a stable loop with a model; None: no such check,
+        because the modules for it load slowly.
     """
 
     def __init__(
@@ -81,7 +80,7 @@ class Results:
         self._models: dict[str, TransferFunction] = {}
 
     def know(self, experiment: Record) -> None:
-        """Remember what a record tells; what comes later under its id changes nothing.
+        """Remember the facts of a record; a later record with the same id changes nothing.
 
         :param experiment: its record.
         """
@@ -89,7 +88,7 @@ class Results:
             _keep(self._evidence, experiment.experiment_id, Evidence.of(experiment))
 
     def experiment(self, message: Any) -> None:
-        """Remember what the record of an experiment tells, if it is one.
+        """Remember the facts of an experiment's record, if the message holds a valid one.
 
         :param message: the `RelayExperiment`.
         """
@@ -99,7 +98,7 @@ class Results:
             self.refusals.say("the record", message.experiment_id, error)
 
     def model(self, message: Any) -> TransferFunction | None:
-        """Return the model of a message, None if it is refused.
+        """Return the model in a message, None if it is refused.
 
         :param message: the `TransferFunction`.
         """
@@ -116,10 +115,10 @@ class Results:
         return model
 
     def gains(self, message: Any) -> Gains | None:
-        """Return the gains of a message, None if they are refused.
+        """Return the gains in a message, None if they are refused.
 
-        Gains of an experiment that is not known, and of which no model has come, are taken: who
-        applies them by hand may know better. :meth:`doubt` tells of them.
+        Gains of an unknown experiment without a model are accepted, because a user who applies
+        them by hand may know more. :meth:`doubt` reports them.
 
         :param message: the `PidGains`.
         """
@@ -133,9 +132,9 @@ class Results:
         return gains
 
     def doubt(self, experiment_id: str, gains: Gains) -> str:
-        """Say why gains must not be applied by themselves; "" if they may.
+        """Return why gains must not be applied automatically; "" if they may.
 
-        :param experiment_id: that they are said to be of.
+        :param experiment_id: their experiment, according to the message.
         :param gains: as :meth:`gains` returned them.
         """
         if experiment_id not in self._evidence:
@@ -149,11 +148,11 @@ class Results:
         return ""
 
     def check(self, experiment_id: str, gains: Gains) -> None:
-        """Refuse gains that contradict what is known of their experiment.
+        """Refuse gains that contradict the known facts of their experiment.
 
-        :param experiment_id: that they are said to be of.
+        :param experiment_id: their experiment, according to the message.
         :param gains: the gains.
-        :raises TuningError: if they do, or the experiment was not completed.
+        :raises TuningError: if they contradict them, or the experiment was not completed.
         """
         evidence = self._evidence.get(experiment_id)
         if evidence is None:
@@ -173,14 +172,14 @@ class Results:
 
 
 class OwnResults(Results):
-    """Take results of the experiments of this node alone.
+    """Accept results of this node's own experiments only.
 
     :param node: relay_node.
     """
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        # Gains that came before their model.
+        # Gains that arrived before their model.
         self._early: tuple[str, Any] | None = None
 
     def take(
@@ -188,9 +187,9 @@ class OwnResults(Results):
     ) -> list[tuple[str, Any]]:
         """Return the messages that may be stored, each with the name of its topic.
 
-        :param name: of the message's topic, ``transfer_function`` or ``pi_gains``.
+        :param name: the message's topic, ``transfer_function`` or ``pi_gains``.
         :param message: the message.
-        :param running: its experiment, if that still runs.
+        :param running: its experiment, if it still runs.
         :param on_setpoint: True if the relay moves a set-point, so that its levels and its sign
             are not those of the command.
         """

@@ -1,4 +1,4 @@
-"""One experiment as the node runs it: its time base, its stamps and its recording."""
+"""One experiment in relay_node: its time base, its stamps and its recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-# numpy loads this with its first median, which would be 20 ms in the middle of a tune.
+# numpy imports this at its first median; load it now, since it takes 20 ms in a tune.
 import numpy.ma
 
 from relay_autotune.exchange.messages import start_seconds
@@ -26,9 +26,9 @@ _LONGEST_WAIT_NS = 1_000_000_000
 class Session:
     """A relay experiment fed with the samples of a topic.
 
-    The time of a sample is, in this order of preference: ``k * sample_period`` for sample k where
-    a sample period is given; the node's clock where that is simulated; its arrival where samples
-    are repeated, since both are then of one clock; the middleware's source stamp otherwise.
+    The time of a sample is the first of these that applies: ``k * sample_period`` for sample k, if
+    a sample period is given; the node's clock, if it is simulated; the time of arrival, if samples
+    are repeated, so that samples and repeats are on one clock; the middleware's source stamp.
 
     :param experiment: the state machine.
     :param experiment_id: the id that every message of the experiment carries.
@@ -51,7 +51,7 @@ class Session:
         self.start_ns = 0
         self.published_cycles = 0
         self.early: EarlyEnd | None = None
-        """What ends it once it has told enough; None: nothing does."""
+        """Ends the experiment once an interval is narrow enough; None: not used."""
         self.lost_samples = 0
         self._step = experiment.step
         self._period = sample_period
@@ -75,7 +75,7 @@ class Session:
             self.answer = self._answer_by_stamp
 
     answer: Callable[[float, Mapping[str, Any]], float | None]
-    """Take a measurement and the middleware's facts about it; return the command, None: none."""
+    """Take a measurement and its message info; return the command, or None for no answer."""
 
     def record_with(self, sample: Callable[[tuple[int, int, float, int, float]], None]) -> None:
         """Hand each sample and its answer to ``sample``, once the answer is out."""
@@ -88,7 +88,7 @@ class Session:
 
     @property
     def has_news(self) -> bool:
-        """True if a cycle was not published, or it is time to look whether to end."""
+        """True if a cycle is not published yet, or the early end must be checked."""
         experiment = self.experiment
         if experiment.cycle_count != self.published_cycles:
             return True
@@ -97,8 +97,8 @@ class Session:
     def repeat(self, measurement: float, ago: float = 0.0) -> float:
         """Take the last measurement for a sample again; return the command.
 
-        :param measurement: what the sensor said last, be it before the tune [y].
-        :param ago: how long ago it was one [s].
+        :param measurement: the sensor's last value, possibly from before the tune [y].
+        :param ago: age of the repeated sample [s].
         """
         now = self.now_ns() - round(1e9 * ago)
         if self._count == 0:
@@ -114,7 +114,7 @@ class Session:
         return time.time_ns() if self._clock is None else self._clock()
 
     def answered(self) -> None:
-        """Note that the answer to the last sample has left; to be called right after it has."""
+        """Note that the last answer was sent; to be called right after sending."""
         received, source, measurement, command = self._last
         if self._period > 0.0:
             # Sample number and period are the only clock of such an experiment.
@@ -150,7 +150,7 @@ class Session:
             self.start_ns = source
         self._count += 1
         command: float = self._step((source - self.start_ns) * 1e-9, measurement)
-        # From the first sample on, since the stamps themselves leave no digits for microseconds.
+        # Relative to the first sample: a float of seconds since 1970 cannot hold microseconds.
         start = self.start_ns
         stepped = self.clocks.add((source - start) * 1e-9, (received - start) * 1e-9)
         if stepped:
@@ -163,7 +163,7 @@ class Session:
         if self._count == 0:
             self.start_ns = received
         elif 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
-            # It has waited while the value before it was repeated.
+            # The message waited in the queue while the value before it was repeated.
             received = self._repeated_ns
         self._count += 1
         command: float = self._step((received - self.start_ns) * 1e-9, measurement)
@@ -206,7 +206,7 @@ class Session:
         return crossed
 
     def answer_after_all(self) -> float | None:
-        """Answer the sample that `answer` dropped as a repeat, if none has followed it."""
+        """Answer the sample that `answer` dropped as a repeat, if no sample has followed."""
         if not self.may_be_no_repeat or self._count != 1:
             return None
         self.may_be_no_repeat = False

@@ -18,10 +18,10 @@ from relay_autotune.record.record import FloatArray, Record, RelaySettings
 def on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters, float]:
     """Return the parameters of a relay on the set-point, and its baseline.
 
-    The levels are set-points then: the limits of the measurement hold for them, and a higher one
-    raises the measurement, since the loop is closed.
+    The levels are set-points. So the limits of the measurement apply to them, and a higher level
+    raises the measurement, because the loop is closed.
 
-    :param parameters: what the user set; ``amplitude`` is in units of the measurement.
+    :param parameters: the user's parameters; ``amplitude`` is in units of the measurement.
     :raises NotReadyError: if the set-point is not given.
     """
     if math.isnan(parameters.setpoint):
@@ -38,12 +38,12 @@ def on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters,
 
 
 class SetpointSession(Session):
-    """A session whose record holds what the controller commanded, not the set-points.
+    """A session whose record holds the controller's commands, not the set-points.
 
-    The controller answers a sample after the relay has seen it, so that the command of a sample
-    is known with the next one.
+    The controller answers a sample after the relay has seen it. So the command of a sample is
+    known only at the next sample.
 
-    :param actual: returns what the actuator was told last [u].
+    :param actual: returns the last command to the actuator [u].
     """
 
     def __init__(self, *args: Any, actual: Callable[[], float], **options: Any) -> None:
@@ -74,8 +74,8 @@ class SetpointSession(Session):
     def record(self) -> Record:
         """Return the record, with the controller's commands.
 
-        While the experiment runs, the answer to the last sample may still be to come; until then
-        it is taken to be the command before.
+        While the experiment runs, the answer to the last sample may be missing; the previous
+        command stands in for it.
 
         :raises RecordError: if there was no sample.
         """

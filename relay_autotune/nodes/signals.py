@@ -1,8 +1,8 @@
-"""Signals that end a process, and output that nobody takes.
+"""Signals that end a process, and output that is not read.
 
-A terminal that is closed sends SIGHUP and then refuses what is written to it; one that is paused
-by Ctrl-S, or a pipe that nobody reads, makes a write wait for as long as it likes. Nothing of that
-may end or hold up a process whose last command is in force.
+A closed terminal sends SIGHUP and then refuses output. A terminal paused by Ctrl-S, or a pipe
+without a reader, blocks a write for any time. Neither may end or delay a process whose last
+command is in force.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import stat
 from collections.abc import Callable
 from contextlib import suppress
 
-# Nobody can catch the first two. The next four come from a defect in the process itself, at an
-# instruction that would be tried again for ever. The next four end nothing. The last two stop a
-# process in the background that uses its terminal.
+# The first two cannot be caught. The next four report a defect of the process itself; a handler
+# would return to the same instruction for ever. The next four end nothing. The last two stop a
+# background process that uses its terminal.
 _OTHERS = {
     signal.SIGKILL, signal.SIGSTOP,
     signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL,
     signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH,
     signal.SIGTTIN, signal.SIGTTOU,
 }  # fmt: skip
-# These are obeyed even where the process was started with them ignored, as a shell does with the
-# first two in the background of a script; SIGHUP then is not, which is what nohup is for.
+# These are obeyed even if the process was started with them ignored: a shell ignores the first two
+# for the background jobs of a script. An ignored SIGHUP stays ignored, for nohup.
 _ALWAYS = {signal.SIGINT, signal.SIGQUIT, signal.SIGTERM}
 
 
@@ -42,27 +42,26 @@ def signal_name(number: int) -> str:
 
 
 def never_wait_for(output: int) -> Callable[[], None]:
-    """Let writes to a terminal or a pipe be dropped where they would wait.
+    """Drop writes to a terminal or a pipe when they would block.
 
-    Whether a write waits belongs to the open file, which the process shares with the shell that
-    started it and whatever else writes there. So it is opened once more, for this process alone.
-    What is written to a file is left as it is: nobody has to read it.
+    The blocking mode belongs to the open file, which the process shares with its shell and others.
+    So the file is opened once more, for this process alone. A regular file never blocks and is
+    left unchanged.
 
-    :param output: number of the file, 1 or 2.
-    :return: what undoes it.
+    :param output: file descriptor, 1 or 2.
+    :return: the function that undoes this.
     """
     try:
         if stat.S_ISREG(os.fstat(output).st_mode):
             return lambda: None
         before, waited = os.dup(output), os.get_blocking(output)
     except OSError:
-        # It is not open at all.
+        # The descriptor is not open.
         return lambda: None
     try:
         own = os.open(f"/proc/self/fd/{output}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
     except OSError:
-        # A socket, such as that of systemd, cannot be opened again, nor what belongs to another
-        # user.
+        # A socket (systemd's journal) or a file of another user cannot be opened again.
         os.set_blocking(output, False)
     else:
         os.dup2(own, output)

@@ -1,4 +1,4 @@
-"""What identifier_node tells of its work, so that nobody waits in vain or leaves too soon."""
+"""Signs of life of identifier_node, so that others wait for its results, but not for ever."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rclpy.node import Node
 from relay_autotune.nodes import quality
 
 TOPIC = "identifier_status"
-# While it computes, a sign of life comes so often [s].
+# Interval of the signs of life during a computation [s].
 EVERY = 1.0
 
 _EXPERIMENT, _STATE = "experiment", "state"
@@ -21,7 +21,7 @@ _WORKING, _DONE = "working", "done"
 
 
 class SignsOfLife:
-    """Publish which experiments are worked on.
+    """Publish which experiments are in work.
 
     :param node: identifier_node.
     """
@@ -42,7 +42,7 @@ class SignsOfLife:
     def work_on(self, experiment_id: str) -> None:
         """Give signs of life until the work is done.
 
-        :param experiment_id: what is worked on.
+        :param experiment_id: the experiment in work.
         """
         self._working.append(experiment_id)
         self._publish(experiment_id, _WORKING, "")
@@ -53,10 +53,10 @@ class SignsOfLife:
             self._publish(experiment_id, _WORKING, "")
 
     def done(self, experiment_id: str, lacking: str) -> None:
-        """Tell that no more will come of an experiment.
+        """Publish that all results of an experiment are out.
 
         :param experiment_id: its id.
-        :param lacking: why there is no model or are no gains; empty: both have been published.
+        :param lacking: why model or gains are missing; empty: both were published.
         """
         if experiment_id in self._working:
             self._working.remove(experiment_id)
@@ -77,7 +77,7 @@ class SignsOfLife:
 
 
 def said_by(message: Any) -> tuple[str, bool, str]:
-    """Return experiment id, whether it is still worked on, and why something will not come.
+    """Return experiment id, whether it is still in work, and why results are missing.
 
     :param message: the `DiagnosticStatus`.
     """

@@ -1,4 +1,4 @@
-"""The silence of the measurement: a fault, or a sensor that speaks only when its value changes."""
+"""Silence of the measurement: a fault, or a sensor that publishes only on change."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import Reader
 from relay_autotune.nodes.reports import Counter
 
-# A timer waits no shorter than this, and the graph is asked so often during a tune [s].
+# Shortest period of a timer, and interval of the graph checks during a tune [s].
 _LEAST_WAIT = 1e-3
 _LOOK_EVERY = 0.2
-# Two times as numbers of seconds since 1970 differ by so much where they are the same [s].
+# Rounding of equal times as floats of seconds since 1970 [s].
 _ROUNDING = 1e-6
 
 
 def require_own_time(sample_period: float, repeat_period: float) -> None:
-    """Refuse to repeat measurements where their number is the only clock.
+    """Refuse to repeat measurements if their number is the only clock.
 
-    :param sample_period: as the user set it [s].
-    :param repeat_period: likewise [s].
+    :param sample_period: the parameter [s].
+    :param repeat_period: the parameter [s].
     :raises ParameterError: if both are given.
     """
     if sample_period > 0.0 and repeat_period > 0.0:
@@ -43,15 +43,15 @@ def require_own_time(sample_period: float, repeat_period: float) -> None:
 class Repeater:
     """Take the last measurement again while the sensor is silent.
 
-    Time is that of the steady clock, or the simulated one. That one goes in steps, and what is
-    measured at a step comes after it: so that a step was silent is known at the next one, and the
-    value is then a sample of the step before. What a sensor said before the node was there is
-    heard if its publisher keeps it (transient local).
+    Time is the steady clock or the simulated one. The simulated clock moves in steps, and the
+    measurement of a step arrives after it. So silence at a step is known only at the next step,
+    and the repeated value is a sample of the earlier step. A value from before the node's start is
+    received if the publisher is latched (transient local).
 
     :param node: the node.
     :param period: silence after which a value is repeated [s], > 0.
     :param reader: how the measurement is read from its messages.
-    :param repeat: called with the value that is a sample again [y], and how long ago it was [s].
+    :param repeat: called with the repeated value [y] and the age of its instant [s].
     """
 
     def __init__(
@@ -82,13 +82,13 @@ class Repeater:
         self._direct = False
 
     def hear(self, value: float) -> None:
-        """Take a measurement that has come [y]."""
+        """Take a received measurement [y]."""
         self._direct = True
         self._silent_at = math.nan
         self._repetition.hear(self._now(), value)
 
     def age(self, since_last: float) -> float:
-        """Return for how long there has been no value to go by [s]; inf: there was none yet.
+        """Return the time without a valid value [s]; inf before the first.
 
         :param since_last: time since the last message came [s].
         """
@@ -97,7 +97,7 @@ class Repeater:
         return since_last if self.why_dead() else 0.0
 
     def why_dead(self) -> str:
-        """Return a sentence if the silence can only be that of a dead sensor, else ""."""
+        """Return a sentence if the sensor must be dead, since its publisher has left, else ""."""
         if not self._repetition.is_heard or self._node.count_publishers(self._topic):
             return ""
         return f"no measurement on {self._topic} any more: its publisher has left"
@@ -132,13 +132,13 @@ class Repeater:
 
 
 class Sensor:
-    """Say whether the measurement lives: by its messages, or by its publisher where it repeats.
+    """Watch the measurement: by its messages, or with repetition by its publisher.
 
     :param node: the node.
     :param reader: how the measurement is read from its messages.
     :param counter: counts the messages.
     :param repeat: called as by :class:`Repeater`.
-    :param stop: called with the reason when a tune is to end.
+    :param stop: called with the reason when a tune must end.
     """
 
     def __init__(
@@ -159,16 +159,16 @@ class Sensor:
         self._timer: Timer | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.hear = self._repeater.hear if self._repeater else None
-        """To be called with each measurement; None: need not be."""
+        """To be called with each measurement; None: no call needed."""
 
     @property
     def age(self) -> float:
-        """For how long there has been no value to go by [s]; inf: there was none yet."""
+        """Time without a valid value [s]; inf before the first."""
         age = self._counter.age
         return age if self._repeater is None else self._repeater.age(age)
 
     def why_dead(self) -> str:
-        """Return a sentence if a silence can only be that of a dead sensor, else ""."""
+        """Return a sentence if the sensor must be dead, since its publisher has left, else ""."""
         return "" if self._repeater is None else self._repeater.why_dead()
 
     @property
@@ -176,12 +176,12 @@ class Sensor:
         return float(self._node.get_parameter("measurement_timeout").value)
 
     def watch(self) -> None:
-        """Watch from now on, on the steady clock, until :meth:`rest`."""
+        """Watch on the steady clock until :meth:`rest`."""
         wait = self._timeout if self._repeater is None else _LOOK_EVERY
         self._timer = self._node.create_timer(wait, self._look, clock=self._steady)
 
     def rest(self) -> None:
-        """Watch no longer."""
+        """Stop watching."""
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None

@@ -1,4 +1,4 @@
-"""The action ~/tune: the same experiment, with feedback, cancel, and a result."""
+"""The action ~/tune: an experiment with feedback, cancel and a result."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _STATES = {
 class Started:
     """The answer to a request for a tune.
 
-    :param accepted: True if it runs, or could in a dry run.
-    :param reason: what will be done, or why not.
-    :param experiment_id: its id; empty where nothing was started.
+    :param accepted: True if the tune runs, or in a dry run could start.
+    :param reason: the plan, or the reason for the refusal.
+    :param experiment_id: id of the experiment; empty if none was started.
     """
 
     accepted: bool
@@ -41,14 +41,14 @@ class Started:
 
 
 class TuneAction:
-    """Serve the action; nothing waits in it, since the experiment advances with the samples.
+    """Serve the action; no callback waits, because the experiment advances with the samples.
 
-    A goal is always accepted, for a rejection could not say why: one that cannot start ends at
-    once as aborted, with the reason in its result.
+    A goal is always accepted, because a rejection carries no reason. A goal that cannot start ends
+    at once as aborted, with the reason in its result.
 
     :param node: the node.
-    :param start: starts a tune with an amplitude [u], or checks whether it could.
-    :param cancel: called when a running tune is to be cancelled.
+    :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune.
+    :param cancel: called when a client cancels the running tune.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class TuneAction:
         return CancelResponse.ACCEPT
 
     def tell(self, experiment: RelayExperiment) -> None:
-        """Publish feedback, if a goal is served.
+        """Publish feedback, if a goal is active.
 
         :param experiment: the running experiment.
         """
@@ -118,7 +118,7 @@ class TuneAction:
         self._goal.publish_feedback(feedback)
 
     def note(self, name: str, message: Any) -> None:
-        """Take a model or gains for the result.
+        """Keep a model or gains for the result.
 
         :param name: unresolved name of its topic.
         :param message: the message.
@@ -133,12 +133,12 @@ class TuneAction:
             self._result.gains = message
 
     def end(self, experiment_id: str, summary: Any, bag: str, missing: str) -> None:
-        """Answer the goal of an experiment; do nothing if it has none.
+        """Answer the goal of an experiment; do nothing if it has no goal.
 
         :param experiment_id: the id of the experiment.
         :param summary: its message, without arrays.
-        :param bag: folder of the recording; empty: none.
-        :param missing: what has not come, a sentence; empty: nothing lacks.
+        :param bag: folder of the recording; empty: no recording.
+        :param missing: a sentence on missing results; empty: nothing is missing.
         """
         goal = self._goal
         if goal is None or experiment_id != self._id:
@@ -156,6 +156,6 @@ class TuneAction:
         conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
 
     def _set_state(self, goal: Any) -> Any:
-        # Each goal brings its own callback; this one is asked for by the constructor alone.
+        # Only the constructor needs this callback; each goal has its own.
         goal.abort()
         return Tune.Result()

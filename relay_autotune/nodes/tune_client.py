@@ -1,4 +1,4 @@
-"""A client of relay_node's action ~/tune, and what it finds around it."""
+"""A client of relay_node's action ~/tune, which also finds the other nodes of the loop."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayExperiment
 
-# A relay_node of which nothing is heard for so long during a tune is taken for gone [s]; that is
-# beside the time after which the middleware misses it.
+# Silence after which relay_node counts as lost during a tune [s], in addition to the middleware's
+# liveliness lease.
 _GONE = 1.0
-# How a goal has ended: the safe command was out by then.
+# States of an ended goal; the safe command was sent before.
 _ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
-# How reasons begin that nodes which have just started give, until they have found each other.
+# Beginnings of the refusals that nodes give after their start, until discovery is complete.
 _NOT_YET = (
     "no measurement has come yet",
     "no command would arrive",
@@ -42,12 +42,12 @@ _NOT_YET = (
 
 
 class TuneClient:
-    """Asks one relay_node for one tune.
+    """Ask one relay_node for one tune.
 
-    :param namespace: namespace of the loop; empty: the root, or what the ROS arguments say.
+    :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
     :param node: name of the relay_node.
     :param ros: arguments for ROS.
-    :raises ParameterError: if no node can have such a name.
+    :raises ParameterError: if the name is not valid.
     """
 
     def __init__(self, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
@@ -81,7 +81,7 @@ class TuneClient:
         self._answer: Any = None
         self._seen = time.monotonic()
         self.refused: set[str] = set()
-        """What came and could not be, each a sentence."""
+        """Sentences on results that were received and refused."""
 
     def __enter__(self) -> TuneClient:
         return self
@@ -100,14 +100,14 @@ class TuneClient:
     def find(self, patience: float, *, needs_identifier: bool, leave: Callable[[], bool]) -> None:
         """Wait for the relay_node, and for the identifier_node if it is needed.
 
-        :param patience: how long [s].
+        :param patience: longest wait [s].
         :param needs_identifier: whether model and gains are wanted.
-        :param leave: whether nobody waits any more; this returns then.
-        :raises LoopError: if they are not there; the sentence says who is.
+        :param leave: returns True to stop waiting; this method then returns.
+        :raises LoopError: if a node is missing; the sentence names the nodes that are there.
         """
         deadline = time.monotonic() + patience
         if not self._wait(lambda: leave() or self._client.server_is_ready(), deadline):
-            # This client itself is in the graph under the name that it looks for.
+            # This client itself appears in the graph under the name that it looks for.
             others = ", ".join(n for n in self._owners("/tune") if n != self.name) or "none"
             raise LoopError(
                 f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
@@ -126,7 +126,7 @@ class TuneClient:
         """Send the goal.
 
         :param amplitude: half the distance of the two commands [u]; 0: the node's parameter.
-        :param dry_run: whether nothing shall be started.
+        :param dry_run: whether only to check, and not to start.
         :raises LoopError: if the node does not answer.
         """
         sent = self._client.send_goal_async(
@@ -141,10 +141,10 @@ class TuneClient:
         self._answer = self._goal.get_result_async()
 
     def spin(self, seconds: float) -> None:
-        """Take what comes within a time, or until the result is there.
+        """Handle messages for a time, or until the result is there.
 
-        :param seconds: how long [s].
-        :raises LoopError: if the node has gone.
+        :param seconds: the time [s].
+        :raises LoopError: if the node is lost.
         """
         self._wait(self._answer.done, time.monotonic() + seconds)
         if self._answer.done() or (self._alive and self._client.server_is_ready()):
@@ -166,7 +166,7 @@ class TuneClient:
         self._alive = info.alive_count > 0
 
     def news(self) -> list[Any]:
-        """Return the feedback that has come since the last call."""
+        """Return the feedback received since the last call."""
         news, self._feedback[:] = list(self._feedback), []
         for feedback in news:
             self.refused.update(without_impossible(feedback))
@@ -182,7 +182,7 @@ class TuneClient:
 
     @property
     def result(self) -> Any:
-        """The `Tune.Result`, without a model or gains that cannot be."""
+        """The `Tune.Result`, without a model or gains that failed their check."""
         result = self._answer.result().result
         self.refused.update(without_impossible(result))
         result.outcome = min(result.outcome, Tune.Result.FAILED)
@@ -195,7 +195,7 @@ class TuneClient:
 
     @property
     def not_ready_yet(self) -> bool:
-        """Whether the request was refused for something that may come by itself."""
+        """Whether the reason for the refusal may disappear without action."""
         refused = not self.succeeded and not self.result.experiment.experiment_id
         return refused and self.result.reason.startswith(_NOT_YET)
 
@@ -209,7 +209,7 @@ class TuneClient:
         return [name for name in self._owners("/apply") if self._is_here(name)]
 
     def record(self, patience: float) -> Record:
-        """Return the samples of the tune, which relay_node keeps for who comes late.
+        """Return the samples of the tune, which relay_node publishes latched.
 
         :param patience: how long to wait for them [s].
         :raises LoopError: if they do not come.
@@ -226,11 +226,11 @@ class TuneClient:
         return record_from_message(next(m for m in came if m.experiment_id == wanted))
 
     def identifier_values(self, patience: float) -> dict[str, Any] | None:
-        """Return the parameters of the identifier_node, by name; None: it does not tell them.
+        """Return the parameters of the identifier_node by name; None: it did not answer.
 
         :param patience: how long to wait for them [s].
         """
-        # Imported here, since no tune shall wait for it.
+        # Imported here, because it loads slowly and must not delay a tune.
         from relay_autotune.nodes.identifier_parameters import PARAMETERS
 
         names = [entry.name for entry in PARAMETERS]
@@ -251,7 +251,7 @@ class TuneClient:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]
 
     def _owners(self, ending: str) -> list[str]:
-        """Return the full names of the nodes that serve what ends so."""
+        """Return the full names of the nodes with a service that has this ending."""
         services = self._node.get_service_names_and_types()
         goals = [name.removesuffix("/_action/send_goal") for name, _ in services]
         return sorted({name.removesuffix(ending) for name in goals if name.endswith(ending)})

@@ -29,17 +29,16 @@ NODE_PARAMETERS = (
         "process_type",
         "self_regulating",
         "",
-        "What the process does at a constant command: it settles, its offset grows, or it runs "
-        "away; the last two are given back to controller_command, or held by proportional "
-        "control, when a tune ends.",
+        "Behaviour at a constant command: the process settles, drifts, or runs away. After a tune "
+        "the last two go back to controller_command, or to proportional control.",
         choices=("self_regulating", "integrating", "unstable"),
     ),
     Quantity(
         "hold_gain",
         0.0,
         "u/y",
-        "Gain of that proportional control, with the sign of the process; 0: half of K_u, as "
-        "soon as a whole cycle was seen.",
+        "Gain of that proportional control, with the sign of the process; 0: half of K_u, from "
+        "the first whole cycle on.",
     ),
     Quantity(
         "start_without_hold",
@@ -60,7 +59,7 @@ NODE_PARAMETERS = (
         "confident_of",
         ULTIMATE_GAIN,
         "",
-        "For stop_when confident: ultimate_gain, K_u; ms, the Ms that the gains would have.",
+        "For stop_when confident: ultimate_gain is K_u; ms is the predicted Ms of the gains.",
         choices=SOUGHT,
     ),
     Quantity(
@@ -75,16 +74,16 @@ NODE_PARAMETERS = (
         "controller_timeout",
         1.0,
         "s",
-        "controller_command counts as connected when its last message is no older; when it falls "
-        "silent for longer, the safe command goes out.",
+        "Longest silence of controller_command while it counts as connected; after a longer "
+        "silence the safe command is sent.",
         1e-3,
     ),
     Quantity(
         "return_time",
         0.0,
         "s",
-        "Time over which the command goes back to the controller's after a tune; 0: the last "
-        "period of the oscillation, else 5 s.",
+        "Time in which the command returns to the controller's after a tune; 0: the last period "
+        "of the oscillation, else 5 s.",
         0.0,
     ),
     Quantity(
@@ -99,22 +98,22 @@ NODE_PARAMETERS = (
         "feedback_timeout",
         1.0,
         "s",
-        "For how long it may be further away before the actuator counts as stuck.",
+        "Longest time beyond that tolerance; after it the actuator counts as stuck.",
         1e-3,
     ),
     Quantity(
         "measurement_timeout",
         1.0,
         "s",
-        "A tune is aborted when no measurement comes for so long.",
+        "Longest silence of the measurement; after it a tune is aborted.",
         1e-3,
     ),
     Quantity(
         "model_timeout",
         10.0,
         "s",
-        "After a tune, the recording waits so long for model and gains, counted from the last "
-        "sign that identifier_node works on them.",
+        "Longest wait of the recording for model and gains after a tune, counted from the last "
+        "sign of life of identifier_node.",
         0.0,
     ),
     Quantity(
@@ -135,8 +134,8 @@ FIXED_PARAMETERS = (
         "path",
         "passthrough",
         "",
-        "passthrough: controller_command is passed on to command when no tune runs; takeover: "
-        "the controller publishes command by itself and is silent during a tune.",
+        "passthrough: without a tune, controller_command is passed on to command; takeover: the "
+        "controller publishes command itself and is silent during a tune.",
         choices=("passthrough", "takeover"),
     ),
     Quantity(
@@ -160,9 +159,8 @@ FIXED_PARAMETERS = (
         "repeat_period",
         0.0,
         "s",
-        "For a sensor that publishes only when its value changes: after each such time of silence "
-        "the last value is a sample again, and measurement_timeout does not count; 0: silence is "
-        "a fault.",
+        "For a sensor that publishes only on change: after this time of silence the last value "
+        "counts as a new sample, and measurement_timeout does not apply; 0: silence is a fault.",
         0.0,
     ),
     Quantity(

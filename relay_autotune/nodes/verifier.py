@@ -1,4 +1,4 @@
-"""The action ~/verify of controller_node: steps, what came of them, pass or fail."""
+"""The action ~/verify of controller_node: make steps, compare, pass or fail."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import Verification
 
-# Samples before a step that tell where the loop was, and how noisy it is.
+# Number of samples before a step, for the loop's rest and noise.
 _BEFORE = 50
 _LEAST_BEFORE = 10
-# Without a measurement for so long, or for so many of the usual intervals, it is given up [s].
+# Longest silence of the measurement: a time [s], or a number of usual intervals if that is longer.
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
 _LOOK_EVERY = 0.2
-# So many samples in a row beyond what was predicted are no outliers of the sensor.
+# This many samples in a row beyond the limit are no outliers of the sensor.
 _IN_A_ROW = 2
-# A hole of this part of a step leaves too little of it to judge.
+# A gap in the samples of this part of a step leaves too little to judge.
 _LARGEST_HOLE = 0.25
-# On the steady clock: what comes before the first step may take so long [s], and the steps so many
-# times what is planned and so much more [s].
+# Limits on the steady clock: the preparation [s]; the steps as a multiple of the planned time,
+# plus a reserve [s].
 _PREPARED_WITHIN = 60.0
 _TIMES_PLANNED = 4.0
 _MORE_THAN_PLANNED = 10.0
@@ -48,12 +48,12 @@ _Sample = tuple[float, float, float]
 
 
 class NotVerifiable(RelayAutotuneError):  # noqa: N818  it is a state of the loop, not a defect
-    """A loop that cannot be verified now."""
+    """The loop cannot be verified now."""
 
 
 @dataclass(frozen=True)
 class Verifiable:
-    """What is tried.
+    """The gains to verify, with model and limits.
 
     :param gains: the controller in force.
     :param model: the process as identified.
@@ -90,16 +90,16 @@ class _Phase(Enum):
 class Verifier:
     """Make steps on a running loop and compare each with the prediction.
 
-    The predictions take up to seconds, and are computed beside the callbacks.
+    The predictions take up to seconds, so they are computed in another thread.
 
     :param node: the node.
-    :param ready: returns what can be tried; raises RelayAutotuneError with the reason where
-        nothing can.
-    :param heights: returns the steps that a request asks for; raises likewise.
-    :param move: puts a step on the set-point [y] and one on the command [u], 0: none.
-    :param begin: called once a request can be tried; raises RelayAutotuneError where it shall not.
+    :param ready: returns the gains to verify; raises RelayAutotuneError with the reason if the
+        loop is not ready.
+    :param heights: returns the steps of a request; raises likewise.
+    :param move: adds a step to the set-point [y] and one to the command [u]; 0: no step.
+    :param begin: called before the first step; raises RelayAutotuneError if it must not begin.
     :param ended: called with True if all steps passed, False if one failed, None without a
-        verdict, and a sentence; returns what to say.
+        verdict, and a sentence; returns the sentence for the client.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Verifier:
         self._samples: list[_Sample] = []
         self._rest: Rest
         self._begun = 0.0
-        # On the steady clock: when it has to be over, and when the samples' time last went on.
+        # On the steady clock: the deadline, and the last advance of the samples' time.
         self._until = self._advanced = 0.0
         self._period = 0.0
         self._beyond = 0
@@ -153,16 +153,16 @@ class Verifier:
 
     @property
     def rested_at(self) -> float:
-        """Command at which the loop rested before the step that is made [u]; NaN: none is."""
+        """Command at rest before the present step [u]; NaN without a step."""
         moved = self._phase in (_Phase.STEPPING, _Phase.RETURNING)
         return self._rest.command if moved else math.nan
 
     # Beginning.
 
     def require_samples(self) -> None:
-        """Refuse a loop of which nothing is heard.
+        """Refuse a loop without samples.
 
-        :raises NotVerifiable: if there are too few samples to tell where it rests.
+        :raises NotVerifiable: if there are too few samples to know the loop's rest.
         """
         if len(self._recent) < _LEAST_BEFORE:
             raise NotVerifiable(
@@ -189,7 +189,7 @@ class Verifier:
             await self._leave(goal, error)
             return
         if goal is not self._goal or self._phase is not _Phase.PREPARING:
-            await self._ended(None, "it ended before its first step")
+            await self._ended(None, "the verification ended before its first step")
             return
         self._tried, self._steps, self._rest, self._period = tried, steps, rest, period
 
@@ -199,7 +199,7 @@ class Verifier:
         self._node.compute(plans, partial(self._planned, goal))
 
     async def _leave(self, goal: Any, error: Exception) -> None:
-        """Refuse a goal whose first step was not made."""
+        """Refuse a goal before its first step."""
         if goal is not self._goal or self._phase is not _Phase.PREPARING:
             return
         self._phase = _Phase.ENDING
@@ -223,13 +223,13 @@ class Verifier:
         self._begin_step()
 
     def _pace(self) -> float:
-        """Return how long a second of the samples takes here."""
+        """Return the steady time for one second of the samples' time."""
         ours = self._arrivals[-1] - self._arrivals[0]
         theirs = self._recent[-1][0] - self._recent[0][0]
         return ours / theirs if theirs > 0.0 else 1.0
 
     def _at_rest(self, steps: list[Step]) -> tuple[Rest, float]:
-        """Return where the loop rests, and its sample period [s]."""
+        """Return the loop's state of rest and its sample period [s]."""
         t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
         period = float(np.median(np.diff(t)))
         if not period > 0.0:
@@ -262,7 +262,7 @@ class Verifier:
         """
         since = at - self._recent[-1][0] if self._recent else 0.0
         if since < 0.0:
-            # What came before lies in another time.
+            # Time went backwards: earlier samples do not count.
             self._recent.clear()
             self._arrivals.clear()
         now = time.monotonic()
@@ -284,7 +284,7 @@ class Verifier:
         self._samples.append(sample)
         over = at - self._samples[0][0] >= wanted.duration
         if self._phase is _Phase.RETURNING:
-            # What was found of the step before has come, too.
+            # Go on only when the judgement of the last step has also arrived.
             if over and len(self._found) > self._number:
                 self._go_on()
             return
@@ -300,13 +300,13 @@ class Verifier:
             self._return()
 
     def out_of_range(self, measurement: float) -> None:
-        """Take a measurement beyond what the loop may do [y], which was not answered."""
+        """Take a measurement outside its range [y], which the controller did not answer."""
         self._beyond += 1
         if self._phase is _Phase.STEPPING and self._beyond >= _IN_A_ROW:
             self._end(False, f"the measurement left its range, to {measurement:.6g}")
 
     def _return(self) -> None:
-        """Go back to where the loop was, while the step is judged."""
+        """Remove the step, and judge it meanwhile."""
         judge = partial(
             judged, self._tried, self._steps[self._number], tuple(self._samples), self._rest
         )
@@ -348,14 +348,14 @@ class Verifier:
     # Ending.
 
     def interrupt(self, reason: str) -> None:
-        """End it without a verdict [the loop is no longer the controller's]."""
+        """End the verification without a verdict."""
         if self._phase not in (_Phase.IDLE, _Phase.ENDING):
             self._end(None, reason)
 
     def _look(self) -> None:
         now = time.monotonic()
         if now > self._until:
-            self.interrupt("it took far longer than planned on the steady clock")
+            self.interrupt("the verification took far longer than planned on the steady clock")
             return
         if self._phase is _Phase.PREPARING or not self._arrivals:
             return
@@ -394,7 +394,7 @@ class Verifier:
 def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Rest) -> Any:
     """Compare a step with its prediction and return the `Verification` message.
 
-    :param tried: what is tried.
+    :param tried: gains, model and limits.
     :param step: the step.
     :param samples: time [s], measurement [y] and command [u] of each, the first at the step.
     :param rest: where the loop was before it.
