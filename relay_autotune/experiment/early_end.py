@@ -1,4 +1,4 @@
-"""When a running experiment is looked at, and whether it has found out what it should."""
+"""When to fit a running experiment, and whether its result is accurate enough to end it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)
 _NAMES = {ULTIMATE_GAIN: "K_u", MS: "the predicted Ms"}
 
-# No loop has a smaller Ms than 1; what is below by rounding is not refused.
+# Ms is at least 1; a value below by rounding is accepted.
 _LEAST_MS = 1.0 - 1e-6
 # Nothing is concluded before the first half cycle.
 _LEAST_SWITCHES = 2
-# From one look to the next, the time since the kick grows by no less and no more. In between,
-# an interval that narrows no faster than the cube of that time decides.
+# Least and largest growth of the time since the kick between two fits. In between, the growth
+# assumes that the interval narrows with the cube of that time at most.
 _LEAST_GROWTH, _MOST_GROWTH = 1.02, 1.15
 _STEEPNESS = 3.0
 
 
 class Running(Protocol):
-    """What is asked of a running experiment.
+    """The part of a running experiment that is needed here.
 
-    :class:`~relay_autotune.experiment.experiment.RelayExperiment` answers it.
+    :class:`~relay_autotune.experiment.experiment.RelayExperiment` has it.
     """
 
     @property
@@ -48,14 +48,14 @@ class Running(Protocol):
 
 @dataclass(frozen=True)
 class Finding:
-    """What the newest fit of a running experiment tells; NaN: not estimated.
+    """Result of the newest fit of a running experiment; NaN: not estimated.
 
     :param ultimate_gain: K_u [u/y].
     :param ultimate_gain_std: its standard deviation [u/y].
     :param ms: Ms that the gains designed on the model would have.
     :param ms_low: lower end of its 95 % interval.
     :param ms_high: upper end; inf: some of the loops would be unstable.
-    :raises ParameterError: if a number cannot be what it says.
+    :raises ParameterError: if a number is outside its possible range.
     """
 
     ultimate_gain: float = math.nan
@@ -93,15 +93,15 @@ class Finding:
 
 
 class EarlyEnd:
-    """End an experiment once an interval is as narrow as asked.
+    """End an experiment once an interval is as narrow as wanted.
 
-    It is looked at again when the time since the kick has grown by a share that depends on how
-    far the interval still is from what is asked, or at a switch of the relay where it has grown
-    by the least share; so the looks, each a fit of the whole record, cost no more the longer it
-    lasts or the faster it is sampled.
+    Each look is a fit of the whole record. The next look comes when the time since the kick has
+    grown by a factor that depends on the interval's present width, or at a switch of the relay
+    after the least growth. So the number of looks grows only with the logarithm of the duration,
+    and does not depend on the sampling rate.
 
     :param sought: which interval, one of ``SOUGHT``.
-    :param wanted: half its width, as a fraction of the value.
+    :param wanted: its half width, as a fraction of the value.
     """
 
     def __init__(self, sought: str, wanted: float) -> None:
@@ -112,10 +112,10 @@ class EarlyEnd:
         self._growth = _MOST_GROWTH
 
     def is_due(self, running: Running) -> bool:
-        """Return True if the experiment is to be looked at.
+        """Return True if it is time for the next look.
 
-        That is from the first half cycle on; in between switches, once the last look was answered
-        and enough time has gone by.
+        Looks begin after the first half cycle. Between switches, the next one comes when the last
+        look was answered and enough time has passed.
 
         :param running: the experiment.
         """
@@ -127,7 +127,7 @@ class EarlyEnd:
         return not self._waits and since >= self._growth * self._last
 
     def look(self, running: Running) -> None:
-        """Note that the experiment is looked at now.
+        """Note a look now.
 
         :param running: the experiment.
         """
@@ -139,7 +139,7 @@ class EarlyEnd:
         """Take the answer to a look; return why the experiment may end, "" if it may not.
 
         :param running: the experiment.
-        :param found: what its newest fit tells.
+        :param found: result of its newest fit.
         """
         width = found.width(self.sought)
         ratio = width / self.wanted if width > 0.0 else math.inf

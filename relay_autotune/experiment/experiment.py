@@ -1,4 +1,4 @@
-"""The relay experiment: fed with samples, it answers with commands and records both."""
+"""The relay experiment: it takes samples, answers with commands and records both."""
 
 from __future__ import annotations
 
@@ -35,15 +35,14 @@ _BASELINE = SafePolicy()
 
 
 class RelayExperiment:
-    """Run one relay experiment: call :meth:`step` for each measurement, send what it returns.
+    """Run one relay experiment: call :meth:`step` for each measurement and send its command.
 
-    :mod:`relay_autotune.experiment.procedure` has the states. Whatever the state, :meth:`abort`
-    and a measurement outside its limits end the experiment as ABORTED; a sample that cannot be
-    used, a frozen sensor and max_duration end it as FAILED. It does not raise on bad data:
-    :attr:`reason` says why it ended. It has no clock: time comes in with the samples, on any
-    origin.
+    :mod:`relay_autotune.experiment.procedure` has the states. In any state, :meth:`abort` and a
+    measurement outside its limits end the experiment as ABORTED; an unusable sample, a frozen
+    sensor and max_duration end it as FAILED. Bad data raise no exception: :attr:`reason` says why
+    the experiment ended. There is no clock here: time comes with the samples, from any origin.
 
-    :param parameters: what the user set.
+    :param parameters: the user's parameters.
     :param baseline: command of the operating point [u].
     :param experiment_id: the id that the record will carry.
     :param policy: how the process is left at the end.
@@ -66,7 +65,7 @@ class RelayExperiment:
         self.experiment_id = experiment_id
         self.baseline = float(baseline)
         self.safe_command = self.baseline if math.isnan(policy.command) else policy.command
-        """What is commanded after an abort or a failure, where nothing holds the process [u]."""
+        """Command after an abort or a failure, without proportional hold of the process [u]."""
         self._policy = policy
         self._hold: ProportionalHold | None = None
         self._samples = Samples()
@@ -80,7 +79,7 @@ class RelayExperiment:
 
     @property
     def state(self) -> State:
-        """Where the experiment is."""
+        """The present state."""
         return self._procedure.state
 
     @property
@@ -90,7 +89,7 @@ class RelayExperiment:
 
     @property
     def outcome(self) -> Outcome:
-        """How it ended: completed; aborted by someone or by a limit; failed; UNKNOWN before."""
+        """How it ended: completed, aborted (on request or at a limit), failed; UNKNOWN before."""
         return _OUTCOMES.get(self._procedure.state, Outcome.UNKNOWN)
 
     @property
@@ -107,7 +106,7 @@ class RelayExperiment:
 
     @property
     def settings(self) -> RelaySettings | None:
-        """What the relay does; None until the measurement has settled.
+        """The relay's settings; None until the measurement has settled.
 
         While the sign of the process gain is not known, ``reverse_acting`` is False.
         """
@@ -128,7 +127,7 @@ class RelayExperiment:
         """Time from the kick to the last sample before the response [s]; NaN until it is seen.
 
         Without noise the dead time lies between this and one sample interval more. With noise
-        this is longer, by the time that the response takes to leave the noise band.
+        this time is longer: the response must first leave the noise band.
         """
         return self._procedure.dead_time_seen
 
@@ -174,16 +173,16 @@ class RelayExperiment:
 
     @property
     def latest(self) -> float:
-        """Time from the first sample on by which it is over or a part of it [s], gaps aside.
+        """Deadline of the present part, from the first sample, gaps not counted [s].
 
-        It grows when a part begins, or takes longer than before; an experiment that lasts longer
-        has failed. Infinite where only max_duration limits the part.
+        It grows when a part begins, or takes longer than before; an experiment beyond it has
+        failed. Infinite if only max_duration limits the part.
         """
         return self._procedure.latest
 
     @property
     def cycles_left(self) -> int:
-        """Number of cycles until the end, as far as one can tell; at least 1 while it runs."""
+        """Estimated number of cycles until the end; at least 1 while it runs."""
         return max(self.parameters.min_cycles + 1 - self.cycle_count, 0 if self.finished else 1)
 
     @property
@@ -196,7 +195,7 @@ class RelayExperiment:
 
     @property
     def progress(self) -> float:
-        """How much of the experiment is done, from 0 to 1, as far as one can tell."""
+        """Estimated part of the experiment that is done, from 0 to 1."""
         if self.state is State.RELAY:
             done = self.cycle_count
             return 0.1 + 0.9 * done / (done + self.cycles_left)
@@ -213,10 +212,10 @@ class RelayExperiment:
         start: float = 0.0,
         lost_samples: int = 0,
     ) -> Record:
-        """Return all that was recorded so far, whether or not the experiment has ended.
+        """Return the record so far, also while the experiment runs.
 
-        The sample that ended it is the last one, if it was a number at a possible time; the
-        samples after the end are not recorded.
+        The last sample is the one that ended the experiment, if it was usable; samples after the
+        end are not recorded.
 
         :param receive_time: when each sample arrived [s], on the relay's clock, counted from the
             time of the first sample; entries beyond the samples recorded are dropped.
@@ -225,7 +224,7 @@ class RelayExperiment:
         :param lost_samples: samples that the middleware is known to have lost.
         :raises RecordError: if there is no sample.
         """
-        # A sample that was being answered when the caller was struck by an error has no answer.
+        # If the caller raised while a sample was being answered, that sample has no answer.
         n = len(self._samples.command)
         time, measurement, command = self._samples.columns(0, n)
         return Record(
@@ -249,18 +248,18 @@ class RelayExperiment:
 
         :param time: when the sample was taken [s], on any origin; equal times are allowed.
         :param measurement: the sample [y].
-        :returns: the command [u]; after the end that of :meth:`after_end`.
+        :returns: the command [u]; after the end the command of :meth:`after_end`.
         """
         return self._take(time, measurement, repeated=False)
 
     def repeat(self, time: float, measurement: float) -> float:
-        """Take the last measurement for a sample once more, since the sensor has been silent.
+        """Take the last measurement again as a sample, because the sensor was silent.
 
-        A sensor that speaks only when its value changes says so that it has not. The record holds
-        the sample like any other: it equals the one before.
+        For a sensor that publishes only on change, silence means that the value is the same. The
+        record holds the sample like any other.
 
         :param time: the present time [s], on the axis of :meth:`step`.
-        :param measurement: what the sensor said last [y].
+        :param measurement: the sensor's last value [y].
         :returns: as :meth:`step`.
         """
         return self._take(time, measurement, repeated=True)
@@ -290,7 +289,7 @@ class RelayExperiment:
     def after_end(self, measurement: float) -> float:
         """Return the command that answers a measurement after the end [u].
 
-        :param measurement: [y]; NaN: there is none.
+        :param measurement: [y]; NaN: no measurement.
         """
         if self._hold is not None:
             return self._hold.command(measurement)
@@ -299,11 +298,11 @@ class RelayExperiment:
         return self.safe_command
 
     def conclude(self, reason: str) -> float:
-        """Complete the experiment now, with what there is; do nothing if it has ended.
+        """Complete the experiment now, with the data so far; do nothing if it has ended.
 
         :param reason: why, for people.
         :returns: the command of :meth:`after_end` [u], to be sent now.
-        :raises ParameterError: if there is no half cycle, without which little is known.
+        :raises ParameterError: before the first half cycle, when too little is known.
         """
         if not self.finished:
             if self.switches < 2:
@@ -378,14 +377,14 @@ class RelayExperiment:
         return procedure.state in _OUTCOMES
 
     def _is_dead(self, t: float, y: float, *, repeated: bool) -> bool:
-        """End the experiment if the sensor says no more; return True if so."""
+        """End the experiment if the sensor is silent or frozen; return True if so."""
         procedure = self._procedure
         if repeated:
             longest = max((cycle.period for cycle in procedure.cycles), default=math.inf)
             if self._silence.repeat(t, longest_cycle=longest):
                 procedure.end(
                     State.FAILED,
-                    f"the measurement does not respond any more: none has come for "
+                    f"the measurement does not respond any more: silent for "
                     f"{self._silence.silence:.3g} s, much longer than before, "
                     f"{procedure.where()}; check the sensor",
                 )

@@ -1,4 +1,4 @@
-"""Read the response to the first step of the relay: when it is seen, and which way it goes."""
+"""Read the response to the first step of the relay: its start and its direction."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import math
 
 from relay_autotune.experiment.settling import RestState
 
-# White noise leaves three standard deviations on one side three times in a row once in 4e8
+# White noise exceeds three standard deviations on one side three times in a row once in 4e8
 # samples; without noise one sample is enough.
 _BAND = 3.0
 _RUN = 3
 
-# The watch looks no earlier than after so many intervals, and decides at the latest after so many,
-# or so many samples where that is later: without noise a process without dead time is seen to
-# respond at the first sample, and an interval then says nothing of how fast it is.
+# First look and last look of the watch, in intervals; the last one also after a least number of
+# samples. Without noise and dead time the response is seen at the first sample, and then the
+# interval says nothing about the speed of the process.
 _FIRST_LOOK = 5
 LAST_LOOK = 50
 LAST_LOOK_SAMPLES = 200
 
-# Parts of the largest deviation: differing by less is level, being nearer to the rest is back,
-# and having more left at the last look outweighs what was before.
+# Parts of the largest deviation: a smaller change counts as level; a smaller deviation counts as
+# back at rest; a larger remainder at the last look decides against the sum.
 _LEVEL = 0.05
 _BACK = 0.15
 _LEFT = 0.5
@@ -45,7 +45,7 @@ class ResponseDetector:
         self._run = 0
         self._run_side = 0
         self.side = 0
-        """1 or -1 once the response is seen: the side of the rest on which it began."""
+        """Side of the rest on which the response began, 1 or -1; set once it is seen."""
         self.last_inside = start
         """Instant of the last sample before the response [s]."""
         self.first_outside = math.nan
@@ -61,7 +61,7 @@ class ResponseDetector:
             return False
         if side != self._run_side or self._run == 0:
             if self._run > 0:
-                # It jumped from one side to the other: noise, which counts as inside.
+                # A jump from one side to the other is noise, and counts as inside.
                 self.last_inside = self._latest
             self._run, self._run_side = 0, side
             self.first_outside = time
@@ -76,25 +76,24 @@ class ResponseDetector:
 class DirectionWatch:
     """Find the sign of the process gain from the response to a short pulse.
 
-    The command was high until the process responded, stays so for as long again, and then rests
-    at the baseline; time is counted in intervals as long as the process took to respond. The side
-    on which the response began is not the answer for a process with inverse response. What
-    remains after the pulse is: a process that answers straight keeps its deviation, or goes back
-    to rest from the side where it was; one with inverse response goes through the rest to the
-    other side. While the command rests, the pulse is all that moves the process, so looking on
-    costs time and little excursion.
+    The command was high until the process responded, stays high for the same time again, and then
+    returns to the baseline. Time is counted in intervals of the time to respond. The side on which
+    the response began is not enough, because of processes with inverse response. The deviation
+    after the pulse decides: without inverse response it stays, or returns to rest from the same
+    side; with inverse response it crosses the rest to the other side. With the command at the
+    baseline only the pulse moves the process, so waiting costs time but little excursion.
 
     From the fifth interval on, with m the mean deviations of the intervals so far (0 in the first,
-    before the response), counted positive on the first side:
+    before the response), positive on the first side:
 
-    - the sum of m is negative: the other side is the answer;
-    - m was level for half of the time (an integrating or very slow process); or it goes back ever
-      more slowly and its geometric continuation ends at the rest, or before; or it was at rest
-      for half of the time: the first side is the answer;
-    - after 50 intervals, and 200 samples, the side is the answer on which half of the largest
-      deviation or more is left; or else that of the sum of m.
+    - if the sum of m is negative: the other side;
+    - if m was level for half of the time (an integrating or very slow process), or returns more
+      and more slowly with a geometric limit at the rest or before it, or was at rest for half of
+      the time: the first side;
+    - after 50 intervals and 200 samples: the side on which half of the largest deviation or more
+      is left; else the side of the sum of m.
 
-    An unstable process runs away meanwhile: its sign has to be given.
+    An unstable process runs away meanwhile, so its sign must be given.
 
     :param interval: length of an interval [s], > 0.
     :param start: instant at which the response was seen [s].
@@ -133,7 +132,7 @@ class DirectionWatch:
             self._errors.append(self._noise_std / math.sqrt(self._count))
             self.sign = self._verdict()
             self._sum, self._count = 0.0, 0
-            # A gap in the samples must not leave intervals without any.
+            # A gap in the samples must not create empty intervals.
             self._end = max(self._end, time - self._interval) + self._interval
         self._sum += measurement - self._rest
         self._count += 1
@@ -167,14 +166,14 @@ class DirectionWatch:
         )
 
     def _tends_back(self) -> bool:
-        """Continue the way back from the largest deviation, in three equal parts."""
+        """Extrapolate the return from the largest deviation, from three equal parts."""
         size = (len(self._means) - self._means.index(max(self._means))) // 3
         if size == 0:
             return False
         tail = self._means[-3 * size :]
         first, second, third = (sum(tail[k * size : (k + 1) * size]) / size for k in range(3))
         slowing = (first - second) - (second - third)
-        # The variance of slowing is that of m - 2 m' + m'', six times that of one part.
+        # slowing is m - 2 m' + m'', with six times the variance of one part.
         uncertainty = math.sqrt(6.0 / size) * max(self._errors[-3 * size :])
         if not first > second > third or slowing <= 3.0 * uncertainty:
             return False
@@ -182,7 +181,7 @@ class DirectionWatch:
         return end >= -_BACK * self.largest
 
     def _is_back(self) -> bool:
-        # For half of the time, so that passing through the rest is not taken for staying.
+        # For half of the time, so that a passage through the rest does not count.
         half = len(self._means) // 2
         largest = self.largest
         return all(

@@ -1,4 +1,4 @@
-"""The two command levels of the relay: given, or found from small to large within the limits."""
+"""The two command levels of the relay: given, or grown from small to large within the limits."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ import math
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.record.record import FloatArray
 
-# An amplitude that is to be found begins with this part of the range of the command.
+# An amplitude that is not given starts at this part of the command's range.
 FIRST_SHARE = 0.01
-# An oscillation stands clear of the noise from so many standard deviations on, of the hysteresis
-# from so many times its half width on, and of the sensor's resolution from so many steps on.
+# Half swing that is clear of noise (in standard deviations), of the hysteresis (in half widths),
+# and of the sensor's resolution (in steps).
 CLEAR_OF_NOISE = 10.0
 CLEAR_OF_HYSTERESIS = 3.0
 CLEAR_OF_STEPS = 5.0
 
-# How much an amplitude that is too small grows at a time.
+# Least and largest growth of a too small amplitude at a time.
 _LEAST_GROWTH = 1.5
 _MOST_GROWTH = 4.0
-# A target is aimed at with so much to spare, since an oscillation is not quite linear in it.
+# Reserve on a target, since the swing is not exactly proportional to the amplitude.
 _TO_SPARE = 1.2
 
-# Levels that grew by so much, with a swing that grew by less than this: the process does not get
-# what it is told. A band makes small swings larger than in proportion, by a third of them at most.
+# Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
+# The hysteresis makes small swings larger than proportional, by a third at most.
 _GROWN, _CLIPPED = 3.0, 1.5
 
 
 class Levels:
     """The levels of a relay about its baseline.
 
-    An amplitude that was given stays as it is. One that is to be found begins at a hundredth of
-    the command's range and grows; a level that would pass a limit stays at the limit, so that
-    next to a limit the upper and the lower step differ, which is then part of the bias.
+    A given amplitude stays as it is. Otherwise the amplitude starts at a hundredth of the range of
+    the command and grows. A level beyond a limit is cut to the limit; the upper and the lower step
+    then differ, which counts as bias.
 
-    :param parameters: what the user set, valid for the baseline.
+    :param parameters: the user's parameters, valid for the baseline.
     :param baseline: command of the operating point [u].
     """
 
@@ -41,7 +41,7 @@ class Levels:
         self._parameters = parameters
         self._baseline = baseline
         self.searching = parameters.finds_amplitude
-        """True while the amplitude is still to be found."""
+        """True while the amplitude may still grow."""
         self._wanted = parameters.amplitude
         if self.searching:
             span = parameters.command_max - parameters.command_min
@@ -49,7 +49,7 @@ class Levels:
             if abs(parameters.bias) >= self._wanted:
                 self._wanted = 1.5 * abs(parameters.bias)
         self._shift = 0.0
-        # Amplitude, half swing and levels of the first cycle that stood clear of the noise.
+        # Amplitude, half swing and levels of the first cycle that was clear of the noise.
         self._first_clear: tuple[float, float, float, float] | None = None
         self._set()
 
@@ -57,7 +57,7 @@ class Levels:
         p = self._parameters
         bias = p.bias if p.bias != 0.0 else p.bias_ratio * self._wanted
         middle = self._baseline + bias + self._shift
-        # Whatever shifts them, the levels stay within the limits.
+        # Shifted levels also stay within the limits.
         self.low = max(middle - self._wanted, p.command_min)
         """The lower level [u]."""
         self.high = min(middle + self._wanted, p.command_max)
@@ -65,7 +65,7 @@ class Levels:
 
     @property
     def _as_given(self) -> bool:
-        # The digits of the user's own numbers are kept.
+        # Keep the exact digits of the user's numbers.
         return not self._parameters.finds_amplitude and self._shift == 0.0
 
     @property
@@ -89,22 +89,22 @@ class Levels:
         return self.searching and (self.low > p.command_min or self.high < p.command_max)
 
     def grow(self, factor: float = 2.0) -> None:
-        """Make an amplitude that is being found larger, as far as the limits let it."""
+        """Make the amplitude larger, within the limits, if it is not given."""
         self._wanted *= factor
         self._set()
 
     def shift(self, by: float) -> None:
-        """Move both levels, to bear a load that has come [u]."""
+        """Move both levels, to compensate a load [u]."""
         self._shift += by
         self._set()
 
     def why_clipped(self, half_swing: float, clear: float) -> str:
-        """Return why the actuator must be at its ends, "" if nothing says so.
+        """Return why the actuator must be at its ends, or "".
 
-        A response that stood clear of what disturbs it has to grow with the levels.
+        A response that is clear of noise must grow with the levels.
 
         :param half_swing: half the swing of the measurement over the last cycle [y].
-        :param clear: the half swing that stands clear [y].
+        :param clear: the half swing that is clear of noise, hysteresis and resolution [y].
         """
         first = self._first_clear
         if first is None:
@@ -122,7 +122,7 @@ class Levels:
         )
 
     def growth_for(self, half_swing: float, least: float) -> float:
-        """Return the factor by which the amplitude is to grow, 1 if it is large enough.
+        """Return the factor by which the amplitude must grow, 1 if it is large enough.
 
         :param half_swing: half the swing of the measurement over the last cycle [y].
         :param least: the half swing that is large enough [y].
@@ -136,9 +136,9 @@ class Levels:
 def clear_swing(
     target: float, noise_std: float, hysteresis: float, measurement: FloatArray
 ) -> float:
-    """Return the half swing at which an oscillation stands clear of what disturbs it [y].
+    """Return the half swing at which the amplitude is large enough [y].
 
-    :param target: what the user asked for [y]; 0: nothing.
+    :param target: the user's target [y]; 0: clear of noise, hysteresis and resolution.
     :param noise_std: standard deviation of the noise [y].
     :param hysteresis: half width of the relay's band [y].
     :param measurement: samples of the oscillation [y], shape (n,); the smallest difference

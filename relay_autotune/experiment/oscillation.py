@@ -1,4 +1,4 @@
-"""The part of an experiment in which the relay switches: cycles, and why there are none."""
+"""The part of an experiment in which the relay switches: its cycles, or why there are none."""
 
 from __future__ import annotations
 
@@ -25,35 +25,33 @@ from relay_autotune.experiment.turns import SHORT_STAY, Turns
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.record.record import Cycle, FloatArray, Outcome
 
-# Of two instants that rounding tells apart, the later one has come when the earlier one has: part
-# of the sample interval.
+# Two instants that differ by less than this part of the sample interval are equal.
 _ROUNDING = 1e-6
 
-# The part of a period at the high level is known when two cycles agree in it this far; a load has
-# come when it then differs by more than the other. A load that stops the oscillation altogether
-# is borne by shifts of this part of the amplitude, so many at a time.
+# The share of the high level in a period is known when two cycles agree within the first number; a
+# later change by more than the second number means a load. A load that stops the oscillation is
+# compensated by shifts of a part of the amplitude, a limited number at a time.
 _SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
 _MOST_SHIFTS, _SHIFT = 2, 0.7
 _FOLLOWS = 2
-# A cycle so many times as long as the one before says nothing of a load yet.
+# A cycle this many times as long as the one before is no sign of a load yet.
 _ALONE = 4.0
 
-# Once a whole cycle was seen, this part of the patience is enough.
+# Part of the patience that applies after the first whole cycle.
 _PATIENCE_IN_CYCLES = 0.4
 
-# What is so many times as far away as the oscillation went has run away, whatever the patience;
-# for so many samples, since a sensor has spikes.
+# The measurement has run away if its distance is this many times the oscillation's, for this many
+# samples, since a sensor has spikes.
 _RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
 
-# So many cycles more than max_cycles, of two stays of the longest that the relay may stay, is the
-# longest that the switching may last, whatever was counted meanwhile: some may be lost from view.
+# The switching may last max_cycles plus this many cycles of twice the longest allowed stay. The
+# spare cycles cover those that could not be counted.
 _SPARE_CYCLES = 12
 
-# So many switches in a cycle, and so many times as many as in any before it, are no noise at the
-# edges of the band.
+# Chatter: more switches in a cycle than this, and this many times as many as in any cycle before.
 _CHATTER, _CHATTER_RATIO = 40, 10.0
 
-# What did not move during so many stays of the relay in a row does not follow it.
+# A measurement that did not move for this many stays of the relay does not follow it.
 _STAYS = 2
 
 _SIGNS = {1: "positive", -1: "negative"}
@@ -62,19 +60,19 @@ _SIGNS = {1: "positive", -1: "negative"}
 class Oscillation:
     """Answer samples with the relay until its cycles agree, or until there is no oscillation.
 
-    An amplitude that is to be found grows from cycle to cycle until the oscillation is large
-    enough; cycles count from there on. A load that comes changes the mean command that the process
-    needs, and with it the half periods; the levels follow, so that these stay as they were.
+    An amplitude that is not given grows from cycle to cycle until the oscillation is large enough;
+    cycles count from then on. A load changes the mean command that the process needs, and with it
+    the half periods; the levels are shifted so that the half periods stay the same.
 
-    :param parameters: what the user set, valid.
+    :param parameters: the user's parameters, valid.
     :param baseline: command of the operating point [u].
-    :param samples: the samples so far; the last one is that at which the relay begins.
+    :param samples: the samples so far; the relay begins at the last one.
     :param levels: the levels of the relay.
     :param rest: the measurement at rest.
     :param setpoint: measurement about which the relay switches [y].
     :param hysteresis: half width of its band [y].
     :param sign: sign of the process gain.
-    :param doubtful: True if no user gave the sign, so that it may turn out to be the other one.
+    :param doubtful: True if the user did not give the sign, so that it may be reversed later.
     :param response_time: time that the process took to respond to the kick [s].
     :param first_limit: longest stay until the first switch [s].
     :param until_converged: False: agreement of the cycles does not end it.
@@ -105,7 +103,7 @@ class Oscillation:
         self.verdict: tuple[Outcome, str] | None = None
         """How it ended and why; None while it goes on."""
         self.notes: list[str] = []
-        """What the reason shall mention besides."""
+        """Notes to add to the reason."""
         self._parameters = parameters
         self._baseline = baseline
         self._samples = samples
@@ -138,7 +136,7 @@ class Oscillation:
         return self._levels.high if self._is_high else self._levels.low
 
     def answer(self, t: float, y: float) -> float:
-        """Take the last sample and return the command; :attr:`verdict` says whether it is over.
+        """Take the last sample and return the command; :attr:`verdict` is set at the end.
 
         :param t: its time [s].
         :param y: the measurement [y].
@@ -192,22 +190,22 @@ class Oscillation:
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
         self._turns = Turns(t, self._response_time)
         self._answers = self._is_lost = False
-        # The shortest cycle before one was lost from view [s]; 0: none was.
+        # The shortest cycle before a cycle was lost [s]; 0: no cycle was lost.
         self._usual = 0.0
-        # The most switches in a cycle, and how many there were when the last one ended.
+        # The most switches in a cycle, and the number of switches at the end of the last cycle.
         self._most, self._counted = 0, self.switches
         self._began, self._longest_limit = t, 0.0
         p = self._parameters
         self._learn(self._response_time)
         if not p.max_half_cycle and (p.hysteresis > 0.0 or not math.isnan(p.setpoint)):
-            # How far the first switch is from the rest is then the user's choice, and the time
-            # to respond says nothing of it.
+            # The user's set-point decides the distance to the first switch, so the time to respond
+            # gives no limit.
             self._limit = self._first_limit
         self._longest_limit = self._limit
 
     @property
     def latest(self) -> float:
-        """Time by which it is over, unless a stay before has its limit extended [s]."""
+        """Deadline of the switching, unless the limit of a stay grows before [s]."""
         cycles = self._parameters.max_cycles + _SPARE_CYCLES
         return self._began + 2.0 * cycles * self._longest_limit
 
@@ -223,12 +221,12 @@ class Oscillation:
 
     @property
     def _balance(self) -> float:
-        """The shorter of two stays over the longer one, of a relay that is biased so."""
+        """Ratio of the shorter to the longer stay of a relay with this bias."""
         amplitude, bias = self._levels.amplitude, abs(self._levels.bias)
         return max(amplitude - bias, 0.0) / (amplitude + bias)
 
     def _learn_anew(self) -> None:
-        """Take what the relay does now for what the process takes, or fail."""
+        """Learn the length of a stay again from the relay's present switching, or fail."""
         turns, most = self._turns, self._parameters.max_cycles
         self._usual = self._usual or min((cycle.period for cycle in self.cycles), default=0.0)
         if self._switches_fast(2.0 * turns.longest):
@@ -236,17 +234,17 @@ class Oscillation:
         if len(self.cycles) + turns.lost >= most:
             self._end(
                 Outcome.FAILED,
-                f"no cycle could be told for {turns.lost_for:.3g} s, though the relay went on "
-                f"switching, after {count_cycles(self.cycles)}, and max_cycles, {most}, are over: "
-                f"its stays at the two levels are too unlike each other; check sensor and "
-                f"actuator, and that the process rests at the baseline",
+                f"no clear cycle for {turns.lost_for:.3g} s, though the relay went on switching, "
+                f"after {count_cycles(self.cycles)}, and max_cycles, {most}, are over: its half "
+                f"cycles differ too much; check sensor and actuator, and that the process rests "
+                f"at the baseline",
             )
             return
         self._patience.forget(turns.longest)
         self._is_lost = True
 
     def _switches_fast(self, period: float) -> bool:
-        """Fail if a period is too short for what the cycles took before one was lost from view."""
+        """Fail if a period is too short compared with the cycles before one was lost."""
         if period >= SHORT_STAY * self._usual:
             return False
         self._end_fast(
@@ -315,11 +313,11 @@ class Oscillation:
                 self._bear_load()
 
     def _look_for_noise(self) -> None:
-        """Make the amplitude larger, or fail, where the last stays at a level moved nothing."""
+        """Make the amplitude larger, or fail, if the last stays did not move the measurement."""
         first, last = self._switched_at[0], self._switched_at[-1]
         if len(self._switched_at) <= _STAYS or last - first < TELL:
             return
-        # While the process passes the band, noise may switch the relay many times.
+        # Noise may switch the relay many times while the measurement passes the band.
         time = self._samples.seen[last] - self._samples.seen[first]
         noise = self._noise_alone(first, last) if time >= _STAYS * self._response_time else ""
         if noise and self._levels.can_grow:
@@ -329,7 +327,7 @@ class Oscillation:
             self._end(Outcome.FAILED, noise)
 
     def _has_grown(self) -> bool:
-        """Make an amplitude that is being found larger if the last cycle was too small."""
+        """Make an amplitude that is not given larger if the last cycle was too small."""
         if not self._levels.searching:
             return False
         first, last = self.cycle_start[-2:]
@@ -375,43 +373,42 @@ class Oscillation:
     def _is_alone(self, period: float) -> bool:
         """Return True if a cycle is much longer than the one before: an actuator may have stuck.
 
-        If a load has come, the next one will tell, too.
+        A load would show in the next cycle, too.
         """
         return len(self.cycles) > 1 and period > _ALONE * self.cycles[-2].period
 
     def _bear_load(self) -> None:
-        """Shift the levels by what a load has changed of the mean command."""
+        """Shift the levels by the change of the mean command that a load has caused."""
         share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in self.cycles[-2:]]
         if math.isnan(self._share):
             if len(share) == 2 and abs(share[1] - share[0]) < _SAME_SHARE:
                 self._share = share[1]
             return
         change = share[-1] - self._share
-        # Once a load has come, what is left of it is borne, too.
+        # After a disturbed cycle a small change counts too: the rest of the same load.
         if abs(change) > (_SAME_SHARE if self.cycles[-2].disturbed else _OTHER_SHARE):
             self._shift(2.0 * change * self._levels.amplitude)
             self.cycles[-1] = replace(self.cycles[-1], disturbed=True)
 
     def _shift(self, by: float) -> None:
         self._levels.shift(by)
-        note = "a load came during the test, and the relay's levels were shifted to bear it"
+        note = "a load came during the test, and the relay's levels were shifted to compensate it"
         if note not in self.notes:
             self.notes.append(note)
 
     # The end.
 
     def _complete(self, reason: str) -> None:
-        """Complete, unless the last cycles cannot be told from noise."""
+        """Complete, unless the last cycles may be noise alone."""
         if noise := self._only_noise(1):
             self._end(Outcome.FAILED, noise)
         else:
             self._end(Outcome.COMPLETED, reason)
 
     def _only_noise(self, least: int) -> str:
-        """Return why the last cycles are no oscillation.
+        """Return why the last cycles are no oscillation, "" if they may be one.
 
-        :param least: how many samples it takes to tell where there are not MIN_CYCLES yet.
-        :returns: empty: they are one, or it cannot be told yet.
+        :param least: number of samples needed for a decision before MIN_CYCLES cycles.
         """
         last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
         first, last = last_cycles[0], last_cycles[-1]
@@ -419,7 +416,7 @@ class Oscillation:
         return "" if few else self._noise_alone(first, last)
 
     def _noise_alone(self, first: int, last: int) -> str:
-        """Return why the samples first to last - 1 are no oscillation; empty: they may be one."""
+        """Return why the samples first to last - 1 are no oscillation, "" if they may be one."""
         measurement = self._samples.columns(first, last)[1]
         return why_noise_alone(measurement, self._rest.noise_std, count_cycles(self.cycles))
 
@@ -433,11 +430,11 @@ class Oscillation:
         self.verdict = outcome, reason
 
     def _no_return(self, t: float, y: float) -> None:
-        """Fail, unless the amplitude can grow or a sign that is in doubt can be reversed."""
-        # A half cycle that is no noise shows that the process goes both ways with the relay.
+        """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
+        # A half cycle beyond the noise shows that the process follows the relay both ways.
         stays = self.switches - self._switches_before
         follows = bool(self.cycles) or (stays >= _FOLLOWS and self._answers)
-        # What stands still, and not only saturates, is no answer to anything.
+        # A constant measurement is no response at all; a saturated one still is.
         moved = has_moved(self._since(self._told_at)[1])
         if self._doubtful and not follows and moved:
             self._doubtful = False
@@ -453,24 +450,24 @@ class Oscillation:
             self._begin()
             return
         if follows and self._shifts < _MOST_SHIFTS and moved:
-            # It did oscillate: a load may have come that one of the levels cannot bear.
+            # It did oscillate before: a load may be too large for one of the levels.
             before = self.command
             self._shift((_SHIFT if self._is_high else -_SHIFT) * self._levels.amplitude)
             if self.command != before:
                 self._shifts += 1
                 self._shifted_at = t
-                # What it needs now is half of the patience that is used up.
+                # Each shift gets half of the patience again.
                 self._patient_from = t - 0.5 * self._limit
                 return
         self._end(Outcome.FAILED, self._why_lost(t, y))
 
     @property
     def _told_at(self) -> float:
-        """When the process was last told something else [s]."""
+        """Time of the last change of the command [s]."""
         return max(self._relay.since, self._shifted_at)
 
     def _since(self, time: float) -> tuple[FloatArray, FloatArray]:
-        """Return time and measurement from an instant on."""
+        """Return time and measurement since an instant."""
         first = bisect_left(self._samples.seen, time)
         return self._samples.columns(first, len(self._samples))[:2]
 

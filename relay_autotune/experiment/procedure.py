@@ -9,9 +9,9 @@ The states, the command in each of them, and what ends it::
                moment, then the baseline  nothing left of the response           -> KICK
     RELAY      the relay's                cycles agree, or max_cycles            -> COMPLETED
 
-A part that takes too long leads to FAILED. What may end an experiment in any state, and leads to
-ABORTED or FAILED, belongs to :mod:`relay_autotune.experiment.experiment`. In COMPLETED,
-ABORTED and FAILED the command is the baseline, for good.
+A part that takes too long leads to FAILED. The ends that are possible in any state, ABORTED or
+FAILED, belong to :mod:`relay_autotune.experiment.experiment`. In COMPLETED, ABORTED and FAILED the
+command stays at the baseline.
 """
 
 from __future__ import annotations
@@ -37,28 +37,28 @@ from relay_autotune.experiment.settling import NOT_SETTLED, RestState, Settling,
 from relay_autotune.record.record import Cycle, Outcome, RelaySettings
 
 SETTLING_LIMIT = 600.0
-"""Longest settling [s], where settle_time does not say; or 500 samples, if these take longer."""
+"""Longest settling without settle_time [s]; or 500 samples, if these take longer."""
 SETTLING_SAMPLES = 500
 KICK_LIMIT = 600.0
-"""Longest wait for a response, and then for the first switch [s], where max_duration does not
-say; or 50 times the settling, if that is longer."""
+"""Longest wait for a response, and then for the first switch, without max_duration [s]; or 50
+times the settling, if that is longer."""
 KICK_SETTLINGS = 50.0
 
-# With fewer samples a line and a standard deviation mean nothing, whatever settle_time says.
+# Least number of samples for a line and a standard deviation, also with settle_time.
 _LEAST_SETTLING_SAMPLES = 5
-# A part that was not ended by its own rules has lasted too long at so many times its limit.
+# A part that its own rules did not end fails at this many times its limit.
 _BEYOND = 2.0
 # An interval of the probe has at least this many samples.
 _PROBE_SAMPLES = 2
-# An amplitude that is to be found begins to grow after this part of the settling, or so many
-# samples; each size lasts as long as all smaller ones together, so that a long dead time does not
-# make it much larger than the process needs.
+# An amplitude that is not given begins to grow after this part of the settling, or a number of
+# samples. Each size lasts as long as all smaller ones together, so that a long dead time does not
+# make the amplitude much too large.
 _GROWTH_SETTLINGS = 0.25
 _GROWTH_SAMPLES = 20
 
 
 class State(enum.IntEnum):
-    """Where an experiment is."""
+    """The state of an experiment."""
 
     SETTLING = 1
     KICK = 2
@@ -75,9 +75,9 @@ _ENDS = {Outcome.COMPLETED: State.COMPLETED, Outcome.FAILED: State.FAILED}
 class Procedure:
     """Answer samples, one state after the other, until the procedure is over.
 
-    Each state is a method that answers a sample, bound to what it alone needs.
+    Each state is a method that answers a sample, bound to the data that only this state needs.
 
-    :param parameters: what the user set, valid.
+    :param parameters: the user's parameters, valid.
     :param baseline: command of the operating point [u].
     :param samples: the samples so far; each is appended before it is answered.
     :param until_converged: False: agreement of the cycles does not end it.
@@ -127,7 +127,7 @@ class Procedure:
 
     @property
     def latest(self) -> float:
-        """Time by which the present part must be over, whatever its own rules count [s]."""
+        """Deadline of the present part, independent of its own rules [s]."""
         if self._oscillation is not None:
             return self._oscillation.latest
         if self.state is State.PROBE:
@@ -156,7 +156,7 @@ class Procedure:
 
     @property
     def settings(self) -> RelaySettings | None:
-        """What the relay does; None until the measurement has settled.
+        """The relay's settings; None until the measurement has settled.
 
         While the sign of the process gain is not known, ``reverse_acting`` is False.
         """
@@ -174,7 +174,7 @@ class Procedure:
         )
 
     def end(self, state: State, reason: str) -> float:
-        """End the experiment; return the command that is safe.
+        """End the experiment and return the safe command.
 
         :param state: COMPLETED, ABORTED or FAILED.
         :param reason: why, a sentence for people.
@@ -185,7 +185,7 @@ class Procedure:
         return self._baseline
 
     def where(self) -> str:
-        """Return where the procedure is, to end a sentence with."""
+        """Return the present state as the end of a sentence."""
         return {
             State.SETTLING: "while settling",
             State.KICK: f"while waiting for the measurement to leave its rest {self.rest.mean:g}",
@@ -215,7 +215,7 @@ class Procedure:
         return self._baseline
 
     def _rest_over_settle_time(self) -> RestState:
-        """Take what there is: who gives a settle_time has decided that it is enough."""
+        """Accept the rest after settle_time, because the user chose that time."""
         n = len(self._samples)
         rest = rest_state(*self._samples.columns(0, n)[:2], n)
         if not rest.is_steady:
@@ -235,7 +235,7 @@ class Procedure:
 
     def _kick(self) -> float:
         t, y = self._samples.seen[-1], self._samples.measurement[-1]
-        # With the sign given, towards the set-point, if that is not where the measurement is.
+        # With a given sign, kick towards the set-point, unless the measurement is already there.
         is_high = self.sign == 0 or self._starts_high(t, y)
         detector = ResponseDetector(self.rest, t)
         self.state = State.KICK
@@ -258,7 +258,7 @@ class Procedure:
             self.dead_time_seen = detector.last_inside - start
             self._response_time = detector.first_outside - start
             if self._levels.can_grow:
-                # What can just be told from the noise does not tell much more.
+                # A response that only just exceeds the noise says too little.
                 self._levels.grow()
             if self.sign == 0:
                 return self._probe(detector, t, y)
@@ -305,7 +305,7 @@ class Procedure:
         if sign == 0:
             return self._levels.high if t < pulse_end else self._baseline
         if watch.remains < self.rest.noise_std:
-            # The pulse left nothing behind: noise had looked like a response.
+            # The pulse left no deviation: noise had looked like a response.
             return self._kick()
         self._sign = sign
         return self._relay(doubtful=True)

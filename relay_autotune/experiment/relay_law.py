@@ -1,4 +1,4 @@
-"""The relay itself: when it switches, and how long it waits for the measurement to come back."""
+"""The relay: when it switches, and how long it waits for the measurement to come back."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ class Relay:
 
     Direct-acting (sign 1), it goes low when the measurement rises to ``setpoint + hysteresis``
     and high when it falls to ``setpoint - hysteresis``; reverse-acting (sign -1), it does the
-    opposite. Without hysteresis the measurement has to pass the set-point: a quantised one may
-    rest on it.
+    opposite. Without hysteresis the measurement must pass the set-point, because a quantised one
+    may stay exactly on it.
 
     :param sign: sign of the process gain, 1 or -1.
     :param setpoint: measurement about which it switches [y].
@@ -25,8 +25,8 @@ class Relay:
         self, sign: int, setpoint: float, hysteresis: float, time: float, measurement: float
     ) -> None:
         self.sign = sign
-        # In the measurement times the sign a high command pushes upwards always, so that one
-        # rule serves both actions.
+        # With the measurement times the sign, a high command always pushes upwards, and one rule
+        # serves both actions.
         centre = sign * setpoint
         self._low_from = max(centre + hysteresis, math.nextafter(centre, math.inf))
         self._high_from = min(centre - hysteresis, math.nextafter(centre, -math.inf))
@@ -54,12 +54,12 @@ class Relay:
 
 
 class Patience:
-    """How long a relay may stay at one level before the measurement is taken for lost.
+    """How long a relay may stay at one level before the measurement counts as lost.
 
-    That is :data:`RATIO` times the longest stay so far, or the time that the process took to
-    respond where that is longer, and more in proportion to how unequally a biased relay pushes
-    to its two sides; but never less than :data:`LEAST_SAMPLES` samples, since without noise a
-    process of high order is seen to respond at the first sample and takes hundreds to turn.
+    The limit is :data:`RATIO` times the longest stay so far, or times the time to respond if that
+    is longer. A biased relay gets more time, in proportion to the ratio of its two steps. The
+    limit is at least :data:`LEAST_SAMPLES` samples: without noise, the response of a high-order
+    process is seen at the first sample, and takes hundreds of samples to turn.
 
     :param amplitude: half the distance of the levels [u].
     :param bias: offset of their middle from the baseline [u], smaller than the amplitude.
@@ -75,14 +75,14 @@ class Patience:
         """Limit of the present stay [s]."""
 
     def forget(self, longest: float) -> None:
-        """Take another stay for the longest one so far [s]."""
+        """Replace the longest stay so far [s]."""
         self._longest = longest
 
     def learn(self, stay: float, interval: float) -> None:
-        """Set the limit of the stay that begins, from the one that ended.
+        """Set the limit of the new stay from the stay that has ended.
 
-        :param stay: how long the relay was at the level before, or, to begin with, the time that
-            the process took to respond to the kick [s].
+        :param stay: length of the ended stay, or at the beginning the time that the process took
+            to respond to the kick [s].
         :param interval: mean sample interval [s].
         """
         self._longest = max(self._longest, stay)

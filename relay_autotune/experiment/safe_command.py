@@ -1,4 +1,4 @@
-"""What is commanded once an experiment has ended."""
+"""The command after the end of an experiment."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ HOLD_SHARE = 0.5
 class SafePolicy:
     """How the process is left when an experiment ends.
 
-    :param command: what is commanded after an abort or a failure [u]; NaN: the baseline.
-    :param hold: True for a process that would not stay where it is at a constant command (an
-        integrating or unstable one): it is held by proportional control as soon as its ultimate
-        gain is roughly known, or from the kick on if ``gain`` is given.
+    :param command: command after an abort or a failure [u]; NaN: the baseline.
+    :param hold: True for a process that drifts or runs away at a constant command (integrating or
+        unstable): proportional control holds it as soon as its ultimate gain is roughly known, or
+        from the kick on if ``gain`` is given.
     :param gain: gain of that proportional control [u/y]; 0: half of the ultimate gain.
-    :param give_back: True if another controller takes over at once, however it ended; the
-        experiment's ``safe_command`` is then kept at what that one wants.
+    :param give_back: True if another controller takes over at once at any end; the experiment's
+        ``safe_command`` then follows that controller's command.
     """
 
     command: float = math.nan
@@ -56,7 +56,7 @@ class ProportionalHold:
     def after(
         cls, settings: RelaySettings | None, cycles: Sequence[Cycle], gain: float = 0.0
     ) -> ProportionalHold | None:
-        """Return the hold that an experiment allows, None where no gain is known.
+        """Return the hold for an experiment, None if no gain is known.
 
         :param settings: the relay's settings; its levels are the limits.
         :param cycles: the cycles so far.
@@ -83,7 +83,7 @@ class ProportionalHold:
         )
 
     def command(self, measurement: float) -> float:
-        """Return the command [u] that answers a measurement [y]; the centre if that is none."""
+        """Return the command [u] for a measurement [y]; the centre if it is not finite."""
         if not math.isfinite(measurement):
             return self.centre
         wanted = self.centre + self.gain * (self.setpoint - measurement)

@@ -9,12 +9,12 @@ import numpy as np
 
 from relay_autotune.record.record import FloatArray
 
-# A constant is known from few samples; a noise band is known to 10 % from 50, since the relative
-# standard error of a standard deviation is 1/sqrt(2 n).
+# Samples needed for a constant, and for a noise band: 50 give a standard deviation to 10 %, since
+# its relative standard error is 1/sqrt(2 n).
 CONSTANT_SAMPLES = 20
 NOISE_SAMPLES = 50
 
-# A transient of which no more than this is left is over, where there is no noise to measure by.
+# Without noise, a transient is over when no more than this part of it is left.
 _REMAINDER = 0.01
 
 # Rounding of a constant: differences below this many units in the last place are no signal.
@@ -23,7 +23,7 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class RestState:
-    """What the measurement did while the command was at the baseline.
+    """The measurement while the command was at the baseline.
 
     :param mean: mean measurement over the window [y].
     :param slope: slope of the straight line through the window [y/s].
@@ -53,11 +53,11 @@ class RestState:
 
     @property
     def is_steady(self) -> bool:
-        """True if the drift over the window is none, or none that matters.
+        """True if the drift over the window does not matter.
 
-        That is: within three standard errors of what noise alone does to the line, or within one
-        standard deviation of the noise (a third of the hysteresis), or within 1 % of all that
-        was seen since the settling began (the end of a transient without noise).
+        One of these must hold: it is within three standard errors of the line's slope under noise
+        alone; within one standard deviation of the noise (a third of the hysteresis); or within
+        1 % of the whole range since the settling began (the end of a transient without noise).
         """
         if self.span <= 0.0:
             return False
@@ -66,7 +66,7 @@ class RestState:
 
 
 NOT_SETTLED = RestState(math.nan, math.nan, math.nan, 0.0, 0, 0.0)
-"""The state of rest before it is known."""
+"""Placeholder before the state of rest is known."""
 
 
 def rest_state(time: FloatArray, measurement: FloatArray, window: int) -> RestState:
@@ -81,8 +81,8 @@ def rest_state(time: FloatArray, measurement: FloatArray, window: int) -> RestSt
     span = float(t[-1] - t[0])
     rounding = _ROUNDING * float(np.max(np.abs(y)))
     if float(np.max(y) - np.min(y)) <= rounding:
-        # The mean of equal numbers may differ from them in the last place, which would put the
-        # set-point beside a constant measurement and not on it.
+        # The rounded mean of equal numbers may differ from them in the last digit, and the
+        # set-point must lie exactly on a constant measurement.
         return RestState(float(y[-1]), 0.0, 0.0, span, window, range_seen)
     mean = float(np.mean(y))
     if span <= 0.0 or window < 3:
@@ -99,25 +99,25 @@ def rest_state(time: FloatArray, measurement: FloatArray, window: int) -> RestSt
 
 
 class Settling:
-    """Decide when to look at the measurement, so that each look costs little in the long run.
+    """Decide when to test the measurement for rest, so that all tests together cost little.
 
-    The window is the later half of all samples, or the last :data:`NOISE_SAMPLES` where that is
-    more: a transient at the start leaves it in time. It is looked at again when there are a
-    quarter more samples than at the last look.
+    The window is the later half of all samples, or the last :data:`NOISE_SAMPLES` if these are
+    more, so that a transient at the start leaves it. The next test comes when there are a quarter
+    more samples than at the last one.
     """
 
     def __init__(self) -> None:
         self._next_look = CONSTANT_SAMPLES
 
     def is_due(self, samples: int) -> bool:
-        """Return True if it is worth looking now.
+        """Return True if it is time for a test.
 
         :param samples: number of samples since the settling began.
         """
         return samples >= self._next_look
 
     def look(self, time: FloatArray, measurement: FloatArray) -> tuple[RestState, bool]:
-        """Return the state of rest, and whether it is steady and the noise band known.
+        """Return the state of rest, and True if it is steady and the noise band is known.
 
         :param time: instants of all samples since the settling began [s], shape (n,).
         :param measurement: the samples [y], shape (n,).

@@ -7,40 +7,40 @@ from itertools import pairwise
 
 from relay_autotune.record.record import Cycle, FloatArray
 
-# A growth is taken for that of an instability after so many steps, each of which is larger than
-# the one before by this factor, to so many times the first swing: the transient of a stable loop
-# grows in steps that become smaller.
+# The swings grow like an unstable loop's after this many steps, each larger than the one before by
+# a factor, to a multiple of the first swing. In the transient of a stable loop the steps become
+# smaller.
 _STEPS = 3
 _FASTER = 1.15
 _LARGER = 3.0
 
-# Growth is exponential if the last of so many steps by this factor took no longer than the one so
-# many before it, give or take: t^8, with which eight lags answer at first, takes 1.7 times as
-# long. Steps of fewer samples are too short to tell.
+# Growth is exponential if a step by this factor takes no longer than a step some steps earlier,
+# with a tolerance. The initial response of eight lags, t^8, takes 1.7 times as long. Steps with
+# fewer samples are too short to decide.
 _STEP, _LEAST_STEPS, _APART, _NO_LONGER = 8.0, 4, 2, 1.1
 _SAMPLES = 10
-# What falls below this part of what it had reached grows no more.
+# A distance that falls below this part of its maximum has stopped growing.
 _FALLEN = 0.05
 
-# Over its last third, a measurement that moves by less than this part of its whole way is level.
+# A measurement is level if in its last third it moves by less than this part of its whole way.
 _LEVEL = 0.03
-# What is no further than this part of its way from where it went last has not come back.
+# A measurement has not come back if it is within this part of its way from its extreme.
 _BACK = 0.1
 
 NO_ANSWER = (
     "it does not respond: it has stood still since the command last changed; check the sensor, "
     "and that the actuator follows"
 )
-"""What there is to say of a measurement that did nothing."""
+"""Sentence for a measurement that did not move."""
 
 
 class RunawayWatch:
-    """Recognise exponential growth, as of an unstable process of which the relay has no hold.
+    """Recognise exponential growth: an unstable process that the relay cannot hold.
 
-    Before the first cycle nothing is known of the process by which a distance could be called far,
-    but the answer of a stable one multiplies ever more slowly.
+    Before the first cycle no distance of the process is known as "far". But the response of a
+    stable process multiplies more and more slowly.
 
-    :param floor: distance from which steps count [y]; 0: from the first one above zero.
+    :param floor: distance from which steps count [y]; 0: from the first distance above zero.
     """
 
     def __init__(self, floor: float) -> None:
@@ -54,13 +54,13 @@ class RunawayWatch:
         """Take a sample; return True if it runs away.
 
         :param time: its instant [s].
-        :param distance: from the set-point, of either sign [y].
+        :param distance: from the set-point, positive or negative [y].
         """
         away = abs(distance)
         self._samples += 1
         if (distance > 0.0) != self._above:
-            # What has turned back to the other side obeys the relay; from a passage through
-            # zero on, a distance multiplies fast whatever the process.
+            # A measurement that changes sides follows the relay. And just after a passage
+            # through zero, the distance of any process multiplies fast.
             self._above = not self._above
             self._passed.clear()
         if away < self._next:
@@ -68,7 +68,7 @@ class RunawayWatch:
                 self._passed.clear()
                 self._next = _STEP * self._floor
             return False
-        # One at a time, so that a spike of the sensor is one.
+        # Only one step for each sample, so that a spike of the sensor counts as one.
         self._passed.append(time)
         self._next = _STEP * (self._next or away)
         samples, self._samples = self._samples, 0
@@ -80,7 +80,7 @@ class RunawayWatch:
 
 
 def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> str:
-    """Say what the measurement did while the relay stayed at one level, and what may help.
+    """Return what the measurement did while the relay stayed at one level, and a remedy.
 
     :param time: instants of the samples of that stay [s], shape (n,).
     :param towards: the samples, times 1 if the relay pushed upwards and -1 if downwards [y],
@@ -94,14 +94,14 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
     whole = float(towards.max() - towards.min())
     still = 3.0 * noise_std / min(len(part) for part in thirds) ** 0.5
     level = max(_LEVEL * whole, still)
-    # It may swing out for a while first; what counts is whether it came back from there.
+    # It may first swing further out; the question is whether it came back from there.
     way_back = float(towards[-1] - towards.min())
     away = way_back <= max(_BACK * whole, level, 6.0 * noise_std)
     if away and third - float(towards[0]) < -level:
         faster = " faster and faster" if second - third > first - second > 0.0 else ""
         rests = abs(third - second) <= level
         other = (
-            "a load has come that the relay cannot bear"
+            "a load has come that the relay cannot compensate"
             if rests
             else "the process is unstable and the amplitude too small to hold it"
         )
@@ -121,7 +121,7 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
 
 
 def has_moved(measurement: FloatArray) -> bool:
-    """Return True if a measurement has changed at all, or there is too little of it to tell.
+    """Return True if a measurement has changed at all, or has too few samples to decide.
 
     :param measurement: the samples since the command last changed [y], shape (n,).
     """
@@ -136,7 +136,7 @@ def _thirds(time: FloatArray, values: FloatArray) -> list[FloatArray]:
 
 
 def is_growing(swings: Sequence[float]) -> bool:
-    """Return True if the swings of the cycles grow as those of an unstable loop do.
+    """Return True if the swings of the cycles grow like those of an unstable loop.
 
     :param swings: peak to peak of each cycle so far [y].
     """
@@ -148,5 +148,5 @@ def is_growing(swings: Sequence[float]) -> bool:
 
 
 def count_cycles(cycles: list[Cycle]) -> str:
-    """Say how many cycles there are."""
+    """Return the number of cycles in words."""
     return f"{len(cycles)} whole cycle{'' if len(cycles) == 1 else 's'}"

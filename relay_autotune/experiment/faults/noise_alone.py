@@ -1,23 +1,23 @@
-"""Recognise a relay that switches on the noise of its sensor alone."""
+"""Recognise a relay that switches only on the noise of its sensor."""
 
 from __future__ import annotations
 
 from relay_autotune.record.record import FloatArray
 
-# An oscillation shows in the samples' standard deviation, which must be so many times that of the
-# noise; a relay without a process switches on noise alone, too, and its cycles agree at last.
+# Least ratio of the samples' standard deviation to the noise's for an oscillation. A relay without
+# a process switches on noise, too, and some of its cycles agree in the end.
 _ABOVE_NOISE = 1.5
 
 TELL = 50
-"""So many samples tell it before there are cycles enough."""
+"""Number of samples for this decision before there are enough cycles."""
 
 
 def why_noise_alone(measurement: FloatArray, noise_std: float, after: str) -> str:
-    """Return why samples are no oscillation; empty: they may be one.
+    """Return why samples are no oscillation, "" if they may be one.
 
     :param measurement: the samples [y], shape (n,).
     :param noise_std: standard deviation of the noise at rest [y].
-    :param after: how many cycles there are, in words.
+    :param after: number of cycles, in words.
     """
     spread = float(measurement.std())
     if spread >= _ABOVE_NOISE * noise_std:

@@ -1,37 +1,37 @@
-"""A sensor that speaks only when its value changes: what its silence says."""
+"""A sensor that publishes only on change: the meaning of its silence."""
 
 from __future__ import annotations
 
 import math
 
-# A silence is too long that lasts so many times the longest one while the relay switched, and so
-# many repetitions, and a whole period at least.
+# A silence is too long if it exceeds a multiple of the longest one while the relay switched, a
+# number of repetitions, and a whole period.
 _SILENT_RATIO = 3.0
 _SILENT_REPETITIONS = 20
 
 
 class Repetition:
-    """Tell when the last measurement is to be taken again.
+    """Decide when the last measurement counts as a new sample.
 
-    A sensor that speaks only when its value changes says by its silence that the value has not
-    changed; so the value is a sample again after each period of silence.
+    For a sensor that publishes only on change, silence means that the value has not changed. So
+    the value counts as a new sample after each period of silence.
 
-    :param period: the silence after which it is [s], > 0.
+    :param period: the silence before a repetition [s], > 0.
     """
 
     def __init__(self, period: float) -> None:
         self.period = period
         self.value = math.nan
-        """The last measurement [y]; NaN: none has come."""
+        """The last measurement [y]; NaN before the first."""
         self._since = math.nan
 
     @property
     def is_heard(self) -> bool:
-        """True once a measurement has come."""
+        """True after the first measurement."""
         return not math.isnan(self._since)
 
     def hear(self, now: float, value: float) -> None:
-        """Take a measurement that has come.
+        """Take a received measurement.
 
         :param now: the time [s].
         :param value: [y].
@@ -40,9 +40,9 @@ class Repetition:
         self._since = now
 
     def wait(self, now: float) -> float:
-        """Return the time until the value is to be repeated [s]; 0: now; the period: unheard.
+        """Return the time until the next repetition [s]; 0: now; the period before a measurement.
 
-        A clock that has gone back makes it 0, so that who takes the sample gets to know.
+        If the clock has gone back it is 0, so that the consumer of the sample sees the step.
 
         :param now: the time [s].
         """
@@ -51,7 +51,7 @@ class Repetition:
         return max(self._since + self.period - now, 0.0) if self.is_heard else self.period
 
     def repeat(self, now: float) -> float:
-        """Return the value, which is a sample now [y].
+        """Return the value as a sample of now [y].
 
         :param now: the time [s].
         """
@@ -60,12 +60,12 @@ class Repetition:
 
 
 class SilenceWatch:
-    """Recognise a sensor that has died, among silences that only say that nothing has changed.
+    """Distinguish a dead sensor from one whose value has not changed.
 
-    At rest any silence is in order. While the relay switches the measurement has to move: from
-    the first whole cycle on, a silence is too long that lasts the longest cycle, three times the
-    longest silence since the relay began, and more than 20 repetitions. Before, the relay's own
-    patience judges.
+    At rest any silence is allowed. While the relay switches, the measurement must move: after the
+    first whole cycle, a silence is too long if it exceeds the longest cycle, three times the
+    longest silence since the relay began, and 20 repetitions. Before that cycle, the relay's own
+    time limit applies.
     """
 
     def __init__(self) -> None:
@@ -74,18 +74,18 @@ class SilenceWatch:
         self._longest = 0.0
         self._repetitions = 0
         self.repeated = 0
-        """Number of samples that were repeated."""
+        """Number of repeated samples."""
         self.silence = 0.0
-        """Time since the sensor spoke last [s]."""
+        """Time since the sensor's last message [s]."""
 
     def hear(self, time: float, *, relaying: bool) -> None:
-        """Take a sample that has come.
+        """Take a received sample.
 
         :param time: its instant [s].
         :param relaying: True if the relay switches.
         """
         if relaying:
-            # The first time that it speaks says nothing of how long it was silent at rest.
+            # The silence before the first message began at rest, so it does not count.
             if not math.isnan(self._heard):
                 self._longest = max(self._longest, time - self._heard)
             self._heard = time
@@ -94,7 +94,7 @@ class SilenceWatch:
         self.silence = 0.0
 
     def repeat(self, time: float, *, longest_cycle: float) -> bool:
-        """Take a sample that was repeated; return True if the sensor has been silent too long.
+        """Take a repeated sample; return True if the sensor has been silent too long.
 
         :param time: its instant [s].
         :param longest_cycle: the longest period so far [s]; inf before the first whole cycle.

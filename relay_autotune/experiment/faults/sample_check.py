@@ -1,28 +1,28 @@
-"""Whether a sample can be used at all."""
+"""Check whether a sample can be used."""
 
 from __future__ import annotations
 
 import math
 
-# Numbers beyond this overflow when squared, and are no measurements of anything.
+# Numbers beyond this are no measurements, and their squares may overflow.
 _LARGEST = 1e100
-# So many samples with one and the same time come from a clock that stands still.
+# More samples than this with the same time mean that the clock stands still.
 _LONGEST_REPEAT = 10_000
 
 
 class SampleCheck:
-    """Recognise numbers that are no measurements, and times that do not go on."""
+    """Recognise numbers that are no measurements, and times that do not advance."""
 
     def __init__(self) -> None:
         self._samples = 0
         self._repeats = 0
 
     def problem(self, time: float, measurement: float, last: float, origin: float) -> str | None:
-        """Take a sample; say why it cannot be used, None if it can.
+        """Take a sample; return why it cannot be used, None if it can.
 
         :param time: its instant [s].
         :param measurement: [y].
-        :param last: instant of the sample before it, from the first one on [s]; -inf: none.
+        :param last: instant of the previous sample, from the first one [s]; -inf: there is none.
         :param origin: instant of the first sample [s].
         """
         count = self._samples

@@ -1,18 +1,18 @@
-"""Watch the sensor: does it still measure, and do its clock and ours go alike."""
+"""Watch the sensor: whether it still measures, and whether its clock agrees with ours."""
 
 from __future__ import annotations
 
 import math
 
-# Where less than this part of the samples at rest equals the one before, the sensor's noise makes
-# every sample another one; so many equal ones in a row are then not by chance.
+# If less than this part of the samples at rest equals the one before, the noise changes every
+# sample, and this many equal samples in a row cannot be chance.
 _RARELY_EQUAL = 0.05
 _FROZEN_SAMPLES = 20
-# Elsewhere a run of equal samples is compared with the longest one of the cycles before.
+# Otherwise the run of equal samples is compared with the longest run of the cycles before.
 _FROZEN_RATIO = 3.0
 
-# A difference of clocks is known from so many samples; a step counts from this size on [s], and
-# where it could be a delay, if it lasts so long [s]. Of a drift this part is followed at a time.
+# Samples needed for the difference of the clocks; smallest step that counts [s]; time after which
+# a larger difference is a step and not a delay [s]; part of a drift that is followed at a sample.
 _STEP_SAMPLES = 10
 _STEP_LEAST = 0.05
 _STEP_LASTS = 1.0
@@ -20,11 +20,11 @@ _FOLLOWED = 1e-3
 
 
 class FrozenWatch:
-    """Recognise a sensor that says the same again and again.
+    """Recognise a sensor that repeats one value.
 
-    A sensor with noise is frozen after 20 equal samples. One that repeats itself anyhow (a coarse
-    resolution, a slow converter, a process without noise) is judged once a whole cycle was seen,
-    by three times the longest run of equal samples so far and 20 samples more.
+    A sensor with noise is frozen after 20 equal samples. If equal samples are normal (a coarse
+    resolution, a slow converter, a process without noise), it is judged after the first whole
+    cycle: it is frozen after three times the longest run of equal samples so far plus 20 samples.
     """
 
     def __init__(self) -> None:
@@ -68,10 +68,9 @@ class FrozenWatch:
 class ClockWatch:
     """Recognise a step between the clock that stamps samples and the clock that receives them.
 
-    What a sample takes on its way varies, and a busy machine may hold many of them back; but
-    nothing arrives before it was sent, and what was held back is soon caught up with. So receive
-    minus source time that is lower than before is a step at once, and a higher one if it stays so
-    for a second and 10 samples.
+    The delay of a sample varies, and a busy machine may delay many of them. But no sample arrives
+    before it was sent, and a backlog is soon worked off. So a drop of receive minus source time is
+    a step at once; a rise is a step if it lasts for a second and 10 samples.
     """
 
     def __init__(self) -> None:
@@ -82,14 +81,14 @@ class ClockWatch:
 
     @property
     def drift(self) -> float:
-        """How far the clocks have moved against each other since the start [s]."""
+        """Change of the difference of the clocks since the start [s]."""
         return 0.0 if math.isnan(self._begin) else self._reference - self._begin
 
     def add(self, source: float, receive: float) -> str:
         """Take the two times of a sample; return a sentence if a clock has stepped, else "".
 
         :param source: when it was taken, on the sensor's clock [s].
-        :param receive: when it arrived, on ours [s].
+        :param receive: when it arrived, on our clock [s].
         """
         difference = receive - source
         if len(self._first) < _STEP_SAMPLES:
