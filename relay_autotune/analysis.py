@@ -315,6 +315,7 @@ def _assessed(
         samples=chosen.model.method == DEFAULT_METHOD,
         others=found.models[1:],
         settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
+        driven=chosen.driven,
     )
     return _judged(found, evidence, (record,), rules, simple, options, rng)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, RecordError
 from relay_autotune.identification.shown.fourier import frequency_point
+from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import cycles_of
@@ -26,6 +27,9 @@ _LEAST_DISAGREEMENT = 0.03
 _LEAST_CYCLES = 3
 # With fewer samples in a cycle, straight lines between them miss more than a percent.
 _LEAST_SAMPLES = 24
+# Of a command's range, where its effect may end; beside the level that it starts from.
+_SHARES = (0.25, 0.5, 0.75)
+_LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
 
 
 def unequal_gains(record: Record, model: TransferFunction) -> str | None:
@@ -66,6 +70,56 @@ def unequal_gains(record: Record, model: TransferFunction) -> str | None:
     )
 
 
+def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] | None:
+    """Return how much of their effect commands lose on one side of a level, and that level.
+
+    The parts of the command above and below a level get a gain each, a and b, in the least-squares
+    sense; the loss is ``(|a - b| - 3 sigma)/max(|a|, |b|)``, with sigma the standard deviation of
+    the difference, at the level where it is largest. Where an actuator is at its end it is 1.
+
+    :param record: any record.
+    :param model: the model fitted to it.
+    :return: None where the command has two levels alone, or the process grows by itself.
+    """
+    if any(t.real < 0.0 for t in model.time_constants) or len(record) < _LEAST_SAMPLES:
+        return None
+    u = record.input()
+    levels = np.unique(np.append(u.values, u.initial))
+    if levels.size < _LEVELS or not np.ptp(levels) > 0.0:
+        return None
+    few = np.unique(np.linspace(0, len(record) - 1, _MOST_SAMPLES).astype(np.int64))
+    part = replace(
+        record,
+        time=record.time[few],
+        measurement=record.measurement[few],
+        command=record.command[few],
+        receive_time=np.empty(0),
+        command_time=np.empty(0),
+        cycle_start=(),
+    )
+    inner = levels[0] + np.array(_SHARES) * np.ptp(levels)
+    found = []
+    for level in (*inner, u.initial):
+        if not levels[0] < level < levels[-1]:
+            continue
+        parts = [
+            response(
+                model,
+                part.time,
+                PiecewiseConstant(u.times, keep(u.values - level, 0.0), keep(u.initial - level, 0)),
+            )
+            for keep in (np.maximum, np.minimum)
+        ]
+        (above, below), covariance = _factors(part, parts, correlated=True)
+        contrast = np.array((1.0, -1.0))
+        sigma = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
+        largest = max(abs(above), abs(below))
+        if largest > 0.0:
+            loss = (abs(above - below) - _SURE_LOSS * sigma) / largest
+            found.append((float(max(loss, 0.0)), float(level)))
+    return max(found, default=None)
+
+
 def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:
     """Say whether a process has another gain for larger changes of the command.
 
@@ -99,12 +153,15 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
     )
 
 
-def _factors(record: Record, parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _factors(
+    record: Record, parts: Sequence[FloatArray], *, correlated: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """Return the factors of some responses in a record, and their covariance.
 
     An offset and a drift are estimated beside them.
 
     :param parts: each of the record's length.
+    :param correlated: True: samples count by what they are worth beside their neighbours.
     """
     line = record.time - record.time.mean()
     columns = np.stack((*parts, np.ones(len(record)), line))
@@ -113,7 +170,10 @@ def _factors(record: Record, parts: Sequence[FloatArray]) -> tuple[FloatArray, F
     scaled = columns / size[:, None]
     factors, *_ = np.linalg.lstsq(scaled.T, record.measurement, rcond=None)
     residual = record.measurement - factors @ scaled
-    covariance = np.linalg.pinv(scaled @ scaled.T) * float(residual @ residual) / len(record)
+    variance = float(residual @ residual) / len(record)
+    if correlated:
+        variance /= worth(residual)
+    covariance = np.linalg.pinv(scaled @ scaled.T) * variance
     count = len(parts)
     return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]
 

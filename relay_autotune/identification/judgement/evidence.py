@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.judgement.direction import OtherDirection, other_direction
+from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.judgement.visible import VisibleError, visible_error
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.plausibility import is_unseen
@@ -56,6 +57,7 @@ class Evidence:
     :param others: other methods' models of the record, with the quality of their fit.
     :param settled: True if the record has a limit cycle whose last cycles agree.
     :param loop: the gains; None: there are none yet.
+    :param driven: the record as the process was driven, with a load that came; None: as it is.
     """
 
     record: Record
@@ -66,6 +68,7 @@ class Evidence:
     others: tuple[Identification, ...] = ()
     settled: bool = False
     loop: Loop | None = None
+    driven: Record | None = None
 
     @cached_property
     def other(self) -> OtherDirection | None:
@@ -98,6 +101,26 @@ class Evidence:
             for m in models
             if self.growth(m) <= MOST_GROWTH and not is_unseen(m, interval, self.record.duration)
         )
+
+    @cached_property
+    def halves(self) -> tuple[Part, ...]:
+        """What either half of the record tells in the chosen structure; empty: not asked for."""
+        if not self.samples:
+            return ()
+        try:
+            return halves(self.found, self.driven or self.record)
+        except (ModelError, np.linalg.LinAlgError):
+            return ()
+
+    @cached_property
+    def plain(self) -> tuple[TransferFunction, ...]:
+        """Plain models of the whole record that explain it as well; empty: not asked for."""
+        if not self.samples:
+            return ()
+        try:
+            return plain_models(self.found, self.driven or self.record)
+        except (ModelError, np.linalg.LinAlgError):
+            return ()
 
     def growth(self, model: TransferFunction) -> float:
         """Return the longest stay of the command over the time with which a model grows.

@@ -12,12 +12,18 @@ import math
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
+from relay_autotune.identification.judgement.checks import lost_effect
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
+from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.text import process_text
 from relay_autotune.verdict import Check, Measured
 
 _FREQUENCIES = 300
+# Share of the models that a half allows on which the gains may be better.
+_BUT_FEW = 0.1
+# K_u is known where its interval is no wider than this to either side.
+_KNOWN = 0.2
 
 
 def _direction(evidence: Evidence) -> Measured | None:
@@ -108,6 +114,54 @@ def _rivals(evidence: Evidence) -> Measured | None:
     return Measured(ms / loop.ms, process_text(model))
 
 
+def _halves(evidence: Evidence) -> Measured | None:
+    loop = evidence.loop
+    if loop is None or not evidence.halves:
+        return None
+    # Most of what a half allows has to object, so that one which tells little is not heard.
+    found = [
+        (float(np.quantile([loop.ms_on(m) for m in part.models], _BUT_FEW, method="lower")), part)
+        for part in evidence.halves
+    ]
+    ms, part = max(found, key=lambda pair: pair[0])
+    return Measured(ms / loop.ms, f"{part.begin:.4g} s to {part.end:.4g} s")
+
+
+def _halves_direction(evidence: Evidence) -> Measured | None:
+    sign = evidence.found.model.process_sign
+    found = [(other_sign(part.models, sign), part) for part in evidence.halves]
+    if not found:
+        return None
+    share, part = max(found, key=lambda pair: pair[0])
+    return Measured(share, f"{part.begin:.4g} s to {part.end:.4g} s")
+
+
+def _plain(evidence: Evidence) -> Measured | None:
+    loop, sign = evidence.loop, evidence.found.model.process_sign
+    if loop is None or not evidence.plain:
+        return None
+    found = [
+        (loop.ms_on(m) if m.process_sign == sign else math.inf, m) for m in evidence.plain
+    ]
+    ms, model = max(found, key=lambda pair: pair[0])
+    return Measured(ms / loop.ms, process_text(model))
+
+
+def _beyond(evidence: Evidence) -> Measured | None:
+    found = evidence.found
+    half = NORMAL_95 * found.ultimate_gain_std / abs(found.ultimate_gain)
+    longest = max((abs(t) for t in (*found.model.time_constants, found.model.dead_time)), default=0)
+    # What the loop needs of a lag much longer than the record is its slope, which is in K_u.
+    if half <= _KNOWN or not evidence.record.duration > 0.0:
+        return None
+    return Measured(longest / evidence.record.duration)
+
+
+def _clipped(evidence: Evidence) -> Measured | None:
+    found = lost_effect(evidence.driven or evidence.record, evidence.found.model)
+    return None if found is None else Measured(found[0], f"{found[1]:.4g}")
+
+
 MODEL_CHECKS = (
     Check(
         name="direction",
@@ -186,6 +240,45 @@ MODEL_CHECKS = (
         remedy="run more cycles, or use a larger amplitude",
         measure=_ultimate,
     ),
+    Check(
+        name="beyond_record",
+        title="Long times",
+        what="longest time of the model over the length of the record, where K_u is not known to "
+        "a fifth",
+        unit="",
+        doubtful=1.0,
+        failed=10.0,
+        sentence="a time of the model is {value} times as long as the record, which cannot show "
+        "it, and K_u is not known without it",
+        remedy="record longer, or run a relay test, which tells K_u without it",
+        measure=_beyond,
+    ),
+    Check(
+        name="clipped",
+        title="Clipping",
+        what="share of their effect that commands surely lose on one side of a level; above 1 they "
+        "act the other way there",
+        unit="",
+        doubtful=0.6,
+        failed=1.0,
+        sentence="commands on one side of {detail} lose {value} of the effect that those on the "
+        "other side have",
+        remedy="keep the command where the actuator is not at its end, and give its ends as "
+        "command_min and command_max",
+        measure=_clipped,
+    ),
+    Check(
+        name="halves_direction",
+        title="Direction in halves",
+        what="share of the models that one half of the record allows in which a higher command "
+        "moves the measurement the other way",
+        unit="",
+        doubtful=0.5,
+        failed=0.9,
+        sentence="from {detail} the record goes with a process that works in the other direction",
+        remedy="keep other inputs constant, or start the record from rest",
+        measure=_halves_direction,
+    ),
 )
 
 LOOP_CHECKS = (
@@ -222,6 +315,30 @@ LOOP_CHECKS = (
         sentence="{detail} explains the record as well, and on it Ms is {value} times as large",
         remedy="run a test that tells them apart: a biased relay, or a longer step",
         measure=_rivals,
+    ),
+    Check(
+        name="halves",
+        title="Halves",
+        what="Ms of the gains that nine of ten models which one half of the record allows exceed, "
+        "over Ms on the model",
+        unit="",
+        doubtful=2.0,
+        sentence="{detail} of the record alone shows a process on which Ms is {value} times as "
+        "large or larger",
+        remedy="see whether load, operating point or other inputs changed, and record again",
+        measure=_halves,
+    ),
+    Check(
+        name="plain",
+        title="Plain models",
+        what="Ms of the gains on the worst of one or two lags with dead time, where these explain "
+        "the record as well, over Ms on the model; infinite: the direction is the other one",
+        unit="",
+        doubtful=2.0,
+        sentence="{detail}, which is simpler and explains the record as well, has an Ms {value} "
+        "times as large",
+        remedy="name the structure that you expect, or record a larger or longer test",
+        measure=_plain,
     ),
 )
 

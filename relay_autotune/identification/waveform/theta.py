@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.waveform.rational import responses
 from relay_autotune.process.factors import Quadratic
+from relay_autotune.process.model_parameters import DEAD_TIME
 from relay_autotune.process.structures import FOPDT, Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
 
@@ -36,6 +37,24 @@ def columns_of(
     if structure == FOPDT and isinstance(u, PiecewiseConstant):
         return one_lag(theta, time, u)
     return responses(structure.denominator, structure.powers, theta, time, u)
+
+
+def theta_of(structure: Structure, values: FloatArray) -> FloatArray:
+    """Return the theta that stands for values of a structure's parameters, shape (m,).
+
+    :param structure: the structure.
+    :param values: of its parameters, in their order, shape (p,).
+    """
+    given = dict(zip(structure.parameters, values.tolist(), strict=True))
+    logs: list[float] = []
+    for factor in structure.factors:
+        poles = factor.poles([given[p] for p in factor.parameters])
+        if isinstance(factor, Quadratic):
+            size = math.sqrt(abs(poles[0] * poles[1]))
+            logs += [math.log(size), math.log(0.5 * (poles[0] + poles[1]).real / size)]
+        else:
+            logs.append(math.log(abs(poles[0].real)))
+    return np.array([*logs, given[DEAD_TIME]])
 
 
 def unit_steps(structure: Structure, theta: FloatArray) -> FloatArray:

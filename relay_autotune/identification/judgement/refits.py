@@ -1,0 +1,240 @@
+"""Other fits of a record, on whose models gains have to hold: of its halves, and plain ones.
+
+A part of a record tells some directions of the parameters and not others. So its models are drawn
+from what is known with it: the whole record's model, each time a factor of e either way, and what
+the samples of the part say beside it (Gauss and Newton with a prior; Laplace's approximation). A
+part that tells nothing has models all around that of the whole, and objects to nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import ModelError
+from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
+from relay_autotune.identification.waveform.plausibility import is_unseen
+from relay_autotune.identification.waveform.residuals import worth
+from relay_autotune.identification.waveform.separable import (
+    Problem,
+    evaluate,
+    information_criterion,
+    problem_of,
+)
+from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
+from relay_autotune.identification.waveform.theta import theta_of, unit_steps
+from relay_autotune.process.structures import FOPDT, SOPDT, GivenModel, Structure
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
+
+FloatArray = NDArray[np.float64]
+
+_MOST_SAMPLES = 1200
+_FEWEST = 24
+_STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
+# Standard deviations of what is known beforehand: of logarithms of times, of a gain relative to
+# its value, of a dead time relative to all times together.
+_TIMES, _GAIN, _DEAD_TIME = 1.0, 2.0, 1.0
+_DRAWS = 40
+_FARTHEST = 20.0
+# A criterion that is larger by less is as good: odds of e^3.
+_AS_GOOD = 6.0
+_TRIAL = 1e-6
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a part of a record tells of the process.
+
+    :param begin: its first time [s].
+    :param end: its last time [s].
+    :param models: drawn from those that it allows.
+    """
+
+    begin: float
+    end: float
+    models: tuple[TransferFunction, ...]
+
+
+def halves(found: Identification, record: Record) -> tuple[Part, ...]:
+    """Return what either half of a record tells of the process in the chosen structure.
+
+    The record is parted where half of the information on the parameters has come. Each half has
+    an offset and a free initial state of its own.
+
+    :param found: a fit to the samples.
+    :param record: what was fitted.
+    :return: empty where no half can be fitted, or the process grows by itself.
+    """
+    structure = found.estimate.structure
+    if isinstance(structure, GivenModel) or structure.unstable:
+        return ()
+    problem = _problem(found, record, structure)
+    theta = theta_of(structure, found.values)
+    whole = evaluate(problem, theta)
+    jacobian = np.concatenate((whole.columns[: len(structure.powers)], whole.derivative))
+    size = np.maximum(np.einsum("pn,pn->p", jacobian, jacobian), 1e-300)
+    told = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
+    middle = int(np.searchsorted(told, 0.5 * told[-1]))
+    least = max(_FEWEST, 4 * whole.parameters)
+    if min(middle, problem.time.size - middle) < least:
+        return ()
+    scale = float(np.ptp(record.measurement))
+    gain = whole.coefficients[: len(structure.powers)]
+    parts = []
+    for chosen in (slice(None, middle), slice(middle, None)):
+        part = problem.part(chosen)
+        models = _allowed(part, gain, theta, scale)
+        if models:
+            parts.append(Part(float(part.time[0]), float(part.time[-1]), models))
+    return tuple(parts)
+
+
+def _problem(found: Identification, record: Record, structure: Structure) -> Problem:
+    """Return the samples that were fitted, thinned, with what is not known of their beginning."""
+    y = (record.measurement - record.measurement[0]) / float(np.ptp(record.measurement))
+    problem = problem_of([(record.time, y, record.drive())], structure)
+    problem = problem.part(np.isfinite(found.fitted)).thinned(_MOST_SAMPLES)
+    # The free state of an integrator is the offset; a command off its balance is a drift.
+    return replace(
+        problem, relaxation=bool(structure.factors), drift=structure.integrators > 0
+    )
+
+
+def _allowed(
+    problem: Problem, gain: FloatArray, theta: FloatArray, scale: float
+) -> tuple[TransferFunction, ...]:
+    """Draw models from those that some samples allow beside a model that is known.
+
+    :param problem: the samples.
+    :param gain: coefficients of the known model's numerator, shape (k,).
+    :param theta: of the known model, shape (m,).
+    :param scale: of the measurement in the problem [y].
+    """
+    structure = problem.structure
+    known = np.concatenate((gain, theta))
+    units = unit_steps(structure, theta)
+    slow = float(units[-1])
+    weak = _GAIN * np.abs(gain[0]) * slow ** np.arange(gain.size)
+    deviation = np.concatenate((weak, np.full(theta.size - 1, _TIMES), [_DEAD_TIME * slow]))
+    if not np.all(deviation > 0.0):
+        return ()
+    precision = 1.0 / deviation**2
+    at = known
+    left, jacobian = _linearised(problem, at, gain.size)
+    variance = max(float(left @ left) / left.size, NEGLIGIBLE**2)
+    cost = float(left @ left) / variance
+    for _ in range(_STEPS):
+        normal = jacobian @ jacobian.T / variance + np.diag(precision)
+        step = np.linalg.solve(
+            normal, jacobian @ left / variance - precision * (at - known)
+        )
+        for _ in range(_HALVINGS):
+            trial = _bounded(at + step)
+            new, slopes = _linearised(problem, trial, gain.size)
+            away = precision @ (trial - known) ** 2
+            now = float(new @ new) / variance + float(away)
+            if now < cost:
+                break
+            step = 0.5 * step
+        else:
+            break
+        gained, at, left, jacobian = cost - now, trial, new, slopes
+        # Noise of this part, each sample by what it is worth beside its neighbours.
+        variance = max(float(left @ left) / left.size / worth(left), NEGLIGIBLE**2)
+        cost = float(left @ left) / variance + float(precision @ (at - known) ** 2)
+        if gained < _SETTLED * cost:
+            break
+    normal = jacobian @ jacobian.T / variance + np.diag(precision)
+    # In units of what is known beforehand, so that the root has no small numbers.
+    root = np.linalg.cholesky(np.linalg.inv(normal * np.outer(deviation, deviation)))
+    shifts = np.random.default_rng(0).standard_normal((_DRAWS, at.size))
+    models = []
+    for shift in np.concatenate((np.zeros((1, at.size)), shifts)):
+        drawn = _bounded(at + deviation * (root @ shift))
+        try:
+            model = structure.model_at(drawn[gain.size :], scale * drawn[: gain.size])
+        except ModelError:
+            model = None
+        if model is not None:
+            models.append(model)
+    return tuple(models)
+
+
+def _bounded(point: FloatArray) -> FloatArray:
+    """Return a point with a dead time that is not negative, and finite times."""
+    point = np.clip(point, -1e12, 1e12)
+    point[-1] = max(float(point[-1]), 0.0)
+    return point
+
+
+def _linearised(
+    problem: Problem, point: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a model leaves beside offset and initial state, and its derivatives.
+
+    :param problem: the samples.
+    :param point: coefficients of the numerator, then theta.
+    :param count: of these coefficients.
+    :return: shapes (n,) and (p, n), both without what the nuisances explain.
+    """
+    gain = point[:count]
+    theta = np.concatenate((np.clip(point[count:-1], -_FARTHEST, _FARTHEST), point[-1:]))
+    columns, derivatives = problem.columns(theta)
+    own, beside = columns[:count], columns[count:]
+    basis, _ = np.linalg.qr(beside.T)
+    by_theta = np.einsum("k,mkn->mn", gain, derivatives[:, :count])
+    rows = np.concatenate(((problem.y - gain @ own)[None, :], own, by_theta))
+    rows = rows - (rows @ basis) @ basis.T
+    return rows[0], rows[1:]
+
+
+def plain_models(found: Identification, record: Record) -> tuple[TransferFunction, ...]:
+    """Return the plain models that explain a record as well as the one that was chosen.
+
+    They are a lag and two lags with dead time, fitted to all samples by simulation with an unknown
+    offset and initial state. Samples count by what they are worth beside their neighbours, so that
+    in noise with a colour, or where no structure is true, less than a visible difference decides
+    nothing.
+
+    :param found: a fit to the samples.
+    :param record: what was fitted.
+    """
+    every = _problem(found, record, FOPDT)
+    scale = float(np.ptp(record.measurement))
+    left = (record.measurement - found.fitted)[every.index] / scale
+    if left.size < _FEWEST:
+        return ()
+    n, each = left.size, worth(left)
+    floor = n * NEGLIGIBLE**2
+    own = information_criterion(float(left @ left), n, len(found.parameters) + 1, floor, each)
+    first = refine_best(every, start_fopdt(every), tolerance=_TRIAL)
+    second = replace(every, structure=SOPDT)
+    fits = [(every, first)]
+    if found.structure not in (FOPDT.name, SOPDT.name):
+        fits.append((second, refine_best(second, Starts(every, first).sopdt(), tolerance=_TRIAL)))
+    models = []
+    for problem, state in fits:
+        other = information_criterion(state.cost, n, state.parameters, floor, each)
+        model = problem.structure.model_at(state.theta, state.coefficients * scale)
+        if model is None or other > own + _AS_GOOD:
+            continue
+        interval = record.duration / max(len(record) - 1, 1)
+        if not is_unseen(model, interval, record.duration):
+            models.append(model)
+    return tuple(models)
+
+
+def other_sign(models: Sequence[TransferFunction], sign: int) -> float:
+    """Return the share of models whose process has not this sign.
+
+    :param models: at least one.
+    :param sign: 1 or -1.
+    """
+    return sum(m.process_sign != sign for m in models) / len(models)
+
