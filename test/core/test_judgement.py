@@ -9,14 +9,20 @@ import pytest
 from report_cases import completed
 
 from relay_autotune.analysis import analyse, analyse_alone
-from relay_autotune.identification import Estimate, identify
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.identification import Estimate, Known, identify
+from relay_autotune.identification.judgement.checks import lost_effect
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
+from relay_autotune.identification.judgement.refits import halves, plain_models
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.judgement.visible import visible_error
+from relay_autotune.identification.waveform.theta import theta_of
 from relay_autotune.loop.analysis import ms_on
+from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import GivenModel
+from relay_autotune.process.structures import GivenModel, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict, judge
 
@@ -118,3 +124,184 @@ def test_a_record_that_is_mostly_another_input_is_doubtful():
     other = np.cumsum(np.random.default_rng(8).normal(0.0, 0.35, len(record)))
     found = analyse_alone(replace(record, measurement=record.measurement + other))
     assert found.verdict is not Verdict.TRUSTED
+
+
+# Parts of a record, plain models, long times, and commands without effect.
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("fopdt", (2.0, 10.0, 3.0)),
+        ("sopdt", (2.0, 10.0, 4.0, 3.0)),
+        ("sopdt_zero", (2.0, 10.0, 4.0, -1.5, 3.0)),
+        ("three_lags", (2.0, 10.0, 4.0, 1.0, 3.0)),
+        ("ipdt", (2.0, 3.0)),
+        ("integrator_lag", (2.0, 10.0, 3.0)),
+    ],
+)
+def test_theta_of_a_models_values_is_read_as_these_values(name, values):
+    structure = structure_named(name)
+    assert len(structure.names) == len(values)
+    by_name = dict(zip(structure.names, values, strict=True))
+    theta = theta_of(structure, np.array(values))
+    gain = by_name["gain"]
+    _, read = structure.read(theta, np.array((gain, gain * by_name.get("zero", 0.0))))
+    np.testing.assert_allclose(read, values, rtol=1e-12)
+
+
+def joined(first, second, *, noise=0.02):
+    """Record a process that becomes another one at 320 s, where all is at rest."""
+    u = steps(first).held_input
+    late = PiecewiseConstant(u.times + 320.0, u.values, 0.0)
+    u = PiecewiseConstant(
+        np.concatenate((u.times, [200.0], late.times)),
+        np.concatenate((u.values, [0.0], late.values)),
+        0.0,
+    )
+    time = np.arange(0.0, 520.0, 0.25)
+    early = np.where(time < 320.0, response(first, time, u), 0.0)
+    y = early + response(second, time, late)
+    y = y + np.random.default_rng(6).normal(0.0, noise, time.size)
+    return Record(time=time, measurement=y, command=u(time), held_input=u)
+
+
+def fitted_as(model, record):
+    """Return what was identified with a FOPDT's parameters in the place of those found."""
+    found = identify(record, "waveform", Known(structure="fopdt"))
+    values = np.array((model.gain, model.time_constants[0].real, model.dead_time))
+    return replace(found, estimate=replace(found.estimate, values=values))
+
+
+def of_checks(record, found, gains, **more):
+    loop = Loop(gains, lambda m: ms_on(gains, m), gains.ms, gains.ms_95)
+    evidence = Evidence(record, found, loop=loop, **more)
+    return {f.name: f for f in judge(CHECKS, evidence)}
+
+
+def test_each_half_of_a_record_tells_its_own_process():
+    other = TransferFunction.fopdt(6.0, 10.0, 6.0)
+    record = joined(PROCESS, other)
+    early, late = halves(fitted_as(PROCESS, record), record)
+    for part, process in ((early, PROCESS), (late, other)):
+        for value, truth in (
+            ([m.gain for m in part.models], process.gain),
+            ([m.dead_time for m in part.models], process.dead_time),
+        ):
+            assert np.median(value) == pytest.approx(truth, rel=0.1)
+
+
+def test_gains_that_do_not_hold_on_one_half_are_doubtful(gains):
+    other = TransferFunction.fopdt(6.0, 10.0, 6.0)
+    assert ms_on(gains, other) == np.inf
+    record = joined(PROCESS, other)
+    found = of_checks(record, fitted_as(PROCESS, record), gains)["halves"]
+    assert found.result is Result.DOUBTFUL
+    same = joined(PROCESS, PROCESS)
+    found = of_checks(same, fitted_as(PROCESS, same), gains)["halves"]
+    assert found.value == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_half_that_works_in_the_other_direction_gives_no_gains(gains):
+    record = joined(PROCESS, TransferFunction.fopdt(-2.0, 10.0, 3.0))
+    found = of_checks(record, fitted_as(PROCESS, record), gains)["halves_direction"]
+    assert found.value == 1.0
+    assert found.result is Result.FAILED
+    same = joined(PROCESS, PROCESS)
+    assert of_checks(same, fitted_as(PROCESS, same), gains)["halves_direction"].value == 0.0
+
+
+def test_a_half_that_shows_nothing_objects_to_nothing(gains):
+    # The noise of the first half is two hundred times that of the other.
+    record = joined(PROCESS, PROCESS)
+    noise = np.random.default_rng(9).normal(0.0, 4.0, len(record))
+    noisy = replace(record, measurement=record.measurement + np.where(record.time < 260, noise, 0))
+    found = of_checks(noisy, fitted_as(PROCESS, noisy), gains)
+    assert found["halves"].result is Result.PASSED
+    assert found["halves_direction"].result is Result.PASSED
+
+
+def test_a_plain_model_that_explains_as_much_speaks_against_gains_of_another(record, gains):
+    weak = TransferFunction.fopdt(0.4, 10.0, 3.0)
+    strong = analyse_alone(steps(weak)).best_gains
+    truth = ms_on(strong, PROCESS) / strong.ms
+    found = of_checks(record, fitted_as(weak, record), strong)["plain"]
+    assert truth > 2.5
+    assert (found.value, found.result) == (pytest.approx(truth, rel=0.1), Result.DOUBTFUL)
+    assert of_checks(record, fitted_as(PROCESS, record), gains)["plain"].value == pytest.approx(
+        1.0, abs=0.05
+    )
+
+
+def test_a_plain_model_that_explains_less_is_not_asked():
+    # Two equal lags and a zero in the right half plane: a lag with dead time leaves a tenth.
+    inverse = TransferFunction(2.0, (-6.0,), (6.0, 6.0), 0, 1.0)
+    record = steps(inverse, noise=0.005)
+    assert plain_models(identify(record, "waveform"), record) == ()
+
+
+@pytest.mark.parametrize(
+    ("times", "spread", "result"),
+    [(0.5, 1.0, Result.PASSED), (3.0, 1.0, Result.DOUBTFUL), (30.0, 1.0, Result.FAILED)],
+)
+def test_a_time_beyond_the_record_counts_where_k_u_is_not_known(
+    record, gains, times, spread, result
+):
+    slow = TransferFunction.fopdt(2.0 * times, times * record.duration, 3.0)
+    found = fitted_as(slow, record)
+    open_gain = replace(found, ultimate_gain_std=spread * abs(found.ultimate_gain))
+    assert of_checks(record, open_gain, gains)["beyond_record"].result is result
+    known = replace(found, ultimate_gain_std=0.05 * abs(found.ultimate_gain))
+    assert "beyond_record" not in of_checks(record, known, gains)
+
+
+LEVELS = PiecewiseConstant(
+    np.array([20.0, 60.0, 100.0, 140.0, 180.0]), np.array([1.0, 3.0, 0.5, 2.0, 0.0]), 0.0
+)
+
+
+def clipped_steps(end):
+    """Record steps on a process whose actuator ends at a level."""
+    time = np.arange(0.0, 240.0, 0.25)
+    acting = PiecewiseConstant(LEVELS.times, np.minimum(LEVELS.values, end), 0.0)
+    y = response(PROCESS, time, acting)
+    y = y + np.random.default_rng(1).normal(0.0, 0.02, time.size)
+    return Record(time=time, measurement=y, command=LEVELS(time), held_input=LEVELS)
+
+
+def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
+    # 1.5 is half of the range, which is one of the levels that are tried.
+    loss, level = lost_effect(clipped_steps(1.5), PROCESS)
+    assert loss == pytest.approx(1.0, abs=0.05)
+    assert level == 1.5
+    loss, _ = lost_effect(clipped_steps(9.0), PROCESS)
+    assert loss < 0.05
+    # Between two levels alone there is nothing to compare.
+    two = PiecewiseConstant(np.array([20.0, 80.0]), np.array([1.0, 0.0]), 0.0)
+    assert lost_effect(replace(clipped_steps(9.0), held_input=two), PROCESS) is None
+
+
+def test_gains_from_a_clipped_actuator_are_not_trusted():
+    assert analyse_alone(clipped_steps(9.0)).verdict is Verdict.TRUSTED
+    assert analyse_alone(clipped_steps(0.7)).verdict is not Verdict.TRUSTED
+    assert analyse_alone(clipped_steps(1.5)).verdict is not Verdict.TRUSTED
+
+
+def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
+    process = TransferFunction.fopdt(1.0, 8.0, 3.0)
+    plant = VirtualProcess(
+        process,
+        actuator=Actuator(0.0, minimum=0.0, maximum=5.0),
+        disturbances=Disturbances(noise_std=0.02),
+        seed=0,
+    )
+    asked = ExperimentParameters(setpoint=0.0, amplitude=100.0, max_cycles=4)
+    tune = RelayExperiment(asked, 0.0)
+    for k in range(2000):
+        plant.command(tune.step(0.5 * k, plant.measure(0.5 * k)))
+        if tune.finished:
+            break
+    found = analyse_alone(tune.record())
+    assert found.verdict is not Verdict.TRUSTED
+    clipped = {f.name: f for f in found.judgement.findings}["clipped"]
+    assert clipped.result is not Result.PASSED

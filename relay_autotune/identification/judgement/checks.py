@@ -106,7 +106,9 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
             response(
                 model,
                 part.time,
-                PiecewiseConstant(u.times, keep(u.values - level, 0.0), keep(u.initial - level, 0)),
+                PiecewiseConstant(
+                    u.times, keep(u.values - level, 0.0), keep(u.initial - level, 0)
+                ),
             )
             for keep in (np.maximum, np.minimum)
         ]

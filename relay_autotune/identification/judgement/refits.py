@@ -8,7 +8,6 @@ part that tells nothing has models all around that of the whole, and objects to 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -101,9 +100,7 @@ def _problem(found: Identification, record: Record, structure: Structure) -> Pro
     problem = problem_of([(record.time, y, record.drive())], structure)
     problem = problem.part(np.isfinite(found.fitted)).thinned(_MOST_SAMPLES)
     # The free state of an integrator is the offset; a command off its balance is a drift.
-    return replace(
-        problem, relaxation=bool(structure.factors), drift=structure.integrators > 0
-    )
+    return replace(problem, relaxation=bool(structure.factors), drift=structure.integrators > 0)
 
 
 def _allowed(
@@ -131,9 +128,7 @@ def _allowed(
     cost = float(left @ left) / variance
     for _ in range(_STEPS):
         normal = jacobian @ jacobian.T / variance + np.diag(precision)
-        step = np.linalg.solve(
-            normal, jacobian @ left / variance - precision * (at - known)
-        )
+        step = np.linalg.solve(normal, jacobian @ left / variance - precision * (at - known))
         for _ in range(_HALVINGS):
             trial = _bounded(at + step)
             new, slopes = _linearised(problem, trial, gain.size)
@@ -173,9 +168,7 @@ def _bounded(point: FloatArray) -> FloatArray:
     return point
 
 
-def _linearised(
-    problem: Problem, point: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
+def _linearised(problem: Problem, point: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Return what a model leaves beside offset and initial state, and its derivatives.
 
     :param problem: the samples.
@@ -220,7 +213,9 @@ def plain_models(found: Identification, record: Record) -> tuple[TransferFunctio
         fits.append((second, refine_best(second, Starts(every, first).sopdt(), tolerance=_TRIAL)))
     models = []
     for problem, state in fits:
-        other = information_criterion(state.cost, n, state.parameters, floor, each)
+        # The unknown state before the record is no merit and no fault of a model.
+        parameters = len(problem.structure.names) + 1
+        other = information_criterion(state.cost, n, parameters, floor, each)
         model = problem.structure.model_at(state.theta, state.coefficients * scale)
         if model is None or other > own + _AS_GOOD:
             continue
@@ -237,4 +232,3 @@ def other_sign(models: Sequence[TransferFunction], sign: int) -> float:
     :param sign: 1 or -1.
     """
     return sum(m.process_sign != sign for m in models) / len(models)
-

@@ -140,9 +140,7 @@ def _plain(evidence: Evidence) -> Measured | None:
     loop, sign = evidence.loop, evidence.found.model.process_sign
     if loop is None or not evidence.plain:
         return None
-    found = [
-        (loop.ms_on(m) if m.process_sign == sign else math.inf, m) for m in evidence.plain
-    ]
+    found = [(loop.ms_on(m) if m.process_sign == sign else math.inf, m) for m in evidence.plain]
     ms, model = max(found, key=lambda pair: pair[0])
     return Measured(ms / loop.ms, process_text(model))
 
@@ -150,7 +148,9 @@ def _plain(evidence: Evidence) -> Measured | None:
 def _beyond(evidence: Evidence) -> Measured | None:
     found = evidence.found
     half = NORMAL_95 * found.ultimate_gain_std / abs(found.ultimate_gain)
-    longest = max((abs(t) for t in (*found.model.time_constants, found.model.dead_time)), default=0)
+    longest = max(
+        (abs(t) for t in (*found.model.time_constants, found.model.dead_time)), default=0
+    )
     # What the loop needs of a lag much longer than the record is its slope, which is in K_u.
     if half <= _KNOWN or not evidence.record.duration > 0.0:
         return None
@@ -256,8 +256,8 @@ MODEL_CHECKS = (
     Check(
         name="clipped",
         title="Clipping",
-        what="share of their effect that commands surely lose on one side of a level; above 1 they "
-        "act the other way there",
+        what="share of their effect that commands surely lose on one side of a level; above 1 "
+        "they act the other way there",
         unit="",
         doubtful=0.6,
         failed=1.0,
