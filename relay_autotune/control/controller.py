@@ -1,17 +1,16 @@
-r"""A PI or PID controller as it runs on a loop: from sample to sample, by hand or by itself.
+r"""A PI or PID controller as it runs on a loop: sample by sample, in manual or automatic.
 
 The law is that of :class:`~relay_autotune.loop.gains.Controller`, sample by sample as in
 :class:`~relay_autotune.loop.sampled.PidLaw`,
 
     u = kc (b r - yf + (1/ti) int (r - yf) dt - td dyf/dt),   yf = y/(1 + tf s + (tf s)^2/2),
 
-with the integral advanced by the backward rule and drawn back by what the limits cut off
-(back-calculation, Astrom and Hagglund 1995, section 3.5). Whatever is changed while it runs (the
-gains, the limits, from manual to automatic), the integral takes up the difference, so that the
-command goes on from where it was.
+with the integral advanced by the backward rule and limited by back-calculation (Astrom and
+Hagglund 1995, section 3.5). At any change (gains, limits, manual to automatic) the integral takes
+up the difference, so that the command has no bump.
 
 Numbers are bounded: gains by :class:`GainBounds`, measurement, set-point and command by
-`LARGEST_VALUE`, so that no product of them leaves the range of floating-point numbers.
+`LARGEST_VALUE`, so that no product of them overflows.
 """
 
 from __future__ import annotations
@@ -29,21 +28,21 @@ from relay_autotune.process.simulation import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import FloatArray
 
-# A measurement, set-point or command of a larger magnitude is the fault of whoever sent it [y, u].
+# A measurement, set-point or command of a larger magnitude is an error of its sender [y, u].
 LARGEST_VALUE = 1e12
 # No controller needs a larger gain [u/y] or a longer time [s].
 LARGEST_GAIN = 1e12
 LONGEST_TIME = 1e9
 
-# A sample interval within this part of the nominal one uses the filter of that one.
+# A sample interval that differs by at most this part from the nominal one uses its filter.
 _JITTER = 0.2
-# An interval longer than so many nominal ones is a gap: the integral does not run on through it.
+# An interval longer than this many nominal ones is a gap; the integral does not run through it.
 _LONGEST_INTERVAL = 5.0
 
 
 @dataclass(frozen=True)
 class GainBounds:
-    """What gains may be put in force.
+    """Bounds for new gains.
 
     :param kc_max: largest magnitude of the proportional gain [u/y].
     :param ti_min: shortest integral time [s]; no integral action (0) is always allowed.
@@ -74,7 +73,7 @@ class GainBounds:
 
 
 def is_usable(value: float) -> bool:
-    """Return True if a measurement, set-point or command is a number that can be [y, u].
+    """Return True if a measurement, set-point or command is a possible value [y, u].
 
     :param value: the number.
     """
@@ -86,10 +85,10 @@ class PidController:
     """Answer each measurement with a command.
 
     :param gains: the controller; None: it only holds its command.
-    :param command: command from which it starts [u].
+    :param command: first command [u].
     :param limits: range of the command.
     :param automatic: False: it starts in manual.
-    :param usual_interval: an interval of samples that is no gap [s]; 0: the first one tells.
+    :param usual_interval: nominal interval of the samples [s]; 0: the first interval.
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class PidController:
         return self._automatic and self._gains is not None
 
     def use(self, gains: Controller | None) -> None:
-        """Take other gains without a bump.
+        """Change the gains without a bump.
 
         :param gains: the gains; None: hold the command.
         """
@@ -137,7 +136,7 @@ class PidController:
         self._align = True
 
     def limit(self, limits: Limits) -> None:
-        """Take other limits.
+        """Change the limits.
 
         :param limits: range of the command.
         """
@@ -150,9 +149,9 @@ class PidController:
         self._align = True
 
     def track(self, command: float) -> None:
-        """Take over what somebody else commands, to go on from there [u].
+        """Track the command of another controller, to continue from there [u].
 
-        :param command: one that is not finite, or beyond `LARGEST_VALUE`, is passed over.
+        :param command: ignored if it is not finite, or beyond `LARGEST_VALUE`.
         """
         if is_usable(command):
             self._command = self._limits.clip(command)
@@ -163,8 +162,8 @@ class PidController:
 
         :param time: of the sample [s], not decreasing.
         :param setpoint: [y].
-        :param measurement: [y]; one that is not finite, or beyond `LARGEST_VALUE`, is passed
-            over, as is a set-point.
+        :param measurement: [y]; ignored, like a set-point, if it is not finite, or beyond
+            `LARGEST_VALUE`.
         """
         if not (is_usable(measurement) and is_usable(setpoint)):
             return self._command
@@ -175,7 +174,7 @@ class PidController:
             return self._command
         law = self._heard(gains, interval, measurement)
         if self._align or not self._automatic:
-            # The integral is what makes the command go on from where it is.
+            # Set the integral so that the command continues from its present value.
             law.integral = self._command - law.proportional(gains, setpoint)
             self._align = False
             return self._command
@@ -185,12 +184,12 @@ class PidController:
         if is_usable(command):
             self._command = command
         else:
-            # Nothing that the law has in memory can be trusted: it begins anew at this command.
+            # The law's memory is no longer valid, so start again from this command.
             self._law, self._align = None, True
         return self._command
 
     def _heard(self, gains: Controller, interval: float, measurement: float) -> PidLaw:
-        """Take a measurement over an interval that may be another one each time."""
+        """Pass a measurement to the filter, over an interval that may vary."""
         law = self._law
         if law is None:
             self._law = law = PidLaw(measurement, self._command)
@@ -216,7 +215,7 @@ def run_loop(
     load: float = 0.0,
     limits: Limits = UNLIMITED,
 ) -> ClosedLoop:
-    """Run the controller on the exact process, which rests, from a step of set-point and load on.
+    """Simulate the controller on the exact process, from rest, after steps of set-point and load.
 
     :param gains: the controller.
     :param model: the process.
@@ -243,6 +242,6 @@ def scaled(model: TransferFunction, factor: float) -> TransferFunction:
     """Return a model with another gain.
 
     :param model: the process.
-    :param factor: on its gain.
+    :param factor: factor on its gain.
     """
     return replace(model, gain=factor * model.gain)

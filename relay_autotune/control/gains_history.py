@@ -1,12 +1,12 @@
-"""Which gains are in force, which were before, and which of them were proven or failed.
+"""The history of a controller's gains: in force, earlier, proven, failed.
 
-A :class:`GainsHistory` is immutable: each event returns the next one, or is refused. What holds
-whatever happens:
+A :class:`GainsHistory` is immutable: each event returns the next history, or is refused. It
+guarantees:
 
 - gains that failed a verification are never in force again;
-- going back leads to a whole set that was in force, never to half of a change;
-- after an interruption the newest gains are in force that can be trusted: those that were proven,
-  or given by the configuration.
+- a revert leads to a whole set that was in force, never to half of a change;
+- after an interruption the newest trusted gains are in force: proven ones, or those of the
+  configuration.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from enum import Enum
 
 from relay_autotune.errors import TuningError
 
-# So many sets before the present one are kept, and so many failed ones are known.
+# Number of earlier sets, and of failed sets, that are kept.
 _KEPT = 20
 _KNOWN = 1000
-# Numbers that differ by less, relatively, are the same.
+# Numbers with a smaller relative difference are equal.
 _EQUAL = 1e-9
 
 
 class HistoryError(TuningError):
-    """A change of the gains that is refused."""
+    """A change of the gains is refused."""
 
 
 class Standing(Enum):
-    """What is known of gains."""
+    """How far gains can be trusted."""
 
     GIVEN = "given"
-    """The configuration gives them, or the other node had them by itself."""
+    """From the configuration, or from the other node's own parameters."""
     EDITED = "edited"
-    """Set by hand, one number after the other: perhaps half of a change."""
+    """Set by hand, one number after the other, so possibly half of a change."""
     APPLIED = "applied"
-    """A whole set that was not proven."""
+    """A whole set without a verification."""
     PROVEN = "proven"
-    """They passed a verification."""
+    """Passed a verification."""
 
 
 class Work(Enum):
-    """What is being done with the gains."""
+    """The operation in progress."""
 
     NOTHING = "nothing"
     APPLY = "apply"
@@ -55,7 +55,7 @@ class GainSet:
     """All numbers of a controller by their names.
 
     :param values: pairs of name and value, in the order of the names.
-    :raises TuningError: if one is not finite.
+    :raises TuningError: if a value is not finite.
     """
 
     values: tuple[tuple[str, float], ...]
@@ -70,7 +70,7 @@ class GainSet:
         """Return a set of gains.
 
         :param values: the numbers by name.
-        :raises TuningError: if one is not finite.
+        :raises TuningError: if a number is not finite.
         """
         return cls(tuple(sorted((name, float(value)) for name, value in values.items())))
 
@@ -79,14 +79,14 @@ class GainSet:
         return dict(self.values)
 
     def is_near(self, other: GainSet) -> bool:
-        """Return True if another set has the same numbers, but for rounding."""
+        """Return True if another set has the same numbers within rounding."""
         theirs = other.by_name()
         return theirs.keys() == self.by_name().keys() and all(
             math.isclose(value, theirs[name], rel_tol=_EQUAL) for name, value in self.values
         )
 
     def is_mixture(self, one: GainSet, other: GainSet) -> bool:
-        """Return True if each number is that of one of two sets."""
+        """Return True if each number comes from one of two sets."""
         first, second = one.by_name(), other.by_name()
         return all(
             any(
@@ -101,7 +101,7 @@ class GainSet:
 
 @dataclass(frozen=True)
 class Entry:
-    """Gains, and what is known of them."""
+    """Gains with their standing."""
 
     gains: GainSet
     standing: Standing
@@ -112,7 +112,7 @@ class Entry:
         return self.standing in (Standing.GIVEN, Standing.PROVEN)
 
     def whole(self) -> Entry:
-        """Return the entry once something else follows, so that the change by hand is over."""
+        """Return the entry as a whole set, once a later event has ended the change by hand."""
         return Entry(self.gains, Standing.APPLIED) if self.standing is Standing.EDITED else self
 
 
@@ -120,12 +120,12 @@ class Entry:
 class GainsHistory:
     """The gains of one controller.
 
-    :param given: gains of the configuration; None: it gives none.
-    :param in_force: the present ones; None: the command is held.
-    :param before: those that were in force before, the newest last; none of them failed.
-    :param failed: those that failed a verification.
-    :param doubtful: those whose verification was cut short with the process.
-    :param work: what is being done.
+    :param given: gains of the configuration; None: not configured.
+    :param in_force: the present gains; None: the command is held.
+    :param before: earlier gains in force, without failed ones, the newest last.
+    :param failed: gains that failed a verification.
+    :param doubtful: gains whose verification was interrupted by the end of the process.
+    :param work: the operation in progress.
     """
 
     given: GainSet | None = None
@@ -159,9 +159,9 @@ class GainsHistory:
             raise HistoryError(f"these gains failed their verification: {gains}; tune again")
 
     def apply(self, gains: GainSet) -> GainsHistory:
-        """Begin to put a whole set in force; :meth:`settled` ends it.
+        """Begin to apply a whole set; :meth:`settled` ends it.
 
-        :raises HistoryError: if it failed a verification, or something else is being done.
+        :raises HistoryError: if it failed a verification, or another operation is in progress.
         """
         self._require_rest()
         self.require_not_failed(gains)
@@ -170,7 +170,7 @@ class GainsHistory:
         return replace(self._with(Entry(gains, Standing.APPLIED)), work=Work.APPLY)
 
     def edit(self, gains: GainSet | None) -> GainsHistory:
-        """Take what was set by hand, which may be half of a change.
+        """Take gains that were set by hand, which may be half of a change.
 
         :param gains: None: no gains, the command is held.
         :raises HistoryError: as :meth:`apply`.
@@ -184,14 +184,14 @@ class GainsHistory:
         return self._with(Entry(gains, Standing.EDITED))
 
     def observe(self, gains: GainSet) -> GainsHistory:
-        """Take what another node turns out to have in force, by itself or by another's hand."""
+        """Take the gains found in another node, whoever set them."""
         if self.in_force is not None and gains.is_near(self.in_force.gains):
             return self
         standing = Standing.APPLIED if gains in self.failed else Standing.GIVEN
         return self._with(Entry(gains, standing))
 
     def settled(self) -> GainsHistory:
-        """Return the history once what was being done has ended without a verdict."""
+        """Return the history after the operation has ended without a verdict."""
         return replace(self, work=Work.NOTHING)
 
     # Going back.
@@ -199,7 +199,7 @@ class GainsHistory:
     def revert(self) -> GainsHistory:
         """Go back to the whole set that was in force before the present gains.
 
-        :raises HistoryError: if there is none, or something else is being done.
+        :raises HistoryError: if there is no such set, or another operation is in progress.
         """
         self._require_rest()
         state = self._back()
@@ -212,7 +212,7 @@ class GainsHistory:
     def verify(self) -> GainsHistory:
         """Begin to verify the gains in force.
 
-        :raises HistoryError: if there are none, or something else is being done.
+        :raises HistoryError: if no gains are in force, or another operation is in progress.
         """
         self._require_rest()
         if self.in_force is None:
@@ -220,7 +220,7 @@ class GainsHistory:
         return replace(self, in_force=self.in_force.whole(), work=Work.VERIFY)
 
     def passed(self) -> GainsHistory:
-        """Return the history once the gains in force have passed."""
+        """Return the history after the gains in force have passed."""
         assert self.in_force is not None
         gains = self.in_force.gains
         return replace(
@@ -231,7 +231,7 @@ class GainsHistory:
         )
 
     def fail(self) -> GainsHistory:
-        """Return the history once the gains in force have failed: those before are, or none."""
+        """Return the history after the gains in force have failed: the earlier ones, or none."""
         assert self.in_force is not None
         gains = self.in_force.gains
         state = replace(
@@ -244,13 +244,13 @@ class GainsHistory:
     # After an interruption.
 
     def is_open_to(self, gains: GainSet) -> bool:
-        """Return True if gains may be put in force without anybody asking for it."""
+        """Return True if gains may be applied automatically."""
         return gains not in self.failed and gains not in self.doubtful
 
     def after_interruption(self) -> GainsHistory:
-        """Return the history after the process ended, while the gains stayed where they were.
+        """Return the history after the process ended, while the gains stayed in the other node.
 
-        What had been done to the end stays; what was being done is undone.
+        Completed operations stay; an operation in progress is undone.
         """
         if self.work is Work.NOTHING:
             return self
@@ -261,10 +261,10 @@ class GainsHistory:
         return state._trusted().settled()
 
     def after_restart(self, given: GainSet | None) -> GainsHistory:
-        """Return the history of a controller that starts again and has nothing in force yet.
+        """Return the history of a controller that restarts with no gains in force yet.
 
-        :param given: gains of its configuration; those of a changed configuration count more than
-            what was proven before, unless they failed.
+        :param given: gains of its configuration; if the configuration has changed, they take
+            precedence over proven gains, unless they failed.
         """
         state = self.after_interruption()._trusted()
         if given == self.given:
@@ -274,7 +274,7 @@ class GainsHistory:
             return state._with(None)
         return state if given in self.failed else state._with(Entry(given, Standing.GIVEN))
 
-    # Within.
+    # Helpers.
 
     def _require_rest(self) -> None:
         if self.work is Work.VERIFY:
@@ -283,7 +283,7 @@ class GainsHistory:
             raise HistoryError("gains are being put in force; wait for the end of that")
 
     def _with(self, entry: Entry | None) -> GainsHistory:
-        """Put other gains in force, and keep the present ones if they are a whole set."""
+        """Put new gains in force, and keep the present ones if they are a whole set."""
         old = self.in_force
         edited = entry is not None and entry.standing is Standing.EDITED
         half = old is not None and old.standing is Standing.EDITED and (edited or entry is None)
@@ -291,21 +291,21 @@ class GainsHistory:
         if old is not None and not half and old.gains not in self.failed:
             before = (*before, old.whole())
         if len(before) > _KEPT:
-            # The oldest goes, but the newest that can be trusted stays.
+            # Drop the oldest, but keep the newest trusted set.
             trusted = max((k for k, e in enumerate(before) if e.is_trusted), default=-1)
             drop = 1 if trusted == 0 else 0
             before = before[:drop] + before[drop + 1 :]
         return replace(self, in_force=entry, before=before)
 
     def _back(self) -> GainsHistory:
-        """Put the newest other set before the present one in force."""
+        """Put the newest earlier set that differs from the present one in force."""
         for k in range(len(self.before) - 1, -1, -1):
             if self.before[k].gains != self.gains:
                 return replace(self, in_force=self.before[k], before=self.before[:k])
         return replace(self, in_force=None, before=())
 
     def _trusted(self) -> GainsHistory:
-        """Put the newest set in force that can be trusted, or none."""
+        """Put the newest trusted set in force, or none."""
         chain = (*self.before, *((self.in_force,) if self.in_force else ()))
         for k in range(len(chain) - 1, -1, -1):
             if chain[k].is_trusted and chain[k].gains not in self.failed:

@@ -1,4 +1,4 @@
-"""Try gains with a step, and compare with what the model predicts for the same step."""
+"""Verify gains with a step: compare it with the model's prediction of the same step."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from relay_autotune.record.record import FloatArray
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05
-# A step is watched for so many times the predicted settling time, and for so many samples.
+# A step lasts for a multiple of the predicted settling time, and for a least number of samples.
 WATCHED = 1.6
 LEAST_SAMPLES = 30
 
-# What may differ from the prediction: a difference of overshoot, a ratio of settling times and of
-# IAE, a gain, and a peak of sensitivity.
+# Tolerances against the prediction: difference of overshoot, ratio of settling times, ratio of
+# IAE, gain, peak of sensitivity.
 OVERSHOOT_MARGIN = 0.15
 SETTLING_RATIO = 2.0
 IAE_RATIO = 1.6
 GAIN_RANGE = (0.6, 1.7)
 MS_RATIO = 1.3
-# So many standard deviations of the noise are left out of each comparison.
+# Allowance for noise in each comparison, in standard deviations.
 _NOISE = 3.0
-# A deviation so many times larger than the prediction's largest ends the step at once.
+# A deviation this many times the largest predicted one ends the step at once.
 RUNAWAY = 3.0
 
 _GAIN_SEARCH = (0.3, 3.0)
@@ -53,13 +53,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Response:
-    """What a response to a step was like.
+    """Features of a response to a step.
 
     :param overshoot: of a set-point step, beyond it, as a fraction; of a load step, the largest
         deviation to the other side, as a fraction of the largest.
-    :param settling_time: after it the error stays within 5 % of its largest [s].
+    :param settling_time: time until the error stays within 5 % of its largest value [s].
     :param iae: integral of the absolute error [y s].
-    :param largest: the largest deviation from where it began [y].
+    :param largest: largest deviation from the start [y].
     """
 
     overshoot: float
@@ -70,18 +70,18 @@ class Response:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A measured step beside the predicted one.
+    """Comparison of a measured step with the predicted one.
 
     :param step: the step.
     :param passed: True if every comparison is within its tolerance.
-    :param reason: what was compared, with numbers.
+    :param reason: the problems, and the compared numbers.
     :param measured: the measured response.
     :param expected: the predicted one.
     :param predicted: predicted deviation at each sample [y], shape (n,).
     :param fit: 1 - rms(difference)/rms(predicted about its mean).
-    :param gain_ratio: factor on the model's gain that fits best.
-    :param ms: largest sensitivity with that gain; NaN: the loop would be unstable.
-    :param ms_predicted: likewise with the model as identified.
+    :param gain_ratio: factor on the model's gain that fits the measured step best.
+    :param ms: Ms with that gain; NaN: the loop would be unstable.
+    :param ms_predicted: Ms with the identified model.
     """
 
     step: Step
@@ -98,11 +98,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Plan:
-    """How long a step is watched, and what would be too much.
+    """Duration of a step, and the deviation that stops it.
 
     :param step: the step.
-    :param duration: s.
-    :param runaway: deviation from rest that ends it at once [y].
+    :param duration: how long to observe it [s].
+    :param runaway: deviation from rest that ends the step at once [y].
     """
 
     step: Step
@@ -113,7 +113,7 @@ class Plan:
 def plan(
     gains: Controller, model: TransferFunction, step: Step, period: float, noise_std: float = 0.0
 ) -> Plan:
-    """Return how long a step has to be watched.
+    """Return how long a step must be observed, and when to stop it.
 
     :param gains: the controller.
     :param model: the process.
@@ -126,7 +126,7 @@ def plan(
         raise TuningError("these gains make an unstable loop with the model: nothing to verify")
     horizon = max(8.0 * (gains.ti + model.dead_time), LEAST_SAMPLES * period)
     for _ in range(_DOUBLINGS):
-        # A slow loop is predicted with fewer samples than it has.
+        # Predict a slow loop with fewer samples, to save time.
         interval = max(period, horizon / _PREDICTED_SAMPLES)
         time = np.arange(int(horizon / interval) + 2, dtype=np.float64) * interval
         run = run_loop(gains, model, time, setpoint=step.setpoint, load=step.load)
@@ -141,12 +141,12 @@ def plan(
 def describe(
     time: FloatArray, deviation: FloatArray, step: Step, noise_std: float = 0.0
 ) -> Response:
-    """Return what a response was like.
+    """Return the features of a response.
 
-    :param time: instants of the samples from the step on [s], shape (n,).
-    :param deviation: of the measurement from where it was before the step [y], shape (n,).
+    :param time: instants of the samples, the first at the step [s], shape (n,).
+    :param deviation: measurement minus its value before the step [y], shape (n,).
     :param step: the step.
-    :param noise_std: standard deviation of the noise, which is no error [y].
+    :param noise_std: standard deviation of the noise, which does not count as error [y].
     """
     error = step.setpoint - deviation
     allowed = _NOISE * noise_std
@@ -187,8 +187,8 @@ def compare(
     :param model: the process as identified.
     :param step: the step.
     :param time: instants of the samples, the first at the step [s], shape (n,).
-    :param deviation: of the measurement from where it was before the step [y], shape (n,).
-    :param limits: range of the command about where it was [u].
+    :param deviation: measurement minus its value before the step [y], shape (n,).
+    :param limits: range of the command, relative to its value before the step [u].
     :param noise_std: standard deviation of the measurement noise [y].
     """
 

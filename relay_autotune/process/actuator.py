@@ -1,4 +1,4 @@
-"""An actuator that does not do quite what it is told: limits, backlash and stiction."""
+"""An imperfect actuator: limits, backlash and stiction."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class Actuator:
        after a reversal it stays until the command has moved by the whole of it;
     3. stiction in the one-parameter form of Stenman, Gustafsson and Forsman (2003): the position
        sticks until the command is further away than ``stiction``, and then jumps to it;
-    4. ``falling_gain``: what the position is below ``initial`` counts that many times, as for a
-       process that heats fast and cools slowly.
+    4. ``falling_gain``: the distance of the position below ``initial`` is multiplied by this, as
+       for a process that heats fast and cools slowly.
 
     :param initial: position at the start [u].
     :param minimum: lower limit of the position [u]; -inf: none.
     :param maximum: upper limit of the position [u]; inf: none.
     :param dead_band: width of the play [u], >= 0.
     :param stiction: width of the band in which it sticks [u], >= 0.
-    :param falling_gain: factor on what the position is below ``initial``, > 0; 1: none.
+    :param falling_gain: factor on the position's distance below ``initial``, > 0; 1: no effect.
     :raises ParameterError: if the limits cross, or a width is negative or not finite.
     """
 
@@ -64,9 +64,9 @@ class Actuator:
         self.position = initial
 
     def move(self, command: float) -> float:
-        """Give a command and return what acts on the process then.
+        """Give a command and return the resulting input of the process [u].
 
-        :param command: [u]; one that is not finite is not followed.
+        :param command: [u]; ignored if it is not finite.
         """
         if not math.isfinite(command):
             return self.acting
@@ -80,6 +80,6 @@ class Actuator:
 
     @property
     def acting(self) -> float:
-        """What the position does to the process, as a position [u]."""
+        """Input of the process at the present position [u]."""
         below = min(self.position - self._initial, 0.0)
         return self.position + (self._falling_gain - 1.0) * below

@@ -1,4 +1,4 @@
-"""Factors of a denominator: poles, parameters, and the derivatives that a fit needs."""
+"""Factors of a denominator: poles, parameters, and the derivatives for a fit."""
 
 from __future__ import annotations
 
@@ -108,10 +108,10 @@ class UnstableLag:
 class Quadratic:
     """``1 + 2 zeta s/w0 + (s/w0)^2`` with the parameters log(1/w0) and log zeta.
 
-    One smooth parametrisation from underdamped to overdamped; where two lags merge into a pair
-    nothing happens.
+    The parameters are smooth from underdamped to overdamped, also where two lags merge into a
+    pair.
 
-    :param parameters: ``TWO_LAGS`` or ``PAIR``, as which it is reported.
+    :param parameters: ``TWO_LAGS`` or ``PAIR``: the form in which it is reported.
     """
 
     parameters: tuple[Parameter, Parameter] = TWO_LAGS
@@ -138,7 +138,7 @@ class Quadratic:
         """Return the two time constants, a conjugate pair where zeta < 1 [s]."""
         t, zeta = math.exp(theta[0]), math.exp(theta[1])
         if zeta >= 1.0:
-            # The larger one without cancellation, the smaller from their product.
+            # The larger one has no cancellation; the smaller one follows from their product.
             larger = t * (zeta + math.sqrt(zeta * zeta - 1.0))
             return [complex(larger), complex(t * t / larger)]
         root = math.sqrt(1.0 - zeta * zeta)
@@ -238,7 +238,7 @@ class Denominator:
 
 
 def _product(polynomials: Sequence[list[float]]) -> list[float]:
-    # Of two or three coefficients each, for which plain numbers are quicker than arrays.
+    # With two or three coefficients each, plain numbers are faster than arrays.
     product = [1.0]
     for polynomial in polynomials:
         longer = [0.0] * (len(product) + len(polynomial) - 1)

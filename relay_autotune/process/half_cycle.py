@@ -57,7 +57,7 @@ class HalfCycle:
         self._rates = modes.slope_weights(modes.weights(late @ after))
 
     def __call__(self, time: FloatArray) -> FloatArray:
-        """Return the output's deviation at any times after the switch.
+        """Return the output's deviation at times after the switch.
 
         :param time: s, shape (n,).
         :return: y, shape (n,).
@@ -65,7 +65,7 @@ class HalfCycle:
         return self._unfolded(time, *self._weights)
 
     def slope(self, time: FloatArray) -> FloatArray:
-        """Return the rate of the output at any times after the switch.
+        """Return the rate of the output at times after the switch.
 
         :param time: s, shape (n,).
         :return: y/s, shape (n,).
@@ -86,17 +86,17 @@ class HalfCycle:
         return np.asarray(np.where(turns % 2.0 == 0.0, y, -y))
 
     def multiplier(self) -> float:
-        r"""Return by what factor a deviation from the limit cycle shrinks in half a period.
+        r"""Return the factor by which a deviation from the limit cycle shrinks in half a period.
 
         A deviation of the state at a switch moves with the process and shifts the next switch,
         x -> (1 - xdot c'/(c' xdot)) Phi x. The eigenvalues of this map are the zeros of
 
             sum_k r_k lambda^-k,   r_k = c' Phi^k xdot,
 
-        where r_k is the rate that the output would have k half periods after the switch if the
-        relay switched no more: a polynomial of degree n - 1 in 1/lambda over
-        ``prod(1 - phi_i/lambda)``. That keeps its digits where the matrix of many equal lags
-        would not.
+        where r_k is the rate of the output k half periods after the switch if the relay did not
+        switch again. The sum is a polynomial of degree n - 1 in 1/lambda over
+        ``prod(1 - phi_i/lambda)``. This form is accurate also for many equal lags, whose matrix
+        is badly conditioned.
         """
         n = len(self._poles)
         if n < 2:

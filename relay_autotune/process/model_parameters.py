@@ -17,11 +17,11 @@ class Parameter:
 
     :param name: in results.
     :param unit: of its value; of a gain without integrators.
-    :param logarithmic: True: it cannot change sign, so that its logarithm is fitted, drawn, and
-        has the interval.
+    :param logarithmic: True: it cannot change sign, so its logarithm is fitted and drawn, and the
+        interval is that of the logarithm.
     :param least: smallest value.
-    :param field: where flags, messages and the parameters of plant_node carry it.
-    :param turned: True: it stands there with the other sign.
+    :param field: its name in flags, messages and the parameters of plant_node.
+    :param turned: True: the field has the opposite sign.
     """
 
     name: str
@@ -43,7 +43,7 @@ DAMPING = Parameter("damping", "", field="damping")
 ZERO = Parameter("zero", logarithmic=False, field="zeros")
 DEAD_TIME = Parameter("dead_time", logarithmic=False, least=0.0, field="dead_time")
 
-# In this order every structure has those that belong to it.
+# Every structure lists its parameters in this order.
 PARAMETERS = (
     *(GAIN, INVERSE, TIME_CONSTANT, TIME_CONSTANT_1, TIME_CONSTANT_2, TIME_CONSTANT_3),
     *(NATURAL_FREQUENCY, DAMPING, ZERO, DEAD_TIME),
@@ -73,7 +73,7 @@ def at_least_one(order: int) -> int:
 def exactly(
     count: int, constants: Sequence[complex], name: str = "time_constants"
 ) -> tuple[complex, ...]:
-    """Return so many constants [s].
+    """Return the constants if their number is ``count`` [s].
 
     :raises ModelError: if there are more or fewer.
     """

@@ -26,7 +26,7 @@ from relay_autotune.errors import ModelError
 from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.float64]
-# Real where every time constant is, which is four times as fast; complex otherwise.
+# Real if every time constant is real, which is four times as fast; else complex.
 Coordinates = NDArray[Any]
 
 _CLOSE = 0.3
@@ -39,7 +39,7 @@ _ONE = np.ones(1)
 
 @dataclass(frozen=True)
 class _Cluster:
-    """One group of eigenvalues: its centre, its place in the chain, its motion and its output.
+    """One group of eigenvalues: centre, place in the chain, motion and output.
 
     ``motion[p]`` is (A - c)^p / (p! scale^p) and ``output[p]`` the rows C times that.
     """
@@ -97,7 +97,7 @@ def _divide(rows: Coordinates, top: complex, constant: complex) -> tuple[Coordin
 def _sylvester(a: Coordinates, b: Coordinates, right: Coordinates) -> Coordinates:
     """Solve ``a x - x b = right`` for small blocks."""
     rows, columns = right.shape
-    # Both products act on x row by row; np.kron would say the same, many times as slowly.
+    # The same operator as with np.kron, but many times as fast.
     operator = np.zeros((rows, columns, rows, columns), dtype=right.dtype)
     for k in range(columns):
         operator[:, k, :, k] = a
@@ -117,7 +117,7 @@ class Modes:
     :param constants: time constants T of the poles, ``prod(1 + T s)`` [s].
     :param integrators: further poles at s = 0.
     :param numerators: of each output, coefficients of powers of s, lowest first, shape (p, d).
-    :param horizon: longest stretch of constant input that will be asked for [s].
+    :param horizon: longest time of constant input that will be evaluated [s].
     :raises ModelError: if a numerator is of higher degree than the denominator.
     """
 
@@ -169,7 +169,7 @@ class Modes:
         """Return the modes of one transfer function.
 
         :param model: the process.
-        :param horizon: longest stretch of constant input that will be asked for [s].
+        :param horizon: longest time of constant input that will be evaluated [s].
         :raises ModelError: if it has a zero at s = 0.
         """
         if model.integrators < 0:
@@ -181,7 +181,7 @@ class Modes:
         return np.ascontiguousarray(array.real if self._dtype is np.float64 else array)
 
     def _output_rows(self, eigenvalues: Coordinates, numerators: Coordinates) -> Coordinates:
-        """Return the weights of the chain's states that make each numerator.
+        """Return the weights of the chain's states for each numerator.
 
         State i is the input over the product of the first i factors, so dividing the numerator
         by the last factor leaves that state's weight as remainder, and so on down the chain.
@@ -233,8 +233,8 @@ class Modes:
             return _ONE, x
         centre = cluster.centre / cluster.scale
         if centre.real != 0.0:
-            # Beyond this the exponential is zero, or infinite for all that matters; a large
-            # power must not make it nan.
+            # Limit t: beyond these times the exponential is practically zero or infinite, and the
+            # product with a large power would be nan.
             low, high = sorted((-_UNDERFLOW / centre.real, _OVERFLOW / centre.real))
             x = np.minimum(np.maximum(x, low), high)
         return np.exp((centre.real if self._dtype is np.float64 else centre) * x), x

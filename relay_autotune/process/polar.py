@@ -21,8 +21,8 @@ class _Factor:
     """One factor ``1 + j w T``, or the two of a complex pair.
 
     :param log_time: log of |T|.
-    :param damping: of the pair; of a real T its sign.
-    :param pair: whether it is one.
+    :param damping: damping of a pair; for a real T its sign.
+    :param pair: whether it is a pair.
     :param power: +1: a zero, -1: a pole.
     """
 
@@ -36,14 +36,15 @@ class _Factor:
 class Polar:
     """A transfer function as the logarithm of its magnitude and its phase, over log frequency.
 
-    Neither overflows, and the phase is kept as whole quarter turns and a small rest, so that two
-    lags and a dead time 1e-40 times as long have a phase margin of 1e-20, and not of zero.
+    Neither overflows. The phase is kept as whole quarter turns and a small rest: two lags with a
+    dead time 1e-40 times as long then have a phase margin of 1e-20, and not of zero.
 
     :param log_gain: log of |K|.
     :param integrators: poles at s = 0.
-    :param half_turn: whether the sign of the controller leaves -180 degrees at w = 0.
-    :param factors: all others.
-    :param log_delay: log of the dead time; -infinity: none.
+    :param half_turn: whether the phase starts at -180 degrees at w = 0, with the controller's
+        sign.
+    :param factors: all other poles and zeros.
+    :param log_delay: log of the dead time; -infinity: no dead time.
     """
 
     log_gain: float
@@ -54,7 +55,7 @@ class Polar:
 
     @classmethod
     def of(cls, model: TransferFunction) -> Polar:
-        """Return that of a transfer function."""
+        """Return the polar form of a transfer function."""
         factors = []
         for power, constants in ((1, model.zeros), (-1, model.time_constants)):
             for c in constants:
@@ -83,14 +84,14 @@ class Polar:
         return abs(self.integrators) + sum(2 if f.pair else 1 for f in self.factors)
 
     def corners(self) -> list[float]:
-        """Return logarithms of the corner frequencies, the lowest first; of 1 if there is none."""
+        """Return logarithms of the corner frequencies, the lowest first; [0] without corners."""
         found = [-f.log_time for f in self.factors]
         if self.delayed:
             found.append(-self.log_delay)
         return sorted(found) or [0.0]
 
     def resonances(self) -> FloatArray:
-        """Return logarithms of frequencies about each resonance, within its width."""
+        """Return logarithms of frequencies around each resonance, within its width."""
         found = [np.empty(0)]
         for f in self.factors:
             if f.pair:
@@ -137,16 +138,16 @@ class Polar:
         return quarters, rest
 
     def turns(self, place: FloatArray, whole: FloatArray | float = 0.0) -> FloatArray:
-        """Return whole turns from -180 degrees on, less some of them.
+        """Return the phase in turns, counted from -180 degrees, minus ``whole``.
 
         :param place: log frequencies, shape (n,).
-        :param whole: turns to be taken off, shape (n,).
+        :param whole: turns to subtract, shape (n,).
         """
         quarters, rest = self._parts(place)
         return np.asarray((quarters + 2.0 - 4.0 * whole) / 4.0 + rest / (2.0 * math.pi))
 
     def lead(self, place: float) -> float:
-        """Return the phase against that at w = 0, where no corner has been passed [rad].
+        """Return the phase relative to w = 0, at a frequency below all corners [rad].
 
         :param place: log frequency below all corners.
         """

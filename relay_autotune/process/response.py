@@ -17,10 +17,10 @@ def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> 
 
     The process rests at ``u.initial`` before the first change of the input (an integrating
     process: in balance). Nothing is discretised: between the delayed changes the response is
-    evaluated in closed form at the times asked for.
+    evaluated in closed form at the given times.
 
     :param model: the process.
-    :param time: when the output is wanted [s], any shape and order.
+    :param time: times of the output [s], any shape and order.
     :param u: the input.
     :return: deviation of y, shape of ``time``.
     """
@@ -48,8 +48,8 @@ def coordinates_at_changes(
     """Return the coordinates just after each change of the input, from rest before the first.
 
     :param modes: the process.
-    :param changes: when the delayed input changes [s], shape (m,).
-    :param steps: by how much, shape (m,).
+    :param changes: instants of the changes of the delayed input [s], shape (m,).
+    :param steps: height of each change, shape (m,).
     :param backward: True: the growing modes are followed backward, from zero just after the last
         change, so that they stay bounded; their true motion differs by a multiple of their own
         free motion.
@@ -59,7 +59,7 @@ def coordinates_at_changes(
     growing = modes.growing
     backward = backward and bool(np.any(growing))
     if backward:
-        # What grows is followed the other way below.
+        # The growing modes are followed backward below.
         forward[:, growing, :] = 0.0
     kicks = steps[:, None] * modes.input_direction
     z = np.empty((changes.size, modes.size), dtype=np.result_type(forward, kicks))

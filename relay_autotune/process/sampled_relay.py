@@ -31,7 +31,7 @@ def simulate_sampled_relay(
     :param model: the process, at rest before the first sample.
     :param settings: levels, set-point, hysteresis.
     :param period: time between samples [s], > 0.
-    :param noise: what is added to each sample [y], shape (n,); it sets the number of samples.
+    :param noise: noise added to each sample [y], shape (n,); it sets the number of samples.
     :param relay_sees_noise: False: the relay acts on the noise-free output, the record still
         holds the noisy one.
     :param operating_point: measurement at rest [y]; default: the set-point.

@@ -66,12 +66,12 @@ class Plant:
 
 @dataclass(frozen=True)
 class RelayRun:
-    """What an ideal relay experiment gave.
+    """Result of an ideal relay experiment.
 
     :param settings: the relay.
     :param command: the command with its exact switch instants.
     :param cycles: every whole cycle, with exact times and peaks.
-    :param time: sample times asked for [s], shape (n,).
+    :param time: sample times [s], shape (n,).
     :param measurement: noise-free measurement there [y], shape (n,).
     """
 
@@ -85,7 +85,7 @@ class RelayRun:
         """Return the samples as a record, with noise that the relay did not see.
 
         :param noise_std: standard deviation of white Gaussian noise [y].
-        :param rng: its source; needed where ``noise_std`` > 0.
+        :param rng: its source; needed if ``noise_std`` > 0.
         """
         y = self.measurement
         if noise_std > 0.0:
@@ -111,9 +111,9 @@ class RelayRun:
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
     ends = function(low), function(high)
     if ends[0] * ends[1] >= 0.0:
-        # The change of sign that was seen over many points at once was rounding.
+        # The change of sign in the vectorised evaluation was rounding.
         return low if abs(ends[0]) <= abs(ends[1]) else high
-    # Relative to the cell, since a root may lie at its very beginning, which may be zero.
+    # The tolerance is relative to the cell, because the root may lie at or near zero.
     return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15, maxiter=1000))
 
 
@@ -124,7 +124,7 @@ class _Segment:
         self.modes, self.z, self.level, self._corners = modes, z, level, corners
         self.weights = modes.weights(z)
         self.slopes = modes.slope_weights(self.weights)
-        # Below this a difference from a threshold is rounding.
+        # A smaller difference from a threshold is rounding.
         size = sum(float(np.abs(w).sum()) for w in self.weights)
         self.rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
 
@@ -171,7 +171,7 @@ class _Segment:
 
 @dataclass
 class _HalfCycle:
-    """Running account of the time between two switches."""
+    """Data collected between two switches."""
 
     start: float
     level_is_high: bool
@@ -181,7 +181,7 @@ class _HalfCycle:
     when_max: float = 0.0
     when_min: float = 0.0
     area: float = 0.0
-    # The motion with its length, and when each piece of it begins.
+    # Each piece of the motion with its length and its begin.
     pieces: list[tuple[_Segment, float, float]] = field(default_factory=list)
 
     def measure(self) -> None:
@@ -214,7 +214,7 @@ def simulate_relay(
     told: int | None = None,
     most_switches: int = 20_000,
 ) -> RelayRun:
-    """Run an ideal relay on a process, from switch to switch, without any time step.
+    """Run an ideal relay on a process, from switch to switch, without a time step.
 
     At t = 0 the process rests at its operating point and the relay takes the level that moves
     the measurement upwards. The relay then switches exactly where the measurement leaves the
@@ -224,13 +224,13 @@ def simulate_relay(
     :param model: the process.
     :param settings: levels, set-point, hysteresis.
     :param cycles: whole cycles to run.
-    :param time: when samples are wanted [s], not decreasing, shape (n,); later ones than the end
-        of the last cycle are left out.
+    :param time: instants of the samples [s], not decreasing, shape (n,); those after the end of
+        the last cycle are left out.
     :param operating_point: measurement at rest [y]; default: the set-point.
     :param kick: how far above the set-point the measurement must rise before the first
         switch [y]; default: the hysteresis.
-    :param told: how many of the cycles are told, the last ones; default: all of them.
-    :param most_switches: more than these are taken for chatter.
+    :param told: number of cycles to return, the last ones; default: all of them.
+    :param most_switches: more switches than this count as chatter.
     :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
     """
     process = replace(model, dead_time=model.dead_time + settings.extra_delay)
@@ -252,7 +252,7 @@ def simulate_relay(
     half = _HalfCycle(0.0, is_high)
     halves: list[_HalfCycle] = []
     segment = _Segment(modes, z, level, corners)
-    # The half that starts from rest and the one after it lead to the first whole cycle.
+    # The half cycle from rest and the one after it come before the first whole cycle.
     while sum(1 for h in halves[1:] if h.level_is_high != direct) <= cycles:
         length = on_the_way[0][0] - now if on_the_way else 60.0 * slowest
         rising = is_high == direct
@@ -319,7 +319,7 @@ def _whole_cycles(
         high, low = usable[2 * index], usable[2 * index + 1]
         high.measure()
         low.measure()
-        # Low turns a direct process down, high a reverse one.
+        # The low level turns a direct-acting process down, the high level a reverse-acting one.
         down, up = (high, low) if settings.reverse_acting else (low, high)
         t_high, t_low = high.end - high.start, low.end - low.start
         period = t_high + t_low
@@ -354,8 +354,8 @@ def exact_limit_cycle(
     :param settings: the relay.
     :param tolerance: relative change of the half periods from cycle to cycle that counts as
         converged.
-    :param most_cycles: cycles to wait for it.
-    :raises ModelError: if there is none, or it does not converge.
+    :param most_cycles: largest number of cycles before it must have converged.
+    :raises ModelError: if there is no limit cycle, or it does not converge.
     """
     count = 8
     while True:

@@ -1,4 +1,4 @@
-"""The structures of processes: one row each, from which all that they have in common follows."""
+"""The structures of processes: one row each, with everything else derived from the rows."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ FloatArray = NDArray[np.float64]
 
 GENERAL = "general"
 
-# Below this damping two lags are reported as a pair; at 1, where they merge, neither is smooth.
+# Below this damping two lags are reported as a pair. Not 1, because there the lags merge and their
+# time constants are not smooth.
 _DAMPING_OF_A_PAIR = 1.02
 
 
@@ -49,14 +50,14 @@ _DAMPING_OF_A_PAIR = 1.02
 class Structure:
     """A structure by its factors: ``gain (1 + z s) exp(-D s)/(s^integrators product)``.
 
-    A fit has a theta for it: the logarithms of the factors' parameters, then the dead time. The
-    coefficients of the numerator are linear: K, and with a zero K z.
+    The nonlinear parameters of a fit are theta: the logarithms of the factors' parameters, then
+    the dead time. The coefficients of the numerator are linear: K, and with a zero K z.
 
     :param name: of the structure.
     :param factors: of the denominator, in the order of theta.
     :param integrators: poles at s = 0.
-    :param zero: its zero; None: it has none.
-    :param either: True: two lags may be a pair that oscillates, with other parameters.
+    :param zero: parameter of its zero; None: no zero.
+    :param either: True: the two lags may also be an oscillating pair, with other parameters.
     :param any_order: True: the number of equal lags belongs to the model, see :meth:`of_order`.
     """
 
@@ -84,7 +85,7 @@ class Structure:
 
     @property
     def given_order(self) -> int:
-        """Number of equal lags where it has to be told with the name; else 0."""
+        """Number of equal lags if it must be given with the name; else 0."""
         return self.order if self.any_order else 0
 
     @property
@@ -126,9 +127,9 @@ class Structure:
         return "y/(u s)" if self.integrators == 1 else f"y/(u s^{self.integrators})"
 
     def of_order(self, order: int) -> Structure:
-        """Return the structure with so many equal lags.
+        """Return the structure with ``order`` equal lags.
 
-        :raises ModelError: if there is less than one.
+        :raises ModelError: if the order is less than one.
         """
         (parameters,) = [f.parameters for f in self.factors if isinstance(f, Lag)]
         return replace(self, factors=(Lag(at_least_one(order), parameters),))
@@ -136,14 +137,14 @@ class Structure:
     def form(self, pair: bool) -> Structure:
         """Return the structure with its quadratic factor as a pair or as two lags.
 
-        :param pair: True: natural frequency and damping in the place of two lags.
+        :param pair: True: natural frequency and damping instead of two lags.
         """
         wanted = Quadratic(PAIR if pair else TWO_LAGS)
         factors = [wanted if isinstance(f, Quadratic) else f for f in self.factors]
         return replace(self, factors=tuple(factors)) if self.either else self
 
     def build(self, values: Sequence[float] | FloatArray) -> TransferFunction:
-        """Return the transfer function of some values.
+        """Return the transfer function with given values.
 
         :param values: of :attr:`parameters`, in their order, shape (p,).
         :raises ModelError: if a time constant or a natural frequency is not positive, the gain
@@ -168,13 +169,13 @@ class Structure:
     def read(
         self, theta: FloatArray, coefficients: FloatArray, like: FloatArray | None = None
     ) -> tuple[Structure, FloatArray] | None:
-        """Return the values that a fit stands for, with the structure whose parameters they are.
+        """Return the structure and the values of its parameters for a fit.
 
         :param theta: shape (m,).
-        :param coefficients: of the numerator first, shape (k,).
-        :param like: a theta beside which the reading takes the same form; default: ``theta``.
-        :return: None if the fit is not of this structure: without gain, a pair where lags are
-            meant, a zero of the other sign.
+        :param coefficients: those of the numerator come first, shape (k,).
+        :param like: the theta that decides between lags and pair; default: ``theta``.
+        :return: None if the fit is not of this structure: no gain, a pair instead of lags, a zero
+            of the wrong sign.
         """
         gain = float(coefficients[0])
         form = self._form_at(theta if like is None else like)
@@ -186,7 +187,7 @@ class Structure:
             given.update(zip(factor.parameters, factor.values(own), strict=True))
             if not factor.unstable and factor.multiplicity == 1 and factor.parameters != PAIR:
                 lags += factor.parameters
-        # Lags that may change places are told by size.
+        # Lags that could be exchanged are ordered by size.
         given.update(zip(lags, sorted((given[p] for p in lags), reverse=True), strict=True))
         if self.zero is not None:
             zero = float(coefficients[1]) / gain
@@ -196,10 +197,10 @@ class Structure:
         return form, np.array([given[p] for p in form.parameters])
 
     def model_at(self, theta: FloatArray, coefficients: FloatArray) -> TransferFunction | None:
-        """Return the model that a fit stands for; None where it is not of this structure.
+        """Return the model of a fit; None if it is not of this structure.
 
         :param theta: shape (m,).
-        :param coefficients: of the numerator first, shape (k,).
+        :param coefficients: those of the numerator come first, shape (k,).
         """
         found = self.read(theta, coefficients)
         if found is None or not np.all(np.isfinite(found[1])):
@@ -207,7 +208,7 @@ class Structure:
         return found[0].build(found[1])
 
     def _form_at(self, theta: FloatArray) -> Structure | None:
-        """Return the structure as two lags or as a pair, by the damping; None: not this one."""
+        """Return the structure as two lags or as a pair, by the damping; None: neither fits."""
         for factor, own in zip(self.factors, self.denominator.split(theta[:-1]), strict=True):
             if isinstance(factor, Quadratic):
                 pair = not math.exp(own[1]) >= _DAMPING_OF_A_PAIR
@@ -226,7 +227,7 @@ class Structure:
         natural_frequency: float = 0.0,
         damping: float = 0.0,
     ) -> TransferFunction:
-        """Return a model by the fields that flags, messages and plant_node's parameters have.
+        """Return a model from the fields of flags, messages and plant_node's parameters.
 
         :param gain: K [y/u, y/(u s)].
         :param time_constants: in the order of the parameters [s]; one for equal lags; empty with
@@ -236,8 +237,8 @@ class Structure:
         :param order: number of equal lags.
         :param natural_frequency: w0 of a complex pair [rad/s].
         :param damping: zeta of a complex pair.
-        :raises ModelError: if their number is not that of the structure's parameters, or a value
-            is out of range.
+        :raises ModelError: if the number of values does not match the structure, or a value is
+            out of range.
         """
         found = self.of_order(order) if self.any_order else self
         found = found.form(pair=not time_constants)
@@ -257,9 +258,9 @@ class Structure:
 
 @dataclass(frozen=True)
 class GivenModel(Structure):
-    """A model of which only the transfer function is known, as one that was read.
+    """A model known only by its transfer function, such as one read from a file.
 
-    :param given: the parameters whose values are told with it.
+    :param given: the parameters whose values are reported with it.
     :param model: the transfer function.
     """
 
@@ -271,7 +272,7 @@ class GivenModel(Structure):
         """Return the structure of a model.
 
         :param model: the transfer function.
-        :param names: of the parameters whose values are told with it.
+        :param names: names of the parameters whose values are reported with it.
         """
         by_name = {p.name: p for p in PARAMETERS}
         given = tuple(by_name[name] for name in names)
@@ -279,13 +280,13 @@ class GivenModel(Structure):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The parameters whose values are told."""
+        """The parameters whose values are reported."""
         return self.given
 
     def build(self, values: Sequence[float] | FloatArray) -> TransferFunction:
-        """Return the model, which has these values.
+        """Return the model itself.
 
-        :param values: those that were told with it.
+        :param values: its reported values; not used.
         """
         assert len(values) == len(self.given)
         return self.model
@@ -307,7 +308,7 @@ INTEGRATOR_INVERSE = Structure("integrator_inverse", (Lag(),), 1, INVERSE)
 UNSTABLE_FOPDT = Structure("unstable_fopdt", (UnstableLag(),))
 UNSTABLE_SOPDT = Structure("unstable_sopdt", (UnstableLag(_ONE), Lag(1, _TWO)))
 
-# All that there are, by name, the simple ones first.
+# All structures by name, the simple ones first.
 TABLE = {
     structure.name: structure
     for structure in (
@@ -322,24 +323,24 @@ FIELDS = (
     *("order", "natural_frequency", "damping"),
 )
 
-# Names that models have; the last one stands for any other transfer function.
+# Names of structures; the last one means any other transfer function.
 STRUCTURES = (*TABLE, GENERAL)
 
 
 def structure_named(name: str) -> Structure:
     """Return a structure by its name.
 
-    :raises ModelError: if there is none; the message lists those there are.
+    :raises ModelError: if the name is unknown; the message lists the known names.
     """
     return look_up(TABLE, name, "structure", ModelError)
 
 
 def structure_of(model: TransferFunction, names: Sequence[str]) -> Structure:
-    """Return the structure of a model that has the parameters named.
+    """Return the structure of a model with given parameter names.
 
-    :param model: with the name of its structure.
-    :param names: of its parameters, in their order.
-    :return: where no structure has these, that of the model alone.
+    :param model: the model, with the name of its structure.
+    :param names: names of its parameters, in order.
+    :return: the structure; a `GivenModel` if no structure has these parameters.
     """
     found = TABLE.get(model.structure)
     if found is not None:

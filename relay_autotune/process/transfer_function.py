@@ -131,8 +131,8 @@ class TransferFunction:
     def process_sign(self) -> int:
         """Sign that the controller's gain must have: +1 for a direct-acting process, else -1.
 
-        The gain's own sign, turned by each real unstable pole (``K/(tau s - 1)`` has a negative
-        static gain and wants a positive controller); right-half-plane zeros do not turn it.
+        This is the sign of the gain, reversed by each real unstable pole (``K/(tau s - 1)`` has a
+        negative static gain and needs a positive controller), but not by right-half-plane zeros.
         """
         turned = sum(1 for t in self.time_constants if t.real < 0.0 and t.imag == 0.0)
         return int(math.copysign(1.0, self.gain)) * (-1) ** turned

@@ -43,14 +43,14 @@ class _Crossing:
 
 
 def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
-    """Return the gain that ends stability, or None where no gain does or none gives it.
+    """Return the gain at which stability ends; None if it never ends, or no gain stabilises.
 
-    Every frequency at which the phase is an odd multiple of -180 degrees is found from the
+    All frequencies at which the phase is an odd multiple of -180 degrees follow from the
     continuous phase, so that neither a large dead time nor a resonance hides one. Raising the
-    gain through such a point moves a pair of closed-loop poles to the right where the phase
-    falls with frequency, and to the left where it rises. Counting from the poles at zero gain,
-    the ultimate gain is the upper end of the first range in which none is on the right; an
-    unstable process has a lower end as well, which is not returned.
+    gain through such a point moves a pair of closed-loop poles to the right if the phase falls
+    with frequency, and to the left if it rises. Counting from the poles at zero gain, the ultimate
+    gain is the upper end of the first range without poles on the right. An unstable process also
+    has a lower end, which is not returned.
 
     :param model: the process.
     """
@@ -76,8 +76,8 @@ def unstable_at_small_gain(model: TransferFunction) -> int:
     m = model.integrators
     if m < 1:
         return unstable
-    # The poles at s = 0 leave along s^m = -K g; one that starts straight up goes left only if
-    # the phase near zero frequency is above its limit.
+    # The poles at s = 0 start along s^m = -K g. A pole that starts straight up moves to the left
+    # only if the phase near zero frequency is above its limit.
     polar = Polar.of(model)
     start = math.pi if model.gain * model.process_sign > 0.0 else 0.0
     lead = polar.lead(polar.corners()[0] - 14.0) > 0.0
@@ -104,7 +104,7 @@ def _crossings(model: TransferFunction) -> list[_Crossing]:
     found += first
     if not first or not polar.delayed:
         return found
-    # Later turns of the dead time matter only where the magnitude is larger again.
+    # Later turns of the dead time matter only if the magnitude is larger again.
     least = -math.log(min(c.gain for c in first))
     last = math.log(first[-1].frequency)
     beyond = np.append(last, logarithms[logarithms > last])
@@ -129,8 +129,8 @@ def _logarithmic(polar: Polar) -> FloatArray:
 def _first_range(polar: Polar, logarithms: FloatArray) -> tuple[float, float]:
     if not polar.delayed:
         return float(logarithms[0]), float(logarithms[-1])
-    # The rational part turns the phase by at most a quarter for each root, so that here the
-    # dead time has passed -180 degrees for certain.
+    # The rational part turns the phase by at most a quarter for each root. So at this angle the
+    # dead time has certainly passed -180 degrees.
     turns = polar.roots * math.pi / 2.0 + 4.0 * math.pi
     return float(logarithms[0]), math.log(turns) - polar.log_delay
 
@@ -138,7 +138,7 @@ def _first_range(polar: Polar, logarithms: FloatArray) -> tuple[float, float]:
 def _grid(polar: Polar, logarithms: FloatArray, low: float, high: float) -> FloatArray:
     parts = [np.array([low, high]), logarithms[(logarithms > low) & (logarithms < high)]]
     if polar.delayed:
-        # In angles of the dead time, which no unit of time makes too large.
+        # In angles of the dead time, which are independent of the unit of time.
         begin, end = (math.exp(min(edge + polar.log_delay, 700.0)) for edge in (low, high))
         count = int(min((end - begin) / 0.3 + 2.0, _MOST_POINTS))
         angles = np.linspace(begin, end, count)
@@ -152,7 +152,7 @@ def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
     cells = np.flatnonzero(np.diff(level) != 0.0)
     if cells.size == 0:
         return []
-    # Where the phase falls it leaves the level that it had, where it rises it enters the next.
+    # A falling phase crosses its present level, a rising one the next level.
     target = np.maximum(level[cells], level[cells + 1])
     falls = level[cells + 1] < level[cells]
     place = _roots(polar, grid[cells], grid[cells + 1], target)
@@ -179,13 +179,13 @@ def _roots(polar: Polar, low: FloatArray, high: FloatArray, target: FloatArray) 
         before = place
         with np.errstate(divide="ignore", invalid="ignore"):
             place = (low * at_high - high * at_low) / (at_high - at_low)
-        # Rounding may place it at an end, or a little beyond.
+        # Rounding may place the root at an end, or a little beyond.
         place = np.clip(np.where(np.isfinite(place), place, low), low, high)
         if bool(np.all(np.abs(place - before) <= _ACCURACY * np.maximum(np.abs(place), 1.0))):
             break
         value = polar.turns(place, target)
         below = np.sign(value) == np.sign(at_low)
-        # An end that stays for a second time counts half, so that both close in.
+        # Illinois: halve the value at an end that stays twice, so that both ends converge.
         again = np.where(below == moved, 0.5, 1.0)
         at_low, at_high = (
             np.where(below, value, again * at_low),

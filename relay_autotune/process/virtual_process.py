@@ -1,4 +1,4 @@
-"""A simulated process as a loop meets it: actuator, exact dynamics, disturbances and sensor."""
+"""A simulated process in a loop: actuator, exact dynamics, disturbances and sensor."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from relay_autotune.process.transfer_function import TransferFunction
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What acts on a process besides its command.
+    """Disturbances of a process.
 
     :param noise_std: standard deviation of white Gaussian noise on each sample [y], >= 0.
     :param quantisation: step of the sensor's resolution [y], >= 0; 0: none.
-    :param load_time: when a load step enters, added to the actuator's position [s], >= 0.
-    :param load_size: its height [u]; 0: none.
+    :param load_time: instant of a load step, which adds to the actuator's position [s], >= 0.
+    :param load_size: its height [u]; 0: no load step.
     :param drift: slope of the measurement that no command causes [y/s].
-    :raises ParameterError: if one is out of its range.
+    :raises ParameterError: if a value is out of its range.
     """
 
     noise_std: float = 0.0
@@ -47,8 +47,8 @@ class VirtualProcess:
     :param model: the process.
     :param rest_measurement: measurement at the operating point, y0 [y].
     :param rest_command: command at the operating point, u0 [u].
-    :param actuator: what turns commands into the input of the model; default: an ideal one.
-    :param disturbances: what else acts on it.
+    :param actuator: turns commands into the input of the model; default: an ideal one.
+    :param disturbances: noise, load and drift; default: none.
     :param seed: seed of the noise; the same seed gives the same noise for the same samples.
     """
 
@@ -78,13 +78,13 @@ class VirtualProcess:
 
     @property
     def position(self) -> float:
-        """Where the actuator is [u]."""
+        """Position of the actuator [u]."""
         return self._actuator.position
 
     def command(self, value: float, time: float | None = None) -> None:
         """Give a command that holds until the next one.
 
-        :param value: [u]; one that is not finite is not followed.
+        :param value: [u]; ignored if it is not finite.
         :param time: when it takes effect, not before the present time [s]; default: now.
         """
         if time is not None:
@@ -92,7 +92,7 @@ class VirtualProcess:
         self._position = self._actuator.move(value)
 
     def measure(self, time: float) -> float:
-        """Move to ``time`` and return what the sensor says there [y].
+        """Move to ``time`` and return the sensor's value there [y].
 
         :param time: not before the present time [s].
         """
@@ -106,7 +106,7 @@ class VirtualProcess:
 
     def _advance(self, time: float) -> float:
         if self._load_waits and time >= self._disturbances.load_time:
-            # The step enters at its own instant, not at that of a sample.
+            # The step enters at its own instant, not at a sample.
             self._load_waits = False
             self._plant.advance(
                 max(self._disturbances.load_time, self._plant.time), self._position
