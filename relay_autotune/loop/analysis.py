@@ -1,4 +1,4 @@
-"""What a controller does on a model: stability, robustness, responses to set-point and load."""
+"""Analysis of a closed loop: stability, robustness, responses to set-point and load."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
 def analyse_loop(
     controller: ControlLaw, model: TransferFunction, sample_period: float = 0.0
 ) -> Performance:
-    """Return what a controller does on a model.
+    """Return the performance of a controller on a model.
 
     :param controller: the gains, or any other linear controller.
     :param model: the process, with all dead time of the loop.
-    :param sample_period: of the measurement, for its noise [s]; 0: continuous.
-    :raises TuningError: if the closed loop is unstable, or so slow that nothing can be told.
+    :param sample_period: period of the measurement, for its noise [s]; 0: continuous.
+    :raises TuningError: if the closed loop is unstable, or its responses do not die away.
     """
     if not is_stable(controller, model):
         raise TuningError(f"{controller} makes an unstable loop with the model: use another rule")
@@ -67,14 +67,14 @@ def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
         if not is_stable(controller, model):
             return math.inf
     except RelayAutotuneError:
-        # Nobody can tell, which is no better.
+        # Stability could not be decided; count it as unstable.
         return math.inf
     grid = frequencies(*controller.characteristic(model))
     return sensitivity_peaks(lambda s: controller(s) * model(s), grid)[0]
 
 
 def _at_rest(terms: tuple[TransferFunction, ...]) -> float | None:
-    """Return the loop's gain at s = 0 where it is a single term without integral action."""
+    """Return the loop's gain at s = 0, for a single term without integral action; else None."""
     if len(terms) != 1 or terms[0].integrators != 0:
         return None
     return terms[0].gain

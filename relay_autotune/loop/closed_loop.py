@@ -43,20 +43,20 @@ def simulate_closed_loop(
     high: float = math.inf,
     noise: FloatArray | None = None,
 ) -> ClosedLoop:
-    """Run a controller at its sampling period; between samples the process moves exactly.
+    """Run a controller at its sampling period; the process is exact between samples.
 
-    :param controller: PI or PID gains, which :class:`SampledPid` then runs, or any other
-        controller of this period, at rest.
+    :param controller: PI or PID gains, which :class:`SampledPid` runs, or any other controller of
+        this period, at rest.
     :param model: the process, at rest, without the half period that a design adds to it.
     :param period: sampling period [s].
     :param duration: s.
     :param setpoint: step of the set-point at t = 0 [y].
     :param load: step of the load at the process input [u].
-    :param load_time: when it comes [s].
-    :param low: least command [u]; of gains only.
-    :param high: largest command [u]; of gains only.
-    :param noise: added to each sample that the controller sees [y], shape (n,); None: none.
-    :raises TuningError: if period or limits make no sense.
+    :param load_time: instant of that step [s].
+    :param low: least command [u]; only for gains.
+    :param high: largest command [u]; only for gains.
+    :param noise: noise on each sample of the controller [y], shape (n,); None: no noise.
+    :raises TuningError: if the period is not positive or the limits leave no range.
     """
     law: SampledController
     if isinstance(controller, Controller):

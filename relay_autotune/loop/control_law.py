@@ -1,4 +1,4 @@
-"""What a linear controller is to the analysis of its loop: PI, PID, or with a model inside."""
+"""Linear controllers as the loop analysis uses them: PI, PID, or with an internal model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ControlLaw(Protocol):
 
 @dataclass(frozen=True)
 class InternalModelLaw:
-    r"""A controller that feeds its own command back through a model, with dead time or without.
+    r"""A controller that feeds its own command back through an internal model.
 
     ``u = forward (r - y) + inside u``, so that from error to command it is
     ``forward/(1 - inside)``: with internal model control ``forward`` is the controller Q and

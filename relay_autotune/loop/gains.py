@@ -1,4 +1,4 @@
-"""Controller gains, in the form in which they are computed, with what is predicted of them."""
+"""Controller gains, with their predicted performance."""
 
 from __future__ import annotations
 
@@ -118,7 +118,8 @@ class Controller:
         lags = (complex(half, half), complex(half, -half)) if self.tf > 0.0 else ()
         if self.ti == 0.0:
             return self.kc, (complex(self.td),), lags, 0
-        # 1 + ti s + ti td s^2; its larger constant first, since the smaller one may cancel.
+        # 1 + ti s + ti td s^2: compute the larger constant first, since the smaller one may lose
+        # its digits by cancellation.
         root = cmath.sqrt(1.0 - 4.0 * self.td / self.ti)
         first = 0.5 * self.ti * (1.0 + root)
         return self.kc / self.ti, (first, self.ti * self.td / first), lags, 1
@@ -126,7 +127,7 @@ class Controller:
 
 @dataclass(frozen=True, kw_only=True)
 class Performance:
-    """What a controller does on a model.
+    """Performance of a controller on a model.
 
     :param ms: largest magnitude of the sensitivity function.
     :param mt: largest magnitude of the complementary sensitivity function.
@@ -143,9 +144,9 @@ class Performance:
     :param effort_setpoint: total variation of the command after a unit step of the set-point
         [u/y].
     :param effort_load: total variation of the command after a unit step of the load.
-    :param noise_gain: standard deviation of the command over that of white noise in the samples
-        of the measurement; without a sampling period the largest gain at any frequency [u/y].
-    :raises TuningError: if a number is negative, or one that is always computed is NaN.
+    :param noise_gain: standard deviation of the command per standard deviation of white noise on
+        the samples; without a sampling period the largest gain at any frequency [u/y].
+    :raises TuningError: if a number is negative, or a number that must be known is NaN.
     """
 
     ms: float
@@ -174,7 +175,7 @@ _PREDICTED = (
     *(*_ALWAYS, "gain_margin_low", "iae_setpoint", "overshoot", "settling_time"),
     *("effort_setpoint", "effort_load", "noise_gain"),
 )
-# The numbers of gains, as messages, documents and files have them.
+# Names of the numbers of gains in messages, documents and files.
 NUMBERS = (
     *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
     *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
@@ -185,12 +186,12 @@ NUMBERS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Gains(Controller, Performance):
-    """The controller that one rule gives, with what it does on the identified model.
+    """The controller of one rule, with its performance on the identified model.
 
     The fields are those of :class:`Controller` and :class:`Performance`, and
 
     :param rule: name in the registry.
-    :param ms_95: Ms that 95 % of the models within the uncertainty stay below.
+    :param ms_95: value of Ms not exceeded by 95 % of the models within the uncertainty.
     :param reason: why this rule and these gains, a sentence for people.
     :param warnings: what the user must know before using them.
     """
@@ -220,8 +221,8 @@ class Gains(Controller, Performance):
 
         :param rule: name in the registry.
         :param controller: the gains.
-        :param performance: what they do on the model.
-        :param ms_95: Ms that 95 % of the models within the uncertainty stay below.
+        :param performance: their performance on the model.
+        :param ms_95: value of Ms not exceeded by 95 % of the models within the uncertainty.
         :param reason: why this rule and these gains.
         :param warnings: what the user must know.
         """

@@ -1,4 +1,4 @@
-"""How far a loop is from instability: peaks of sensitivities, margins of gain, phase and delay."""
+"""Margins of a loop: peaks of the sensitivities, margins of gain, phase and delay."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 Loop = Callable[[ComplexArray], ComplexArray]
 
-# Local maxima that are refined; the largest on the grid need not be the largest.
+# Number of local maxima to refine, since the largest on the grid need not be the largest.
 _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
-# Each round narrows a cell to a sixteenth.
+# Number of rounds; each round divides a cell into this many parts.
 _ROUNDS, _PARTS = 13, 16
-# Below this magnitude a loop is not felt, whatever its phase.
+# Below this magnitude the loop has no influence, whatever its phase.
 _FELT = 0.05
 _MOST_TURNS = 800.0 * math.pi
 
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a stable loop is from instability.
+    """Margins of a stable loop.
 
     :param ms: largest magnitude of ``1/(1 + L)``.
-    :param ms_frequency: where [rad/s].
+    :param ms_frequency: frequency of that maximum [rad/s].
     :param mt: largest magnitude of ``L/(1 + L)``.
-    :param gain_margin: factor by which the loop's gain may grow; infinite: any.
-    :param gain_margin_low: factor to which it may fall; 0: any.
+    :param gain_margin: factor by which the loop's gain may grow; infinite: no limit.
+    :param gain_margin_low: factor to which it may fall; 0: no limit.
     :param phase_margin: lag that may be added [rad]; pi where the loop's gain is never 1.
-    :param delay_margin: dead time that may be added [s]; infinite: any.
+    :param delay_margin: dead time that may be added [s]; infinite: no limit.
     """
 
     ms: float
@@ -49,7 +49,7 @@ class Margins:
 
 
 def frequencies(*terms: TransferFunction) -> FloatArray:
-    """Return a grid on which loops change little in magnitude and phase between points.
+    """Return a grid with little change of the loops' magnitude and phase between points.
 
     :param terms: the loop, or the terms of its characteristic equation.
     :return: rad/s, increasing.
@@ -64,7 +64,7 @@ def frequencies(*terms: TransferFunction) -> FloatArray:
         felt = np.max([np.abs(t(1j * grid)) for t in terms], axis=0) > _FELT
         last = float(grid[felt][-1]) if felt.any() else low
     for d in dead_times:
-        # Turn by turn, coarser where the loop only passes by again and again.
+        # First turns of the dead time finely, later ones more coarsely.
         parts.append(np.arange(0.05, 12.0 * math.pi, 0.05) / d)
         parts.append(np.arange(12.0 * math.pi, min(last * d, _MOST_TURNS), 0.2) / d)
     for c in constants:
@@ -78,7 +78,7 @@ def sensitivity_peaks(loop: Loop, grid: FloatArray) -> tuple[float, float]:
     """Return (Ms, Mt), the largest magnitudes of ``1/(1 + L)`` and ``L/(1 + L)``.
 
     :param loop: L as a function of s.
-    :param grid: frequencies near which the peaks are sought [rad/s], increasing.
+    :param grid: frequencies that show the peaks roughly [rad/s], increasing.
     """
     (ms, _), (mt, _) = peaks(loop, grid)
     return ms, mt
@@ -93,7 +93,7 @@ def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[floa
     sizes = (sensitivity, sensitivity * np.abs(values))
     best = [float(size.max()) for size in sizes]
     where = [float(grid[np.argmax(size)]) for size in sizes]
-    # Both are sought at the same time, the peaks of the one in the rows above those of the other.
+    # Refine both at the same time: the rows hold the peaks of 1/(1 + L), then those of L/(1 + L).
     tops = [_tops(size) for size in sizes]
     at, first = np.concatenate(tops), tops[0].size
     low, high = log_grid[np.maximum(at - 1, 0)], log_grid[np.minimum(at + 1, grid.size - 1)]
@@ -115,20 +115,20 @@ def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[floa
 
 
 def _tops(values: FloatArray) -> NDArray[np.intp]:
-    """Return where the largest local maxima are, and the largest value."""
+    """Return the indices of the largest local maxima and of the largest value."""
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
     return np.append(inner[np.argsort(-values[inner])[:_PEAKS]], np.argmax(values))
 
 
 def _changes(values: FloatArray) -> NDArray[np.intp]:
-    """Return the cells between whose ends the sign changes, a zero being positive."""
+    """Return the cells in which the sign changes; zero counts as positive."""
     return np.flatnonzero((values[:-1] >= 0.0) != (values[1:] >= 0.0))
 
 
 def _roots(
     function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return a root in each cell whose ends differ in sign, by dividing all cells at once."""
+    """Return a root in each cell with a change of sign, by dividing all cells at once."""
     low, high = np.log(low), np.log(high)
     if not low.size:
         return low
@@ -143,11 +143,11 @@ def _roots(
 
 
 def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> Margins:
-    """Return how far a stable loop is from instability.
+    """Return the margins of a stable loop.
 
     :param loop: L as a function of s.
-    :param grid: frequencies on which crossings show [rad/s], increasing.
-    :param at_rest: L(0), where it is finite; None: it is not.
+    :param grid: frequencies fine enough to show every crossing [rad/s], increasing.
+    :param at_rest: L(0), if it is finite; None: it is not finite.
     """
     values = loop(1j * grid)
     cells = _changes(values.imag)
@@ -164,7 +164,7 @@ def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> Margi
     delays = np.mod(lead, 2.0 * math.pi) / crossovers
     (ms, at), (mt, _) = peaks(loop, grid)
     return Margins(
-        # For w -> infinity the one tends to 1, for w -> 0 with integral action the other.
+        # ms tends to 1 for w -> infinity; mt tends to 1 for w -> 0 with integral action.
         ms=max(ms, 1.0),
         ms_frequency=at,
         mt=max(mt, 1.0) if at_rest is None else mt,

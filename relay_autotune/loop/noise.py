@@ -1,4 +1,4 @@
-r"""What measurement noise does to the command of a sampled controller."""
+r"""Effect of measurement noise on the command of a sampled controller."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _ANGLES = 2048
 
-# Time constants of the filter over the sampling period, between which is interpolated.
+# Grid of filter time constant over sampling period, for interpolation.
 _RATIOS = np.geomspace(1e-3, 1e4, 141)
 
 
@@ -29,10 +29,10 @@ def _moments() -> FloatArray:
     """Return var(yf), cov(yf, h yf') and var(h yf') for each of ``_RATIOS``, shape (3, n)."""
     motions = [filter_matrices(float(ratio), 1.0) for ratio in _RATIOS]
     turn, past, present = (np.array(part) for part in zip(*motions, strict=True))
-    # In time constants of the filter both states are of one size, as the solution needs.
+    # Scaled to the filter's time constant, both states have one order of magnitude.
     size = np.stack((np.ones(_RATIOS.size), _RATIOS), axis=1)
     turn, past, present = turn * size[:, :, None] / size[:, None, :], past * size, present * size
-    # What the state and the next sample share is the sample before.
+    # State and next sample are correlated only by the sample before.
     shared = _outer((turn @ present[..., None])[..., 0], past)
     drive = _outer(past, past) + _outer(present, present) + shared + shared.swapaxes(1, 2)
     twice = turn[:, :, None, :, None] * turn[:, None, :, None, :]
@@ -49,12 +49,12 @@ def _outer(left: FloatArray, right: FloatArray) -> FloatArray:
 def open_noise_gain(td: FloatArray, tf: FloatArray, period: float) -> FloatArray:
     """Return the standard deviation of ``yf + td dyf/dt`` per that of white sampled noise.
 
-    Times kp it is that of the command, but for the integral's share and for what the loop feeds
-    back.
+    Times kp it is the standard deviation of the command, without the integral part and without
+    feedback through the loop.
 
     :param td: derivative times [s], shape (k,).
     :param tf: time constants of the filter [s], shape (k,).
-    :param period: of the samples [s].
+    :param period: period of the samples [s].
     """
     at = np.log(np.maximum(tf / period, _RATIOS[0]))
     value, mixed, slope = (np.interp(at, np.log(_RATIOS), row) for row in _moments())
@@ -63,17 +63,17 @@ def open_noise_gain(td: FloatArray, tf: FloatArray, period: float) -> FloatArray
 
 
 def filter_for(td: FloatArray, largest: FloatArray, period: float) -> FloatArray:
-    """Return the least time constant of the filter with which the noise gain keeps a limit.
+    """Return the least time constant of the filter that keeps the noise gain within a limit.
 
     :param td: derivative times [s], shape (k,).
-    :param largest: what :func:`open_noise_gain` may be, shape (k,).
-    :param period: of the samples [s].
-    :return: s, shape (k,); infinite: none of a usable size.
+    :param largest: largest allowed :func:`open_noise_gain`, shape (k,).
+    :param period: period of the samples [s].
+    :return: s, shape (k,); infinite: no usable time constant is enough.
     """
     value, mixed, slope = _moments()
     lead = (td / period)[:, None]
     gains = np.sqrt(value + 2.0 * lead * mixed + lead**2 * slope)
-    # A filter that is slow enough makes it ever smaller.
+    # Beyond some time constant the noise gain only falls.
     keeps = gains <= largest[:, None]
     first = np.where(keeps.any(axis=1), keeps.argmax(axis=1), _RATIOS.size)
     inside = np.clip(first, 1, _RATIOS.size - 1)
@@ -89,14 +89,14 @@ def filter_for(td: FloatArray, largest: FloatArray, period: float) -> FloatArray
 def noise_gain(controller: ControlLaw, model: TransferFunction, period: float) -> float:
     """Return the standard deviation of the command per that of white measurement noise.
 
-    The noise is that of the samples, and reaches the command directly and round the loop, in
-    which the command is held for a period. A PI or PID controller counts as
+    The noise of the samples reaches the command directly and around the loop, in which the command
+    is held for a period. A PI or PID controller is computed as
     :class:`~relay_autotune.loop.sampled.SampledPid` runs it.
 
-    :param controller: of a stable loop.
+    :param controller: the controller of a stable loop.
     :param model: the process, with all dead time of the loop, that of the hold included.
-    :param period: of the samples [s]; 0: the largest magnitude from noise to command, which no
-        period exceeds.
+    :param period: period of the samples [s]; 0: the largest magnitude from noise to command, an
+        upper bound for every period.
     :return: u/y.
     """
     if period == 0.0:
@@ -115,7 +115,7 @@ def _sampled(controller: ControlLaw, angle: FloatArray, period: float) -> Comple
         return controller(1j * angle / period)
     turn, past, present = filter_matrices(controller.tf, period)
     z = np.exp(1j * angle)
-    # The state's transform, by Cramer's rule.
+    # Transform of the state, by Cramer's rule.
     first, second = (past[k] + present[k] * z for k in (0, 1))
     (f11, f12), (f21, f22) = turn.tolist()
     determinant = (z - f11) * (z - f22) - f12 * f21

@@ -1,10 +1,10 @@
-r"""Responses of a closed loop to steps of set-point and load, and what they cost.
+r"""Responses of a closed loop to steps of set-point and load, and their figures of merit.
 
 The transforms are inverted by a fast Fourier transform along ``Re s = sigma`` (Dubner and Abate
-1968); dead times enter exactly. A jump at t = 0, which a transform cut at some frequency cannot
-follow, is taken out before and put back after. Integrals of an error are computed as
+1968); dead times enter exactly. A truncated transform cannot follow a jump at t = 0, so the jump
+is removed before the inversion and added after it. Integrals of an error are computed as
 ``int |e| = |int e| + 2 int (the part of the other sign)``: the first is the transform at s = 0,
-so that a slow tail costs nothing.
+so that a slow tail needs no computation.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _POINTS = 4096
 _MOST_POINTS = 1 << 18
 _DECAY = math.log(1e8)
 _TURNS, _RESETS, _LONGEST = 6.0, 8.0, 64.0
-# The rest of a response is small enough to end the horizon there.
+# The horizon is long enough if the tail of a response is below this part of the whole.
 _SETTLED = 1e-3
-# An error that has come so near to zero has come there.
+# A smaller final error counts as zero.
 _NO_OFFSET = 1e-3
 BAND = 0.02
 
@@ -49,10 +49,10 @@ class StepResponse:
 
 
 def abscissae(duration: float, points: int) -> ComplexArray:
-    """Return where :func:`inverted` needs a Laplace transform [rad/s], shape (points + 1,).
+    """Return the values of s for the transform of :func:`inverted` [rad/s], shape (points + 1,).
 
     :param duration: s.
-    :param points: instants at which the function is wanted.
+    :param points: number of instants of the function.
     """
     return _DECAY / (2.0 * duration) + 1j * np.arange(points + 1) * (math.pi / duration)
 
@@ -60,9 +60,9 @@ def abscissae(duration: float, points: int) -> ComplexArray:
 def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatArray:
     """Return the function of a Laplace transform at equally spaced times from 0 on.
 
-    :param values: of the transform at :func:`abscissae`, shape (points + 1,); it has no pole
+    :param values: the transform at :func:`abscissae`, shape (points + 1,); it must not have poles
         right of the imaginary axis.
-    :param duration: s; the last instant is a step before it.
+    :param duration: s; the last instant is one step before it.
     :param jump: value just after t = 0.
     :return: shape (points,).
     """
@@ -71,7 +71,7 @@ def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatA
     time = np.arange(points) * step
     if jump:
         values = values - jump / (abscissae(duration, points) + decay)
-    # Lanczos' factors take away the ringing that the cut at the last frequency leaves.
+    # Lanczos' factors remove the ringing caused by the cut at the last frequency.
     values = values * np.sinc(np.arange(points + 1) / points)
     found = np.fft.irfft(values)[:points] * np.exp(_DECAY / (2.0 * duration) * time) / step
     return np.asarray(found + jump * np.exp(-decay * time) if jump else found)
@@ -79,7 +79,7 @@ def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatA
 
 @dataclass(frozen=True)
 class ClosedLoopTransforms:
-    """What set-point and load make of measurement and command.
+    """Transfer functions from set-point and load to measurement and command.
 
     :param law: the controller.
     :param model: the process, with all dead time of the loop.
@@ -127,7 +127,7 @@ def _horizon(law: ControlLaw, model: TransferFunction, frequency: float) -> floa
     if integral > 0.0:
         reset = abs(complex(law(np.array([1j * frequency]))[0])) / integral
         if model.is_stable:
-            # With a small gain the integral alone has to bring the process round.
+            # With a small gain, the integral alone brings the process to its set-point.
             reset += 1.0 / (integral * abs(model.gain))
     return _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
 
@@ -137,14 +137,14 @@ def step_responses(
 ) -> tuple[StepResponse, StepResponse]:
     """Return the responses to a unit step of the set-point, and to one of the load.
 
-    :param law: the controller, of a stable loop.
+    :param law: the controller of a stable loop.
     :param model: the process, with all dead time of the loop.
     :param duration: s.
-    :param points: instants.
+    :param points: number of instants.
     """
     to = ClosedLoopTransforms(law, model)
     s = abscissae(duration, points)
-    # At the same frequencies all four are made of the same three.
+    # All four responses follow from these three functions at the same frequencies.
     g, c, f = model(s), law(s), law.from_setpoint(s)
     rest = 1.0 + c * g
     time = np.arange(points) * (duration / points)
@@ -160,15 +160,15 @@ def step_responses(
 
 @dataclass(frozen=True)
 class StepFigures:
-    """What the responses to unit steps are like.
+    """Features of the responses to unit steps.
 
     :param iae_load: integral of the absolute error after a step of the load [y s/u]; infinite
-        where an error remains.
-    :param iae_setpoint: of the absolute error after a step of the set-point [s].
-    :param overshoot: of the measurement over its final value after a step of the set-point,
-        relative to that.
-    :param settling_time: from which on the measurement stays within 2 % of its final value after
-        a step of the set-point [s].
+        if an error remains.
+    :param iae_setpoint: integral of the absolute error after a step of the set-point [s].
+    :param overshoot: overshoot of the measurement after a step of the set-point, relative to its
+        final value.
+    :param settling_time: time after a step of the set-point until the measurement stays within
+        2 % of its final value [s].
     :param effort_setpoint: total variation of the command after a step of the set-point [u/y].
     :param effort_load: total variation of the command after a step of the load.
     """
@@ -182,9 +182,9 @@ class StepFigures:
 
 
 def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> StepFigures:
-    """Return what the responses to unit steps are like.
+    """Return the features of the responses to unit steps.
 
-    :param law: the controller, of a stable loop.
+    :param law: the controller of a stable loop.
     :param model: the process, with all dead time of the loop.
     :param frequency: about which the loop is closed [rad/s].
     :raises TuningError: if the responses do not die away in any reasonable time.
@@ -197,7 +197,7 @@ def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> 
         final = float(to.measurement_from_setpoint(rest)[0].real)
         offset = float(to.measurement_from_load(rest)[0].real)
     duration = _horizon(law, model, frequency)
-    # Twenty instants to a turn, as far as that can be had.
+    # Twenty instants per period of this frequency, if the number of points allows it.
     finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
     points = max(_POINTS, 1 << finest.bit_length())
     longest = _LONGEST * duration
@@ -249,6 +249,6 @@ def _settling_time(time: FloatArray, error: FloatArray, band: float) -> float:
 
 
 def _iae(whole: float, error: FloatArray, step: float) -> float:
-    """Return the integral of |error|, from that of the error itself and the smaller part."""
+    """Return the integral of |error| from the integral of the error and its part of other sign."""
     other = np.maximum(-math.copysign(1.0, whole) * error, 0.0)
     return abs(whole) + 2.0 * float(other.sum()) * step

@@ -1,11 +1,10 @@
-r"""The controller as it runs: at a sampling period, within the limits of its actuator.
+r"""The sampled controller: at a sampling period, within the limits of its actuator.
 
-The filter is advanced exactly for a measurement that runs straight from one sample to the next,
-so that it has the same lag at every sampling period, and without a filter the derivative is the
-difference quotient. The integral is advanced by the backward rule, and drawn back by what the
-limits cut off (Astrom and Hagglund's back-calculation), so that it does not wind up. At a limit it
-moves no further than the range of the limits lets it, so that one wild sample leaves it where it
-was.
+The filter is exact for a measurement that is linear between samples. So its lag is the same at
+every sampling period, and without a filter the derivative is the difference quotient. The integral
+is advanced by the backward rule, with Astrom and Hagglund's back-calculation against windup. At a
+limit, its change in one sample is bounded by the range of the limits, so that one outlier hardly
+moves it.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ UNLIMITED = Limits()
 
 
 def require_period(period: float) -> None:
-    """Refuse what cannot be a sampling period.
+    """Refuse an invalid sampling period.
 
     :param period: s.
     :raises TuningError: if it is not positive and finite.
@@ -63,7 +62,7 @@ def require_period(period: float) -> None:
 
 
 class SampledController(Protocol):
-    """What turns one sample of the measurement into one command."""
+    """A controller that turns one sample of the measurement into one command."""
 
     period: float
 
@@ -72,7 +71,7 @@ class SampledController(Protocol):
 
 
 def filter_matrices(tf: float, period: float) -> Motion:
-    """Return how ``(yf, dyf/dt)`` moves on over one period.
+    """Return the matrices that advance ``(yf, dyf/dt)`` by one period.
 
     ``x = F x + g0 y + g1 y_next`` with ``yf + tf yf' + tf^2/2 yf'' = y``.
 
@@ -82,25 +81,25 @@ def filter_matrices(tf: float, period: float) -> Motion:
     """
     if tf <= 1e-6 * period:
         return np.zeros((2, 2)), np.array([0.0, -1.0 / period]), np.array([1.0, 1.0 / period])
-    # The poles lie at (-1 +- j)/tf, and a is the period in time constants. A matrix exponential
-    # would be solved for by BLAS, whose threads take longer to agree than this takes.
+    # The poles lie at (-1 +- j)/tf, and a is the period in time constants. The closed form is
+    # faster than a matrix exponential with BLAS, whose threads need time to synchronise.
     a = period / tf
     decay, cosine, sine = math.exp(-a), math.cos(a), math.sin(a)
     late, away = math.expm1(-a), 2.0 * math.sin(0.5 * a) ** 2
     turn = decay * np.array([[cosine + sine, tf * sine], [-2.0 / tf * sine, cosine - sine]])
     step = np.array([away - sine - late * (cosine + sine), 2.0 / tf * decay * sine])
-    # What a measurement leaves that rises from 0 to 1 in the period.
+    # Response to a measurement that rises from 0 to 1 within the period.
     ramp = np.array([1.0 + (late * cosine - away) / a, step[0] / period])
     return turn, step - ramp, ramp
 
 
 class PidLaw:
-    """The law from one sample to the next: its filter, its integral, and what the limits cut off.
+    """The control law of one sample: filter, integral, and back-calculation at the limits.
 
-    The gains are given with each sample, so that they may be others from one on.
+    The gains are given with each sample, so that they may change at any sample.
 
-    :param measurement: at which the filter starts [y].
-    :param integral: at which the integral starts [u].
+    :param measurement: initial value of the filter [y].
+    :param integral: initial value of the integral [u].
     """
 
     def __init__(self, measurement: float, integral: float) -> None:
@@ -110,9 +109,9 @@ class PidLaw:
         self._last = measurement
 
     def hear(self, motion: Motion, measurement: float) -> None:
-        """Take a measurement, which ran straight from the one before.
+        """Take a measurement, which is linear since the one before.
 
-        :param motion: of the filter over the interval, see :func:`filter_matrices`.
+        :param motion: matrices of the filter for the interval, see :func:`filter_matrices`.
         :param measurement: y.
         """
         turn, past, present = motion
@@ -120,7 +119,7 @@ class PidLaw:
         self._last = measurement
 
     def replace_last(self, measurement: float) -> None:
-        """Take another measurement of the same instant [y]."""
+        """Replace the last measurement by another one at the same instant [y]."""
         self._last = measurement
 
     def proportional(self, c: Controller, setpoint: float) -> float:
@@ -137,7 +136,7 @@ class PidLaw:
 
         :param c: the gains.
         :param setpoint: y.
-        :param interval: since the sample before [s].
+        :param interval: time since the sample before [s].
         :param limits: range of the command.
         """
         before = self.integral
@@ -149,10 +148,10 @@ class PidLaw:
         if given != wanted and tracking > 0.0:
             pull = min(1.0, interval / tracking)
             drawn = self.integral + pull * (given - wanted)
-            # One sample moves the integral by no more than the limits' range would in its time,
+            # One sample moves the integral by at most `pull` times the range of the limits,
             room = pull * (limits.high - limits.low)
             drawn = min(max(drawn, before - room), before + room)
-            # and it asks for no command beyond the limits, neither now nor at the set-point.
+            # and it gives no command beyond the limits, neither now nor at the set-point.
             rest = c.kc * (c.b - 1.0) * setpoint
             low, high = limits.low - max(rest, part), limits.high - min(rest, part)
             self.integral = min(max(drawn, low), high)
@@ -163,11 +162,11 @@ class SampledPid:
     """A PI or PID controller that is called once for each sample.
 
     :param controller: the gains.
-    :param period: of the samples [s].
+    :param period: period of the samples [s].
     :param low: least command [u].
     :param high: largest command [u].
-    :param offset: command at which the integral starts [u].
-    :param measurement: at which the filter starts [y].
+    :param offset: initial value of the integral [u].
+    :param measurement: initial value of the filter [y].
     :raises TuningError: if the period is not positive or the limits leave no range.
     """
 

@@ -1,4 +1,4 @@
-r"""Poles of a closed loop in the right half plane, by an argument principle that cannot miss one.
+r"""Number of closed-loop poles in the right half plane, by an exact argument principle.
 
 The characteristic equation is ``1 + sum L_k(s) = 0``, each L_k rational with a dead time of its
 own. Where they have n poles at s = 0, all is multiplied by ``(a s/(1 + a s))^n``; the function H
@@ -7,9 +7,9 @@ zeros in the right half plane are those of the closed loop, and
 
     zeros = poles - (turning of H from w = 0 to infinity)/pi.
 
-How far H turns is not read off a grid: the axis is divided until, on every piece, a bound on
-``|H'|`` times the length of the piece is smaller than ``|H|`` at its beginning, so that H cannot
-have passed round the origin unseen. From the frequency on at which H can no longer be as far
+The turning of H is not read from a grid: the axis is divided until, on every piece, a bound on
+``|H'|`` times the length of the piece is smaller than ``|H|`` at its beginning. So H cannot pass
+around the origin unseen. From the frequency on at which H can no longer be as far
 from its limit as zero is, it cannot turn any more. A loop of neutral type, whose L_k with dead
 time do not vanish at infinity, is stable only if their magnitudes there have a sum below that of
 the rest (Bellman and Cooke 1963).
@@ -34,20 +34,20 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _PIECES = 128
 _PARTS = 4
-# Where pieces become this short H passes through zero, or so close that nobody could tell.
+# If a piece becomes this short, H passes through zero within the accuracy of the numbers.
 _SHORTEST = 1e-12
 _MOST_PIECES = 1_000_000
 _SURE = 0.9
-# Tangent of a step of the phase that can only have gone the short way round.
+# Tangent of a phase step that is small enough to be unambiguous.
 _CLEAR = math.tan(1.0)
 _COMPLEX_FACTOR = math.sqrt(0.75)
 
 
 def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
-    """Return how many zeros ``1 + sum L_k(s)`` has in the right half plane.
+    """Return the number of zeros of ``1 + sum L_k(s)`` in the right half plane.
 
-    :param terms: the L_k. Poles that several have in common count once.
-    :return: a whole number; infinite where there is no end of them, or one lies on the axis.
+    :param terms: the L_k. Poles that several terms share count once.
+    :return: a whole number; infinite for infinitely many zeros, or one on the axis.
     :raises TuningError: if a term has poles on the imaginary axis other than at s = 0.
     """
     if any(t.real == 0.0 for term in terms for t in term.time_constants):
@@ -65,17 +65,17 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
 def winding(
     values: ComplexArray, w: FloatArray, poles: IntArray, integrators: IntArray, limits: FloatArray
 ) -> FloatArray:
-    """Return the same count for many loops from values on a grid, NaN where they leave it open.
+    """Return the same count for many loops from values on a grid; NaN if it is not certain.
 
-    Much faster than :func:`closed_loop_unstable_poles`, for loops that are known to be far from
-    zero on a grid that is known to be fine, such as those of models like one another.
+    This is much faster than :func:`closed_loop_unstable_poles`. The loops must stay away from
+    zero and the grid must be fine, as for an ensemble of similar models.
 
     :param values: ``1 + L``, shape (n, m).
-    :param w: rad/s, shape (n,), increasing, from where all but integrators has come to rest to
-        where the loops have vanished.
-    :param poles: how many each L has in the right half plane, shape (m,).
-    :param integrators: of each L, shape (m,).
-    :param limits: of each L for s -> infinity; 0 where there is a dead time, shape (m,).
+    :param w: rad/s, shape (n,), increasing, from a frequency below all dynamics but integrators to
+        one at which the loops have vanished.
+    :param poles: number of poles of each L in the right half plane, shape (m,).
+    :param integrators: number of integrators of each L, shape (m,).
+    :param limits: limit of each L for s -> infinity; 0 with a dead time, shape (m,).
     :return: shape (m,).
     """
     s = 1j * w / math.sqrt(w[1] * w[-1])
@@ -87,7 +87,7 @@ def winding(
         bounded[:-1, of] = values[:, of] * (risen**n)[:, None]
     steps = bounded[1:] * bounded[:-1].conj()
     clear = np.all(np.abs(steps.imag) < _CLEAR * steps.real, axis=0)
-    # With steps so short a turn is a passage of the negative real axis from above.
+    # With such short steps, each turn is one crossing of the negative real axis from above.
     above, left = bounded.imag >= 0.0, bounded.real < 0.0
     falls = np.sum(left[1:] & above[:-1] & ~above[1:], axis=0)
     rises = np.sum(left[1:] & ~above[:-1] & above[1:], axis=0)
@@ -97,7 +97,7 @@ def winding(
 
 
 def at_infinity(term: TransferFunction) -> float:
-    """Return the limit for s -> infinity, of the magnitude where there is a dead time."""
+    """Return the limit for s -> infinity; with a dead time that of the magnitude."""
     excess = len(term.zeros) - len(term.time_constants) - term.integrators
     if excess < 0:
         return 0.0
@@ -156,7 +156,7 @@ class _Factors:
         return np.asarray(slope * below)
 
     def largest_beyond(self, w: float) -> float:
-        """Return a magnitude not exceeded at any frequency from w on, twice all resonances."""
+        """Return a bound on the magnitude from w on, for w above twice all resonances."""
         zeros = sorted(zip(np.abs(self.c), self.b, strict=True), reverse=True)
         bound = abs(self.gain)
         for k, pole in enumerate(sorted(self.d, key=abs, reverse=True)):
@@ -169,7 +169,7 @@ class _Factors:
         return float(bound)
 
     def change_beyond(self, w: float) -> float:
-        """Return how far from its limit it is at most, from w on, relative to that limit."""
+        """Return a bound on the distance from the limit from w on, relative to the limit."""
         bound = 1.0
         for b, c in zip(self.b, np.abs(self.c), strict=True):
             bound *= 1.0 + b / (w * c)
@@ -189,11 +189,11 @@ def _extent(
 
 
 def _turning(terms: Sequence[TransferFunction], limit: float, near: float) -> float | None:
-    """Return by how much the phase of H grows from w = 0 to infinity; None: H has a zero there.
+    """Return the growth of the phase of H from w = 0 to infinity; None: H has a zero there.
 
     :param terms: the L_k.
-    :param limit: of the part of H without dead time, for w -> infinity.
-    :param near: distance from there, less than that of zero, which H need not leave any more.
+    :param limit: limit of the part of H without dead time, for w -> infinity.
+    :param near: radius around that limit, without zero, in which H stays in the end.
     """
     n = max(term.integrators for term in terms)
     sizes = [abs(c) for t in terms for c in (*t.zeros, *t.time_constants)]
@@ -224,7 +224,7 @@ def _turning(terms: Sequence[TransferFunction], limit: float, near: float) -> fl
 
 
 def _end(parts: Sequence[_Factors], near: float, sizes: Sequence[float]) -> float:
-    """Return a frequency from which on H stays as near to its limit as is asked."""
+    """Return a frequency from which on H stays within ``near`` of its limit."""
     resonances = [1.0 / abs(d) for p in parts for d in p.d if d.imag != 0.0]
     w = 2.0 * max([*resonances, 0.5 / max(sizes, default=1.0)])
     while True:

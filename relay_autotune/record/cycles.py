@@ -36,12 +36,12 @@ __all__ = [
 MIN_CYCLES = 3
 TOLERANCE = 0.02
 
-# A pause between samples is a gap if it is longer than 5 median intervals and matters, that is,
-# takes more than a twentieth of the cycle.
+# A pause between samples is a gap if it is longer than 5 median intervals and than a twentieth of
+# the cycle.
 _GAP_INTERVALS = 5.0
 _GAP_SHARE = 0.05
 
-# Agreement allows for so many standard deviations of the noise; see `agree`.
+# Allowance of `agree` for noise, in standard deviations.
 _NOISE_MARGIN = 3.0
 
 
@@ -56,13 +56,13 @@ def cycle_from_samples(
 ) -> Cycle:
     """Compute the features of one whole cycle from its samples.
 
-    The samples begin with the one that was answered by the switch to the high level, and end with
-    the one that begins the next cycle: that one bounds the last interval and is not part of the
-    cycle. The mean of the measurement is that of the straight lines between its samples, the mean
-    of the command that of the held command (Wang, Hang & Zou 1997, eq 6, needs both).
+    The first sample is the one answered by the switch to the high level. The last sample begins
+    the next cycle: it bounds the last interval and is not part of this cycle. The mean of the
+    measurement uses straight lines between the samples, the mean of the command the held command
+    (Wang, Hang & Zou 1997, eq 6, needs both).
 
-    Noise may make the relay switch to and fro for a moment; the switch to the low level is the
-    one that begins its longest stay there, and ``period_high`` and ``period_low`` are the total
+    Noise may make the relay switch back and forth for a moment. So the switch to the low level is
+    the one before the longest stay there, and ``period_high`` and ``period_low`` are the total
     times at each level.
 
     :param index: number of the cycle.
@@ -90,8 +90,8 @@ def cycle_from_samples(
         mean_measurement = float(np.mean(measurement[:-1]))
         mean_command = float(np.mean(command))
     down = _longest_low(time, high)
-    # The extremes belong to the cycle, without the sample that begins the next one. Each is
-    # searched from the switch that leads to it.
+    # Search the extremes without the first sample of the next cycle, each from the switch that
+    # leads to it.
     y = measurement[:-1]
     raised, lowered = (0, down) if reverse_acting else (down, 0)
     top = raised + int(np.argmax(y[raised:]))
@@ -114,7 +114,7 @@ def cycle_from_samples(
 
 
 def _longest_low(time: FloatArray, high: np.ndarray) -> int:
-    """Return the sample that begins the longest stay at the low level, 0 if there is none."""
+    """Return the first sample of the longest stay at the low level, 0 if there is none."""
     edges = np.diff(high.astype(np.int8))
     begins = np.flatnonzero(edges == -1) + 1
     if begins.size == 0:
@@ -127,19 +127,20 @@ def _longest_low(time: FloatArray, high: np.ndarray) -> int:
 def agree(cycles: Sequence[Cycle], noise_std: float, interval: float, tolerance: float) -> bool:
     """Return True if the half periods and the peaks of some cycles agree.
 
-    Between the largest and the smallest of each are allowed
+    The allowed difference between the largest and the smallest is
 
     - half periods: ``tolerance`` of their mean, plus two sample intervals, plus three standard
       deviations of the noise divided by the slope of the measurement on its slower way;
-    - peaks: ``tolerance`` of the amplitude (half of peak to peak), plus what the measurement moves
-      in two sample intervals on its faster way, plus three standard deviations of the noise.
+    - peaks: ``tolerance`` of the amplitude (half of peak to peak), plus the change of the
+      measurement in two sample intervals on its faster way, plus three standard deviations of the
+      noise.
 
-    A sampled relay switches late by up to one interval, and by another up to one the time before;
-    so the limit cycle itself wanders within these two intervals, and never settles further. The
-    slopes are peak to peak over the shorter and the longer half period.
+    A sampled relay switches up to one interval late at both ends of a half period. So even the
+    limit cycle varies within two intervals. The slopes are peak to peak over the shorter and the
+    longer half period.
 
     :param cycles: the cycles to compare, at least one.
-    :param noise_std: standard deviation of the measurement noise [y]; NaN: not known, as 0.
+    :param noise_std: standard deviation of the measurement noise [y]; NaN (not known) counts as 0.
     :param interval: sample interval [s].
     :param tolerance: relative difference allowed.
     """
@@ -175,8 +176,8 @@ def next_cycle(
 ) -> Cycle:
     """Compute the features of a cycle, and whether it agrees with those before it.
 
-    It uses nothing that comes later, so that a live experiment and a replay of its record give
-    the same cycles bit for bit.
+    It uses only data up to this cycle, so that a live experiment and a replay of its record give
+    identical cycles.
 
     :param before: the cycles so far, in order.
     :param time: as for :func:`cycle_from_samples`, as are the next four.
@@ -202,10 +203,10 @@ def cycles_of(
 ) -> tuple[Cycle, ...]:
     """Compute the whole cycles of a record.
 
-    The cycles are bounded by ``record.cycle_start``. Where that is empty and it is not known how
-    the experiment ended (a recording that was cut short, or another program's), they are bounded
-    by the switches of the command, as found by
-    :func:`~relay_autotune.record.foreign.find_cycles`; and settings that are missing are inferred.
+    The cycles are bounded by ``record.cycle_start``. If that is empty and the outcome is unknown
+    (a truncated recording, or one of another program), they are bounded by the switches of the
+    command, see :func:`~relay_autotune.record.foreign.find_cycles`, and missing settings are
+    inferred.
 
     :param record: the record of an experiment.
     :param min_cycles: number of successive cycles that must agree for ``converged``.
@@ -222,7 +223,7 @@ def cycles_of(
         low, high = float(sent.min()), float(sent.max())
         middle = settings.baseline + settings.bias
         if not low < middle < high:
-            # The levels were shifted later, to bear a load.
+            # The levels were shifted later, to compensate a load.
             middle = 0.5 * (low + high)
         cycles.append(
             next_cycle(
@@ -248,11 +249,10 @@ def _bounds(record: Record) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class LimitCycle(CycleFeatures):
-    """Averages over the cycles that agree, or over the last ones if none do.
+    """Averages over the cycles that agree, or else over the last cycles.
 
-    :param std: standard deviation of each of the features between the cycles, by name; 0 for one
-        cycle.
-    :param cycles: indices of the cycles averaged.
+    :param std: standard deviation of each feature between the cycles, by name; 0 for one cycle.
+    :param cycles: indices of the averaged cycles.
     :param converged: True if they agree.
     """
 
@@ -272,9 +272,9 @@ def limit_cycle(
 ) -> LimitCycle:
     """Average the cycles of the limit cycle.
 
-    These are the last unbroken run of converged cycles together with the ``min_cycles - 1``
-    before it, with which they agree; if none is converged, the last ``min_cycles``. Disturbed
-    cycles are left out if others remain.
+    These are the last unbroken run of converged cycles and the ``min_cycles - 1`` cycles before
+    it, with which they agree. Without a converged cycle they are the last ``min_cycles``.
+    Disturbed cycles are left out if others remain.
 
     :param source: a record, or its cycles.
     :param min_cycles: number of successive cycles that had to agree.

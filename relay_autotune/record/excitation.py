@@ -1,4 +1,4 @@
-"""Find the experiments in a long record: where the command moves the process, and how."""
+"""Find the experiments in a long record: the parts in which the command moves the process."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ import numpy as np
 
 from relay_autotune.record.record import FloatArray, IntArray, Record, roughness
 
-# Switches between two levels that make a relay phase: two whole cycles.
+# Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
 # A stay this many times the usual one ends a relay phase.
 _LONG_STAY = 4.0
 
-# Steps belong together unless the process rests between them this many times as long as it moved.
+# Steps form one experiment unless the process rests between them this many times as long as it
+# moved.
 _REST = 10.0
 
-# A command that changes with more than this share of the samples is a controller's.
+# A command that changes at more than this share of the samples comes from a controller.
 _CONTINUOUS = 0.2
 _FEWEST_CHANGES = 20
 
-# Nothing recorded for so long, and so many times the usual interval, is a break.
+# A break in the record: no sample for this time, and for a multiple of the usual interval.
 _BREAK_S = 60.0
 _BREAK_INTERVALS = 1000.0
 
-# Equal samples at an end of the measurement's range that are saturation, not chance.
+# Number of equal samples at an end of the measurement's range that means saturation.
 _SATURATED = 20
 
-# The measurement moves where it leaves its rest by this many standard deviations of its noise,
-# and by this share of its range.
+# The measurement moves if it leaves its rest by this many standard deviations of its noise, and by
+# a share of its range.
 _NOISE = 4.0
 _SHARE = 0.05
 
-# Parts into which a record under a controller is divided to tell movement from rest.
+# Number of parts of a record under a controller, to separate movement from rest.
 _BLOCKS = 400
 
 
@@ -45,7 +46,7 @@ class Stretch:
     :param first: index of its first sample.
     :param last: index of its last sample.
     :param kind: ``relay``, ``steps``, ``pulses`` or ``closed loop``.
-    :param reason: what is seen there, for people.
+    :param reason: description for the user.
     """
 
     first: int
@@ -57,12 +58,12 @@ class Stretch:
 def find_experiments(record: Record) -> tuple[Stretch, ...]:
     """Return the stretches of a record in which the process is excited, in order.
 
-    Rest before and after is part of an experiment, as long as the experiment itself at most: it
-    shows the operating point. Where the measurement is saturated, or nothing was recorded for
-    long, an experiment ends.
+    A stretch includes the rest before and after it, which shows the operating point; each rest is
+    at most as long as the experiment itself. A saturated measurement or a break ends an
+    experiment.
 
     :param record: a record of any origin.
-    :returns: none if the command moves nothing.
+    :returns: the stretches; empty if the command does not move the measurement.
     """
     found: list[Stretch] = []
     for first, last in _unbroken(record):
@@ -86,12 +87,12 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
 
 
 def _saturated(y: FloatArray) -> np.ndarray:
-    """Return which samples stand still at an end of the measurement's range."""
+    """Return which samples are constant at an end of the measurement's range."""
     low, high = float(np.min(y)), float(np.max(y))
     still = np.zeros(y.size, dtype=np.bool_)
     equal = np.diff(y) == 0.0
     if low == high or float(np.mean(equal)) > 0.5:
-        # A coarsely quantised measurement, or one without noise at rest, stands still often.
+        # A coarsely quantised measurement, or one without noise at rest, is often constant.
         return still
     for end in (low, high):
         edges = np.flatnonzero(np.diff(np.concatenate(([0], (y == end).astype(np.int8), [0]))))
@@ -132,7 +133,7 @@ class _Changes:
     levels: FloatArray
 
 
-# --- a command that holds between its changes
+# --- a command that is constant between its changes
 
 
 def _switching_parts(
@@ -187,7 +188,7 @@ def _without_long_stays(times: FloatArray, begin: int, stop: int) -> list[tuple[
 def _with_kick(
     changes: _Changes, run: tuple[int, int], runs: Sequence[tuple[int, int]]
 ) -> tuple[int, int]:
-    """Add the changes that lead into a relay phase, and out of it."""
+    """Add the changes just before and after a relay phase."""
     times, (begin, stop) = changes.times, run
     reach = _LONG_STAY * float(np.median(np.diff(times[begin:stop])))
     others = {k for other in runs if other != run for k in range(*other)}
@@ -214,7 +215,7 @@ def _relay(
 
 
 def _follows(record: Record, at: IntArray, up: np.ndarray) -> bool:
-    """Tell a relay from pulses by the clock: it switches at the same measurement each time."""
+    """Distinguish a relay from timed pulses: a relay switches at the same measurements."""
     inside = record.measurement[at[0] : at[-1] + 1]
     swing = float(np.ptp(inside))
     if swing == 0.0 or np.count_nonzero(up) < 2 or np.count_nonzero(~up) < 2:
@@ -239,7 +240,7 @@ def _settled(record: Record, last: int, changes: _Changes) -> FloatArray:
             continue
         final = float(np.median(part[-max(part.size // 5, 3) :]))
         band = max(_NOISE * noise, _SHARE * float(np.max(np.abs(part - final))))
-        # Of many samples one lies far out by chance; five in a row do not.
+        # One of many samples may lie far out by chance; the mean of five does not.
         smooth = np.convolve(part, np.full(5, 0.2), mode="valid")
         moving = np.flatnonzero(np.abs(smooth - final) > band)
         settled[k] = begin if moving.size == 0 else record.time[low + moving[-1]]
@@ -247,7 +248,7 @@ def _settled(record: Record, last: int, changes: _Changes) -> FloatArray:
 
 
 def _rests(changes: _Changes, settled: FloatArray, group: Sequence[int], k: int) -> bool:
-    """Return whether the process rests so long before a change that another experiment begins."""
+    """Return whether a long rest before a change separates two experiments."""
     moved = float(settled[k - 1] - changes.times[group[0]])
     return bool(changes.times[k] - settled[k - 1] > _REST * moved)
 
@@ -270,11 +271,11 @@ def _steps(
     return [(float(changes.times[begin]), float(settled[stop - 1]), kind, reason)]
 
 
-# --- a command that a controller moves all the time
+# --- a command that a controller changes all the time
 
 
 def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, float, str, str]]:
-    """Return the parts in which the set-point, or a load, moved the measurement."""
+    """Return the parts in which the set-point or a load moved the measurement."""
     time, y = record.time[first : last + 1], record.measurement[first : last + 1]
     edges = np.unique(np.linspace(0, y.size, min(_BLOCKS, max(y.size // 5, 1)) + 1).astype(int))
     means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
@@ -318,7 +319,7 @@ def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, fl
 def _with_rest(
     record: Record, first: int, last: int, found: Sequence[tuple[float, float, str, str]]
 ) -> list[Stretch]:
-    """Add the rest before and after each experiment, and drop those that move nothing."""
+    """Add the rest before and after each experiment, and drop those without a response."""
     stretches = []
     noise = roughness(record.measurement[first : last + 1])
     for k, (begin, end, kind, reason) in enumerate(found):

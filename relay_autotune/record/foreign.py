@@ -8,11 +8,11 @@ import numpy as np
 
 from relay_autotune.record.record import FloatArray, IntArray, Record, RelaySettings, asked_once
 
-# Two commands nearer than this, relative to the range of the command, are one level.
+# Two commands that differ by less than this part of the command's range are one level.
 _LEVEL_TOLERANCE = 1e-6
 
-# A command of more levels than this among its changes is a controller's, not a relay's; the
-# levels before and after the experiment and a few manual steps are within it.
+# A command with more levels than this comes from a controller, not from a relay. The number leaves
+# room for the levels before and after the experiment and a few manual steps.
 _MAX_LEVELS = 12
 
 # A stay at a level shorter than this fraction of the usual stay is noise at a switch.
@@ -44,8 +44,8 @@ def find_cycles(record: Record) -> tuple[int, ...]:
     """Return the samples at which cycles begin, from the switches of the command alone.
 
     Levels before and after the oscillation (a baseline, a manual step) may differ from the two
-    levels of the relay. A short stay at a level, less than a tenth of the usual one, is taken for
-    noise at a switch and begins no cycle.
+    levels of the relay. A stay at a level of less than a tenth of the usual one counts as noise at
+    a switch and begins no cycle.
 
     :param record: a record of any origin.
     :returns: indices as in ``Record.cycle_start``; empty if the command does not switch to a
@@ -58,11 +58,11 @@ def find_cycles(record: Record) -> tuple[int, ...]:
 def infer_settings(record: Record) -> RelaySettings | None:
     """Estimate the settings of a relay from a record that carries none.
 
-    The levels are those of the command. The baseline is the level before the oscillation if there
-    is another one; otherwise the middle of the levels, with no bias. The switching levels of the
-    measurement lie between the samples before and at the switches, so set-point and hysteresis
-    are known to about half of what the measurement moves in a sample interval, and less well if
-    the relay saw another signal than the recorded one. The relay is direct-acting if the
+    The levels are those of the command. The baseline is the level before the oscillation if that
+    is a third level; otherwise the middle of the levels, with no bias. The switching levels of the
+    measurement lie between the samples before and at the switches. So set-point and hysteresis are
+    accurate to about half of the measurement's change in a sample interval, and less accurate if
+    the relay acted on another signal than the recorded one. The relay is direct-acting if the
     measurement is higher at the switches down than at the switches up.
 
     :param record: a record of any origin.
@@ -91,7 +91,7 @@ def infer_settings(record: Record) -> RelaySettings | None:
 
 @asked_once
 def settings_of(record: Record) -> RelaySettings | None:
-    """Return the settings of a record's relay: its own, or else what its data tell.
+    """Return the relay settings of a record: its own, or else those inferred from its data.
 
     :param record: a record of any origin.
     :returns: as :func:`infer_settings`.
@@ -100,7 +100,7 @@ def settings_of(record: Record) -> RelaySettings | None:
 
 
 def _crossed_level(measurement: FloatArray, at: IntArray) -> float:
-    """Return the level that the measurement reached from below at some samples."""
+    """Return the level that the measurement crosses from below at given samples."""
     before = measurement[np.maximum(at - 1, 0)]
     reached = measurement[at]
     lowest, highest = float(np.max(before)), float(np.min(reached))
@@ -113,7 +113,7 @@ def find_relay(record: Record) -> RelayStretch | None:
     """Return the longest stretch in which the command switches between two levels.
 
     :param record: a record of any origin.
-    :returns: None if no two levels have two switches from the lower to the higher.
+    :returns: the stretch; None without two switches from a lower to a higher level.
     """
     command = record.command
     change = np.flatnonzero(np.diff(command) != 0.0) + 1
@@ -162,8 +162,8 @@ def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | N
     is_high = value > 0.5 * (np.max(value) + np.min(value))
     stay = np.diff(np.append(record.time[starts], record.time[last]))
     long = stay >= _SHORT_STAY * _usual_stay(stay)
-    # A switch counts if the stay that it ends was no moment of noise, and it leads to the other
-    # level than the last switch that counted.
+    # A switch counts if the stay before it was not noise, and it goes to the other level than the
+    # last switch that counted.
     up: list[int] = []
     down: list[int] = []
     at_high: bool | None = None
@@ -185,7 +185,7 @@ def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | N
 
 
 def _usual_stay(stay: FloatArray) -> float:
-    """Return the stay such that half of the time was spent in longer ones."""
+    """Return the time-weighted median of the stays: half of the time was spent in longer ones."""
     ordered = np.sort(stay)
     total = np.cumsum(ordered)
     return float(ordered[int(np.searchsorted(total, 0.5 * total[-1]))])

@@ -1,4 +1,4 @@
-"""What one experiment recorded: samples, settings, cycles."""
+"""The record of one experiment: samples, settings, cycles."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from relay_autotune.errors import RecordError
 
 FloatArray = NDArray[np.float64]
-# Slopes that differ by less, as a share of the steepest, are rounding.
+# Slopes that differ by less than this part of the steepest one are equal.
 _STRAIGHT = 1e-12
 IntArray = NDArray[np.int64]
-# No quantity of a process is larger, and the squares of smaller ones can be added.
+# Largest value of a quantity; squares of values up to this can be added without overflow.
 LARGEST = 1e152
 
 
@@ -68,7 +68,7 @@ class Outcome(enum.IntEnum):
 
 @dataclass(frozen=True)
 class RelaySettings:
-    """What the relay did in an experiment.
+    """The relay's settings in an experiment.
 
     The command is ``baseline + bias + amplitude`` (high) or ``baseline + bias - amplitude``
     (low); a direct-acting relay goes low when the measurement rises to
@@ -106,7 +106,7 @@ class RelaySettings:
 
 @dataclass(frozen=True)
 class CycleFeatures:
-    """What is measured of a cycle, or averaged over several.
+    """Features of a cycle, or their averages over several cycles.
 
     :param period: whole period [s].
     :param period_high: time with the command high, T_u1 of Wang et al. [s].
@@ -195,7 +195,7 @@ class PiecewiseConstant:
 
 @dataclass(frozen=True)
 class PiecewiseLinear:
-    """A signal that moves along straight lines, and rests before the first and after the last.
+    """A signal of straight lines, constant before the first instant and after the last.
 
     :param times: instants at which the slope changes, strictly increasing [s], shape (m,).
     :param slopes: per second from each instant on, shape (m,).
@@ -231,7 +231,7 @@ class PiecewiseLinear:
         return cls(times[kept], slopes[kept], float(values[0]))
 
 
-# What drives a process.
+# The input of a process.
 Input = PiecewiseConstant | PiecewiseLinear
 
 
@@ -269,10 +269,10 @@ class Record:
     :param start: time of the first sample [s since the epoch]; 0: unknown.
     :param lost_samples: samples that the middleware is known to have lost.
     :param held_input: the command at its own instants [s on the axis of ``time``], for records
-        whose commands do not answer samples (a foreign recording, an ideal relay); None: as
-        ``command`` and ``command_time`` say.
-    :param continuous_command: True: the command moved along straight lines from one of its
-        instants to the next, as an analogue controller's does; False: it was held.
+        whose commands do not answer samples (a foreign recording, an ideal relay); None: it
+        follows from ``command`` and ``command_time``.
+    :param continuous_command: True: the command moved along straight lines between its instants,
+        as from an analogue controller; False: it was held.
     :ivar answers: what was asked of the record before, see :func:`asked_once`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
         goes backwards, or the noise is negative.
@@ -390,12 +390,12 @@ class Record:
 
     @asked_once
     def input(self) -> PiecewiseConstant:
-        """Return the command as the process saw it, on the clock of the samples.
+        """Return the command at the process, on the clock of the samples.
 
         Sensor and relay may run on different clocks, so only the relay's own interval between
-        receiving and answering is used: the smallest lag from stamp to arrival is taken as the
-        offset of the clocks. A constant transport delay thus counts as dead time of the loop,
-        which is what a controller in the relay's place would see.
+        receiving and answering is used. The smallest lag from stamp to arrival is taken as the
+        offset of the clocks. So a constant transport delay counts as dead time of the loop, as
+        a controller in place of the relay would see it.
         """
         if self.held_input is not None:
             return self.held_input
@@ -404,10 +404,10 @@ class Record:
         return PiecewiseConstant.from_samples(sent, self.command)
 
     def drive(self) -> Input:
-        """Return what the process was driven by: :meth:`input`, or the lines between its points.
+        """Return the input of the process: :meth:`input`, or straight lines between its points.
 
-        A command that is published for each sample and held is exact as it is, a slow one as a
-        staircase. One that moved on between its samples is half an interval early to that.
+        For a command that is held between its instants, the staircase is exact. A command that
+        moves between its samples is half an interval ahead of that staircase.
         """
         if not self.continuous_command:
             return self.input()
