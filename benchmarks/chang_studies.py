@@ -25,7 +25,7 @@ from relay_autotune.identification.methods.atv import (
     time_constant_from_phase,
     ultimate_estimate,
 )
-from relay_autotune.identification.methods.chang1992 import (
+from relay_autotune.identification.methods.chang import (
     time_constant_from_period,
     two_time_constants,
 )

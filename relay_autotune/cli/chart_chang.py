@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods.atv import atv_from_numbers
-from relay_autotune.identification.methods.chang_method import chang_from_numbers
-from relay_autotune.identification.methods.li_method import li_from_numbers
+from relay_autotune.identification.methods.chang import chang_from_numbers
+from relay_autotune.identification.methods.li import li_from_numbers
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 

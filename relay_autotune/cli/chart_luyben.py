@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.methods.luyben_method import (
+from relay_autotune.identification.methods.luyben import (
     identify_step_numbers,
     require_structure,
 )

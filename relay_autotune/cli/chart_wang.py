@@ -10,7 +10,7 @@ import numpy as np
 from relay_autotune.errors import SelectionError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.methods.wang1997 import (
+from relay_autotune.identification.methods.wang import (
     FopdtCycle,
     fopdt_from_biased,
     fopdt_with_gain,

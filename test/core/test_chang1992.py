@@ -13,14 +13,15 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.methods.chang1992 import (
+from relay_autotune.identification.methods.chang import (
+    chang_from_numbers,
     gain_and_time_constant,
+    identify_chang,
     time_constant_from_amplitude,
     time_constant_from_period,
     two_equal_and_one,
     two_time_constants,
 )
-from relay_autotune.identification.methods.chang_method import chang_from_numbers, identify_chang
 from relay_autotune.identification.methods.square_wave import fundamental, level, peak, slope_sign
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 from relay_autotune.process.sampled_relay import simulate_sampled_relay

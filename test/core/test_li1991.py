@@ -12,8 +12,12 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import JOINT_METHODS, identify, identify_jointly
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods.lag_models import MODEL_1, MODEL_4, MODEL_5
-from relay_autotune.identification.methods.li1991 import fit_jointly, fits_jointly, frequency_point
-from relay_autotune.identification.methods.li_method import li_from_numbers
+from relay_autotune.identification.methods.li import (
+    fit_jointly,
+    fits_jointly,
+    frequency_point,
+    li_from_numbers,
+)
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
 from relay_autotune.process.structures import equal_lags

@@ -12,12 +12,12 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.methods.luyben2003 import (
+from relay_autotune.identification.methods.luyben import (
     from_step,
+    identify_step_numbers,
     step_features,
     step_response,
 )
-from relay_autotune.identification.methods.luyben_method import identify_step_numbers
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction

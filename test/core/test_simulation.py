@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from worked_cases import cases
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.methods.wang1997 import fopdt_limit_cycle
+from relay_autotune.identification.methods.wang import fopdt_limit_cycle
 from relay_autotune.process.response import response
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay

@@ -10,14 +10,15 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.methods.wang1997 import (
+from relay_autotune.identification.methods.wang import (
     FopdtCycle,
     fopdt_from_biased,
     fopdt_from_unbiased,
     fopdt_limit_cycle,
     fopdt_with_gain,
+    identify_biased,
+    identify_unbiased,
 )
-from relay_autotune.identification.methods.wang_method import identify_biased, identify_unbiased
 from relay_autotune.identification.shown.fourier import cycle_means, frequency_point
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import simulate_relay
