@@ -1,7 +1,11 @@
-"""The errors that this package raises; each message says found, expected and what to do."""
+"""The errors that this package raises: found, expected, what to do; and look-up by name."""
+
+from __future__ import annotations
 
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 
 class RelayAutotuneError(Exception):
@@ -63,3 +67,21 @@ def defect(error: BaseException) -> str:
         f"a defect of relay_autotune, {type(error).__name__} at {place}; please report this line, "
         f"with the recording if you can"
     )
+
+
+T = TypeVar("T")
+
+
+def look_up(registry: Mapping[str, T], name: str, kind: str, error: type[RelayAutotuneError]) -> T:
+    """Return what has a name.
+
+    :param registry: all that there is, by name.
+    :param name: which one.
+    :param kind: what it is, for the message.
+    :param error: class of the error.
+    :raises RelayAutotuneError: of that class, if there is none of that name; the message lists
+        those there are.
+    """
+    if name not in registry:
+        raise error(f"unknown {kind} {name!r}; known: {', '.join(registry)}")
+    return registry[name]

@@ -6,18 +6,181 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from relay_autotune.cli.chart_chang import (
-    identify_atv_chart,
-    identify_chang_chart,
-    identify_li_chart,
-)
-from relay_autotune.cli.chart_luyben import identify_step_chart
-from relay_autotune.cli.chart_thyagarajan import identify_thyagarajan_chart
-from relay_autotune.cli.chart_wang import identify_biased_chart, identify_unbiased_chart
-from relay_autotune.errors import SelectionError
+import numpy as np
+
+from relay_autotune.errors import SelectionError, look_up
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.result import Identification
-from relay_autotune.registry import look_up
+from relay_autotune.identification.methods.atv import atv_from_numbers
+from relay_autotune.identification.methods.chang import chang_from_numbers
+from relay_autotune.identification.methods.li import li_from_numbers
+from relay_autotune.identification.methods.luyben import (
+    identify_step_numbers,
+    require_structure,
+)
+from relay_autotune.identification.methods.thyagarajan_method import identify_numbers
+from relay_autotune.identification.methods.wang import (
+    FopdtCycle,
+    fopdt_from_biased,
+    fopdt_with_gain,
+)
+from relay_autotune.identification.result import Identification, identified
+from relay_autotune.identification.shown.shape import Shape
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.structures import FOPDT
+
+
+def identify_chang_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify lags by the exact equations of Chang et al.
+
+    :param numbers: period, amplitude, relay, dead_time; hysteresis.
+    :param known: gain, structure and order where they are known.
+    :raises IdentificationError: if no such model has the limit cycle.
+    """
+    return chang_from_numbers(_cycle(numbers), known)
+
+
+def identify_atv_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify lags by the original ATV.
+
+    :param numbers: period, amplitude, relay, dead_time; hysteresis.
+    :param known: gain, structure and order where they are known.
+    :raises IdentificationError: if no such model has the limit cycle.
+    """
+    return atv_from_numbers(_cycle(numbers), known)
+
+
+def identify_li_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify lags with their gain from two tests, the second with a dead time added.
+
+    :param numbers: period, amplitude, relay; period_2, amplitude_2, extra_delay; relay_2 and
+        hysteresis.
+    :param known: dead time, structure and order where they are known.
+    :raises IdentificationError: if no such model has both limit cycles.
+    """
+    relay, hysteresis = numbers["relay"], numbers.get("hysteresis", 0.0)
+    first = SymmetricCycle(numbers["period"], numbers["amplitude"], relay, hysteresis, 0.0)
+    second = SymmetricCycle(
+        numbers["period_2"],
+        numbers["amplitude_2"],
+        numbers.get("relay_2", relay),
+        hysteresis,
+        numbers["extra_delay"],
+    )
+    return li_from_numbers((first, second), known)
+
+
+def _cycle(numbers: Mapping[str, float]) -> SymmetricCycle:
+    return SymmetricCycle(
+        numbers["period"],
+        numbers["amplitude"],
+        numbers["relay"],
+        numbers.get("hysteresis", 0.0),
+        numbers["dead_time"],
+    )
+
+
+def identify_step_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify an integrating process with inverse response (Luyben 2003, eqs 4 to 6).
+
+    :param numbers: t1, t2, extremum, step, dead_time.
+    :param known: the structure, which can only be this one.
+    :raises IdentificationError: if no such process has these numbers.
+    """
+    require_structure(known)
+    return identify_step_numbers(
+        numbers["t1"], numbers["t2"], numbers["extremum"], numbers["step"], numbers["dead_time"]
+    )
+
+
+def identify_thyagarajan_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify a model of the structure that the shape of a limit cycle suggests.
+
+    :param numbers: period, amplitude, relay; time_to_peak, time_half, rise, hysteresis.
+    :param known: structure, order and dead time where they are known.
+    :raises SelectionError: if neither numbers nor structure tell the category.
+    :raises IdentificationError: if no such model has the limit cycle.
+    """
+    peak = numbers.get("time_to_peak", math.nan)
+    half = numbers.get("time_half", math.nan)
+    shape = Shape(
+        half_period=0.5 * numbers["period"],
+        amplitude=numbers["amplitude"],
+        level=numbers.get("hysteresis", 0.0),
+        time_to_peak=peak,
+        rise=numbers.get("rise", peak),
+        rise_half=half,
+        sharpness=math.nan,
+        plateau=math.nan,
+    )
+    lags = known.order > 1 or known.structure == "lag_n"
+    if math.isnan(half) and math.isnan(peak) and math.isnan(known.dead_time) and not lags:
+        raise SelectionError(
+            "thyagarajan also needs --time-to-peak for a curve with sharp edges, with --time-half "
+            "for one that is almost rectangular, or --structure lag_n: with --order 2 for one "
+            "that took many cycles to grow, with --order 5 for one that did not"
+        )
+    if not math.isnan(half) and math.isnan(shape.rise):
+        raise SelectionError("--time-half also needs --time-to-peak")
+    # Whoever reads the time to half of the peak takes the curve for a rectangular one.
+    category = "1a" if math.isnan(half) else "1b"
+    return identify_numbers(shape, numbers["relay"], known, category)
+
+
+def identify_biased_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify a FOPDT model from the limit cycle of a biased relay (eqs 6 to 11).
+
+    :param numbers: period_high, period_low, peak_max, peak_min, relay, bias; hysteresis; and
+        mean_measurement with mean_command where the gain is not known.
+    :param known: the gain, whose sign is that of the process.
+    :raises SelectionError: if neither the gain nor the means are given.
+    :raises IdentificationError: if the numbers are no limit cycle of a FOPDT process.
+    """
+    gain = known.gain
+    if math.isnan(gain):
+        if not {"mean_measurement", "mean_command"} <= numbers.keys():
+            raise SelectionError(
+                "wang_biased also needs --gain, or --mean-measurement and --mean-command"
+            )
+        if numbers["mean_command"] == 0.0:
+            raise SelectionError(
+                "--mean-command must not be 0: the gain is the ratio of the means (eq 6)"
+            )
+        gain = numbers["mean_measurement"] / numbers["mean_command"]
+    # With the command turned round a reverse-acting process has a positive gain.
+    sign = -1 if gain < 0.0 else 1
+    high, low = (numbers["period_high"], numbers["period_low"])[::sign]
+    cycle = FopdtCycle(high, low, numbers["peak_max"], numbers["peak_min"])
+    k, tau, dead_time = fopdt_from_biased(
+        cycle,
+        abs(gain),
+        numbers["relay"],
+        sign * numbers["bias"],
+        numbers.get("hysteresis", 0.0),
+    )
+    return _fopdt("wang_biased", sign * k, tau, dead_time)
+
+
+def identify_unbiased_chart(numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify a FOPDT model from the limit cycle of an unbiased relay (eqs 21 and 22).
+
+    :param numbers: period, amplitude, relay; hysteresis.
+    :param known: the gain.
+    :raises IdentificationError: if the numbers are no limit cycle of a FOPDT process.
+    """
+    k, tau, dead_time = fopdt_with_gain(
+        abs(known.gain),
+        numbers["period"],
+        numbers["amplitude"],
+        numbers["relay"],
+        numbers.get("hysteresis", 0.0),
+    )
+    return _fopdt("wang_unbiased", math.copysign(k, known.gain), tau, dead_time)
+
+
+def _fopdt(method: str, gain: float, time_constant: float, dead_time: float) -> Identification:
+    return identified(method, Estimate.of(FOPDT, np.array((gain, time_constant, dead_time))))
+
 
 Numbers = Mapping[str, float]
 ChartMethod = Callable[[Numbers, Known], Identification]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from relay_autotune.errors import IdentificationError
+from relay_autotune.errors import IdentificationError, look_up
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.atv import identify_atv
@@ -20,7 +20,6 @@ from relay_autotune.identification.waveform.method import (
     identify_waveform_jointly,
 )
 from relay_autotune.record.record import Record
-from relay_autotune.registry import look_up
 
 Method = Callable[[Record, Known], Identification]
 JointMethod = Callable[[Sequence[Record], Known], Identification]

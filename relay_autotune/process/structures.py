@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.errors import ModelError
+from relay_autotune.errors import ModelError, look_up
 from relay_autotune.process.factors import (
     PAIR,
     TWO_LAGS,
@@ -35,7 +35,6 @@ from relay_autotune.process.model_parameters import (
     exactly,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.registry import look_up
 
 FloatArray = NDArray[np.float64]
 

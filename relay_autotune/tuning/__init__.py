@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from relay_autotune.errors import TuningError
+from relay_autotune.errors import TuningError, look_up
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
-from relay_autotune.registry import look_up
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule

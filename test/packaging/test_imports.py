@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # know each other.
 FLOORS = (
     {"errors", "threads"},
-    {"quantities", "registry", "confidence", "text", "escape"},
+    {"quantities", "confidence", "text", "escape"},
     {"record", "verdict"},
     {"process"},
     {"experiment"},

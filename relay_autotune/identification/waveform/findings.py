@@ -20,7 +20,6 @@ from relay_autotune.identification.result import (
     identified,
 )
 from relay_autotune.identification.waveform.averaging import averaged_point
-from relay_autotune.identification.waveform.choice import support
 from relay_autotune.identification.waveform.determination import with_what_is_determined
 from relay_autotune.identification.waveform.fit_covariance import (
     NEGLIGIBLE,
@@ -31,7 +30,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
     raw_residual,
 )
 from relay_autotune.identification.waveform.residuals import ljung_box
-from relay_autotune.identification.waveform.selection import Candidate
+from relay_autotune.identification.waveform.selection import Candidate, support
 from relay_autotune.identification.waveform.separable import Problem, State, evaluate, refine
 from relay_autotune.record.record import Record
 

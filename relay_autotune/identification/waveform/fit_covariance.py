@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.differences import jacobian, relative_steps
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.waveform.quantisation import quantisation_step
-from relay_autotune.identification.waveform.residuals import covariance_meat
-from relay_autotune.identification.waveform.robust import mean_slope, scale_of, weights
+from relay_autotune.identification.waveform.residuals import (
+    covariance_meat,
+    mean_slope,
+    scale_of,
+    weights,
+)
 from relay_autotune.identification.waveform.selection import Candidate
 from relay_autotune.identification.waveform.separable import Problem, State
 from relay_autotune.record.record import Record
@@ -158,3 +161,30 @@ def _gradient(problem: Problem, state: State, scale: float) -> FloatArray:
     numbers = np.arange(point.size)
     logarithms = (k <= numbers) & (numbers < point.size - 1)
     return jacobian(values, point, relative_steps(point, logarithms))
+
+
+_MOST = 20_000
+# Values on a grid come again: of so many samples each, on average.
+_TIMES_EACH = 3.0
+_ROUNDED = 1e-3
+
+
+def quantisation_step(measurement: FloatArray) -> float:
+    """Return the step of the grid on which all values lie; 0 if there is none.
+
+    :param measurement: the samples [y], shape (n,).
+    """
+    some = measurement[:: max(1, measurement.size // _MOST)]
+    levels = np.unique(some)
+    if levels.size < 2 or _TIMES_EACH * levels.size > some.size:
+        return 0.0
+    gaps = np.diff(levels)
+    # Decimal numbers are on their grid to rounding only.
+    rounding = 1e-9 * float(np.abs(levels).max())
+    gaps = gaps[gaps > rounding]
+    if gaps.size == 0:
+        return 0.0
+    step = float(gaps.min())
+    multiples = gaps / step
+    on_grid = np.abs(multiples - np.round(multiples)) <= _ROUNDED + rounding / step
+    return step if bool(np.all(on_grid)) else 0.0

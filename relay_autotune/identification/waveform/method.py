@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.choice import choose
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit, raw_residual
-from relay_autotune.identification.waveform.robust import scale_of, weights
+from relay_autotune.identification.waveform.residuals import scale_of, weights
 from relay_autotune.identification.waveform.selection import (
     Candidate,
     Ground,
     after_the_unknown,
+    choose,
     fit_all,
     fit_one,
 )
