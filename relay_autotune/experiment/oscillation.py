@@ -33,6 +33,9 @@ _ROUNDING = 1e-6
 # compensated by shifts of a part of the amplitude, a limited number at a time.
 _SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
 _MOST_SHIFTS, _SHIFT = 2, 0.7
+# So many stays of an oscillation may need that: a load that comes and goes twice. A process that
+# needs it at every turn does not oscillate.
+MOST_BORNE = 4
 _FOLLOWS = 2
 # A cycle this many times as long as the one before is no sign of a load yet.
 _ALONE = 4.0
@@ -124,7 +127,7 @@ class Oscillation:
         self._switches_before = 0
         self.switches = 0
         """Number of switches so far."""
-        self._shifts = 0
+        self._shifts = self._borne = 0
         self._shifted_at = -math.inf
         self._furthest = math.inf
         self._away = 0
@@ -144,10 +147,16 @@ class Oscillation:
         relay = self._relay
         if relay.update(t, y):
             self.switches += 1
+            # Only what the process did by itself says how long it takes: else each stay that the
+            # levels are shifted in would grant the next one a longer limit.
+            was_shifted = self._shifts > 0
             self._answers = self._turns.add(
-                t, relay.last_stay, self._balance, is_first=relay.switches == 1
+                t,
+                relay.last_stay,
+                self._balance,
+                counts=relay.switches > 1 and not was_shifted,
             )
-            self._learn(relay.last_stay)
+            self._learn(0.0 if was_shifted else relay.last_stay)
             self._shifts = 0
             if begins := relay.is_high and self._answers:
                 self._turns.begin(t)
@@ -449,11 +458,13 @@ class Oscillation:
             self._levels.grow()
             self._begin()
             return
-        if follows and self._shifts < _MOST_SHIFTS and moved:
+        may_shift = self._shifts < _MOST_SHIFTS if self._shifts else self._borne < MOST_BORNE
+        if follows and may_shift and moved:
             # It did oscillate before: a load may be too large for one of the levels.
             before = self.command
             self._shift((_SHIFT if self._is_high else -_SHIFT) * self._levels.amplitude)
             if self.command != before:
+                self._borne += not self._shifts
                 self._shifts += 1
                 self._shifted_at = t
                 # Each shift gets half of the patience again.
@@ -479,9 +490,14 @@ class Oscillation:
             if has_moved(self._since(self._told_at)[1])
             else NO_ANSWER
         )
+        shifted = (
+            f", and {self._borne} stays ended only when the levels were shifted"
+            if self._borne >= MOST_BORNE
+            else ""
+        )
         return (
-            f"no oscillation after {count_cycles(self.cycles)}: the measurement is {y:g} and did "
-            f"not come back to {self._setpoint:g} -/+ {self._hysteresis:g} within "
+            f"no oscillation after {count_cycles(self.cycles)}{shifted}: the measurement is {y:g} "
+            f"and did not come back to {self._setpoint:g} -/+ {self._hysteresis:g} within "
             f"{t - self._relay.since:.3g} s; {why} (process_gain_sign was taken as "
             f"{_SIGNS[self.sign]})"
         )

@@ -22,7 +22,8 @@ class Turns:
     all normal stays would look like noise. So if the relay keeps switching but no cycle begins for
     three times the longest stay, and 200 samples, the longest stay is forgotten, and the longest
     of this time replaces it. After a cycle, a stay of more than twice the longest one restarts
-    this time, whose length still follows from the longest stay before.
+    this time, whose length still follows from the longest stay before. A stay during which the
+    levels were shifted does not show how long the process takes; it only restarts this time.
 
     :param time: instant from which the relay acts [s].
     :param response_time: time that the process took to respond to the kick [s].
@@ -42,15 +43,18 @@ class Turns:
         self._since = time
         self._recent = 0.0
 
-    def add(self, time: float, stay: float, balance: float, *, is_first: bool) -> bool:
+    def add(self, time: float, stay: float, balance: float, *, counts: bool) -> bool:
         """Take a stay that has ended; return True if it can be a response of the process.
 
         :param time: when it ended [s].
         :param stay: its length [s].
         :param balance: ratio of the shorter to the longer stay of a biased relay.
-        :param is_first: True for the stay before the first switch, which may begin anywhere.
+        :param counts: False for the stay before the first switch, which may begin anywhere, and
+            for one during which the levels were shifted.
         """
-        if not is_first:
+        if not counts:
+            self._since, self._recent = time, 0.0
+        else:
             self._recent = max(self._recent, stay)
             if stay > _MUCH_LONGER * self.longest:
                 # Cycles that it may hide come after it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from fopdt_plant import FopdtPlant
 from histories import History
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.oscillation import MOST_BORNE
 from relay_autotune.experiment.samples import GAP, Samples
 from relay_autotune.experiment.turns import OVERDUE, Turns
 from relay_autotune.record.record import Outcome
@@ -24,6 +26,23 @@ def test_random_histories_end_within_their_bound(part):
         history = History(seed)
         history.run()
         assert not history.problem, f"{history.problem}: {history}"
+
+
+def test_a_stay_that_only_shifts_of_the_levels_end_grants_the_next_no_longer_one():
+    # An actuator with a third of its gain: the weaker level never passes the band by itself.
+    history = History(1625)
+    tune = history.run()
+    assert not history.problem, f"{history.problem}: {history}"
+    assert f"{MOST_BORNE} stays ended only when the levels were shifted" in tune.reason
+    time, _, command = tune.samples(0, tune.sample_count)
+    # Shifts only make a level larger in its own direction, within a stay.
+    rises = np.sign(command - tune.settings.baseline)
+    turns = np.flatnonzero(np.diff(rises)) + 1
+    stays = np.diff(time[turns])
+    own = history.limit.period * history.period
+    # The patience of the limit cycle with its bias, and twice half of it again.
+    assert stays.max() < 2.0 * 10.0 * (1.3 / 0.7) * own
+    assert history.samples < 0.05 * history.bound
 
 
 def disturbed(begin, length, *, kind, min_cycles=3, period=0.01, samples=20_000):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.oscillation import MOST_BORNE
 from relay_autotune.experiment.procedure import KICK_LIMIT, KICK_SETTLINGS
 from relay_autotune.experiment.samples import GAP
 from relay_autotune.experiment.turns import OVERDUE, OVERDUE_SAMPLES
@@ -207,7 +208,8 @@ class History:
         With P the longest stay of the relay: no longer than the disturbances last together, and
         than half a period of a relay as unequal as this one. A cycle takes two of them, and one
         that cannot be told three or 200 samples more; the last stay may last ten times as long,
-        and more with a bias, and half of it twice again while the levels are shifted.
+        and more with a bias, and half of it twice again while the levels are shifted, and so may
+        those few before it that only shifts of the levels ended.
         """
         p = self.tune.parameters
         bias = 0.3 if p.finds_amplitude else abs(p.relay_bias)
@@ -216,7 +218,7 @@ class History:
         own = unequal * (3.0 * self.limit.period + rate) + 2.0 * p.extra_delay / self.period
         stay = own + sum(self._lasts(h) for h in self.happenings)
         turns = p.max_cycles + (_GROWTHS if p.finds_amplitude else 1)
-        patience = 2.0 * max(10.0 * unequal * stay, OVERDUE_SAMPLES)
+        patience = (1 + MOST_BORNE) * 2.0 * max(10.0 * unequal * stay, OVERDUE_SAMPLES)
         kick = 2.0 * max(KICK_LIMIT / self.period, KICK_SETTLINGS * SETTLING) + 100.0 * stay
         return int(turns * (2.0 * stay + max(OVERDUE * stay, OVERDUE_SAMPLES)) + patience + kick)
 
