@@ -45,6 +45,8 @@ WARM = 0.2
 # a day of tunes, one each minute, is 1,440 of them.
 MOST_MEMORY = 2000.0
 KILO = 1e3
+# A busy machine takes long for a fit [s].
+PATIENCE = 600.0
 PLANT = {
     "mode": "lockstep",
     "sample_period": PERIOD,
@@ -55,7 +57,14 @@ PLANT = {
     "noise_std": 0.01,
     "seed": 7,
 }
-TUNE = {"amplitude": 1.0, "baseline": 0.0, "sample_period": PERIOD}
+# A busy machine stalls the loop for longer than a second, which would end a tune.
+TUNE = {
+    "amplitude": 1.0,
+    "baseline": 0.0,
+    "sample_period": PERIOD,
+    "measurement_timeout": 60.0,
+    "model_timeout": 60.0,
+}
 
 
 @dataclass(frozen=True)
@@ -117,7 +126,7 @@ def run(rig: Rig, seconds: float, most: float, file: Path | None) -> list[Held]:
         rig.until(
             lambda answer=answer: any(g.experiment_id == answer.experiment_id for g in gains),
             f"gains of tune {tune}",
-            60.0,
+            PATIENCE,
         )
         gains.clear()
         # What is on the disk is no memory of theirs.

@@ -48,6 +48,9 @@ class RelayExperiment:
     :param policy: how the process is left at the end.
     :param until_converged: False: cycles that agree do not end it, but :meth:`conclude` or
         max_cycles does.
+    :param from_small: True: an amplitude that is given begins at a quarter of that for a cycle,
+        and the experiment fails where the measurement swings no wider at the whole of it: the
+        actuator is then at its ends. It has no effect on an amplitude that finds itself.
     :raises ParameterError: if a parameter is out of range, or some contradict each other.
     """
 
@@ -59,6 +62,7 @@ class RelayExperiment:
         *,
         policy: SafePolicy = _BASELINE,
         until_converged: bool = True,
+        from_small: bool = False,
     ) -> None:
         parameters.validate(baseline)
         self.parameters = parameters
@@ -73,7 +77,11 @@ class RelayExperiment:
         self._silence = SilenceWatch()
         self._check = SampleCheck()
         self._procedure = Procedure(
-            parameters, self.baseline, self._samples, until_converged=until_converged
+            parameters,
+            self.baseline,
+            self._samples,
+            until_converged=until_converged,
+            from_small=from_small,
         )
         self._origin = math.nan
 
@@ -155,6 +163,14 @@ class RelayExperiment:
     def cycle_start(self) -> tuple[int, ...]:
         """Index of the first sample of each cycle, as in a record."""
         return tuple(self._procedure.cycle_start)
+
+    @property
+    def is_tried(self) -> bool:
+        """True unless the levels began small and it is not known yet whether the process follows.
+
+        Until then the cycles may be those of an actuator that is at its ends.
+        """
+        return self._procedure.is_tried
 
     @property
     def sample_count(self) -> int:

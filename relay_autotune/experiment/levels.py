@@ -21,6 +21,9 @@ _MOST_GROWTH = 4.0
 # Reserve on a target, since the swing is not exactly proportional to the amplitude.
 _TO_SPARE = 1.2
 
+# First part of a given amplitude that may be beyond the actuator's ends.
+_SMALL = 0.25
+
 # Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
 # The hysteresis makes small swings larger than proportional, by a third at most.
 _GROWN, _CLIPPED = 3.0, 1.5
@@ -29,33 +32,44 @@ _GROWN, _CLIPPED = 3.0, 1.5
 class Levels:
     """The levels of a relay about its baseline.
 
-    A given amplitude stays as it is. Otherwise the amplitude starts at a hundredth of the range of
-    the command and grows. A level beyond a limit is cut to the limit; the upper and the lower step
-    then differ, which counts as bias.
+    A given amplitude stays as it is; with ``from_small`` it starts at a quarter, so that the two
+    swings of the measurement show whether the actuator goes as far. Otherwise the amplitude starts
+    at a hundredth of the range of the command and grows. A level beyond a limit is cut to the
+    limit; the upper and the lower step then differ, which counts as bias.
 
     :param parameters: the user's parameters, valid for the baseline.
     :param baseline: command of the operating point [u].
+    :param from_small: True: a given amplitude is not put on at once.
     """
 
-    def __init__(self, parameters: ExperimentParameters, baseline: float) -> None:
+    def __init__(
+        self, parameters: ExperimentParameters, baseline: float, *, from_small: bool = False
+    ) -> None:
         self._parameters = parameters
         self._baseline = baseline
-        self.searching = parameters.finds_amplitude
+        self.from_small = from_small and not parameters.finds_amplitude
+        """True if a given amplitude starts at a quarter."""
+        self.searching = parameters.finds_amplitude or self.from_small
         """True while the amplitude may still grow."""
         self._wanted = parameters.amplitude
-        if self.searching:
+        self._shift = 0.0
+        if self.from_small:
+            self.begin_small()
+        elif parameters.finds_amplitude:
             span = parameters.command_max - parameters.command_min
             self._wanted = FIRST_SHARE * span
             if abs(parameters.bias) >= self._wanted:
                 self._wanted = 1.5 * abs(parameters.bias)
-        self._shift = 0.0
         # Amplitude, half swing and levels of the first cycle that was clear of the noise.
         self._first_clear: tuple[float, float, float, float] | None = None
         self._set()
 
     def _set(self) -> None:
         p = self._parameters
-        bias = p.bias if p.bias != 0.0 else p.bias_ratio * self._wanted
+        if p.finds_amplitude:
+            bias = p.bias if p.bias != 0.0 else p.bias_ratio * self._wanted
+        else:
+            bias = p.relay_bias * (self._wanted / p.amplitude)
         middle = self._baseline + bias + self._shift
         # Shifted levels also stay within the limits.
         self.low = max(middle - self._wanted, p.command_min)
@@ -66,7 +80,7 @@ class Levels:
     @property
     def _as_given(self) -> bool:
         # Keep the exact digits of the user's numbers.
-        return not self._parameters.finds_amplitude and self._shift == 0.0
+        return self._wanted == self._parameters.amplitude and self._shift == 0.0
 
     @property
     def amplitude(self) -> float:
@@ -86,11 +100,20 @@ class Levels:
     def can_grow(self) -> bool:
         """True if the amplitude may be made larger."""
         p = self._parameters
+        if self.from_small and self._wanted == p.amplitude:
+            return False
         return self.searching and (self.low > p.command_min or self.high < p.command_max)
 
     def grow(self, factor: float = 2.0) -> None:
         """Make the amplitude larger, within the limits, if it is not given."""
         self._wanted *= factor
+        if self.from_small:
+            self._wanted = min(self._wanted, self._parameters.amplitude)
+        self._set()
+
+    def begin_small(self) -> None:
+        """Put on the first part of a given amplitude, whatever the kick needed."""
+        self._wanted = _SMALL * self._parameters.amplitude
         self._set()
 
     def shift(self, by: float) -> None:
@@ -98,21 +121,34 @@ class Levels:
         self._shift += by
         self._set()
 
-    def why_clipped(self, half_swing: float, clear: float) -> str:
+    def note_small(self, half_swing: float, clear: float) -> None:
+        """Keep the first swing of the measurement that is clear of noise.
+
+        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param clear: the half swing that is clear of noise, hysteresis and resolution [y].
+        """
+        if self._first_clear is None and half_swing >= clear:
+            self._first_clear = self.amplitude, half_swing, self.low, self.high
+
+    @property
+    def grew_enough(self) -> bool:
+        """True if the levels grew so much that the response must have grown, too."""
+        first = self._first_clear
+        return first is not None and self.amplitude >= _GROWN * first[0]
+
+    def why_clipped(self, half_swing: float, *, settled: bool) -> str:
         """Return why the actuator must be at its ends, or "".
 
         A response that is clear of noise must grow with the levels.
 
         :param half_swing: half the swing of the measurement over the last cycle [y].
-        :param clear: the half swing that is clear of noise, hysteresis and resolution [y].
+        :param settled: True: the swing does not grow any more, and must have grown by at least
+            the square root of the growth of the levels.
         """
-        first = self._first_clear
-        if first is None:
-            if half_swing >= clear:
-                self._first_clear = self.amplitude, half_swing, self.low, self.high
+        if self._first_clear is None or not self.grew_enough:
             return ""
-        amplitude, swing, low, high = first
-        if self.amplitude < _GROWN * amplitude or half_swing >= _CLIPPED * swing:
+        amplitude, swing, low, high = self._first_clear
+        if half_swing >= swing * (math.sqrt(self.amplitude / amplitude) if settled else _CLIPPED):
             return ""
         return (
             f"the actuator is clipped: the amplitude grew from {amplitude:.3g} to "
@@ -127,7 +163,11 @@ class Levels:
         :param half_swing: half the swing of the measurement over the last cycle [y].
         :param least: the half swing that is large enough [y].
         """
-        if half_swing >= least or not self.can_grow:
+        if not self.can_grow:
+            return 1.0
+        if self.from_small:
+            return self._parameters.amplitude / self._wanted
+        if half_swing >= least:
             return 1.0
         ratio = _TO_SPARE * least / half_swing if half_swing > 0.0 else math.inf
         return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)

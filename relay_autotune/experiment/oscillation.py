@@ -54,6 +54,12 @@ _SPARE_CYCLES = 12
 # Chatter: more switches in a cycle than this, and this many times as many as in any cycle before.
 _CHATTER, _CHATTER_RATIO = 40, 10.0
 
+# If the levels started at a quarter, the swings are compared after this many cycles, once the
+# swing grows by less than this factor from one to the next.
+_TRIED, _STILL = 2, 1.1
+# A last swing this many times as large as a clear one should have been clear at a quarter, too.
+_CLEARLY = 5.0
+
 # A measurement that did not move for this many stays of the relay does not follow it.
 _STAYS = 2
 
@@ -302,6 +308,8 @@ class Oscillation:
             )
         elif noise := self._only_noise(TELL):
             self._end(Outcome.FAILED, noise)
+        elif clipped := self._clipped():
+            self._end(Outcome.FAILED, clipped)
         elif self._until_converged and cycle.converged:
             n = len(self.cycles)
             which = f"{n}" if n == p.min_cycles else f"the last {p.min_cycles} of {n}"
@@ -346,12 +354,16 @@ class Oscillation:
         )
         half_swing = 0.5 * float(y.max() - y.min())
         clear = clear_swing(0.0, self._rest.noise_std, self._hysteresis, y)
-        if clipped := self._levels.why_clipped(half_swing, clear):
+        clipped = (
+            "" if self._levels.from_small else self._levels.why_clipped(half_swing, settled=False)
+        )
+        if clipped:
             self._end(Outcome.FAILED, clipped)
             return True
+        self._levels.note_small(half_swing, clear)
         factor = self._levels.growth_for(half_swing, least)
         if factor == 1.0:
-            if half_swing < least:
+            if half_swing < least and not self._levels.from_small:
                 self.notes.append(
                     f"the amplitude {self._levels.amplitude:g} is all that the command limits "
                     f"allow, and the measurement swings by {half_swing:.3g} only, less than "
@@ -362,6 +374,25 @@ class Oscillation:
         self._levels.grow(factor)
         self.cycle_start[:] = [last]
         return True
+
+    def _clipped(self) -> str:
+        """Return why the actuator is at its ends, once the swing grows no more; empty: nothing."""
+        if not self._levels.from_small or len(self.cycles) < _TRIED:
+            return ""
+        before, last = (0.5 * (c.peak_max - c.peak_min) for c in self.cycles[-2:])
+        return "" if last > _STILL * before else self._levels.why_clipped(last, settled=True)
+
+    def _should_have_told(self) -> bool:
+        """Return True if a quarter of the last swing would have stood clear of the noise."""
+        first, last = self.cycle_start[-2:]
+        y = self._samples.columns(first, last + 1)[1]
+        clear = clear_swing(0.0, self._rest.noise_std, self._hysteresis, y)
+        return 0.5 * float(y.max() - y.min()) > _CLEARLY * clear
+
+    @property
+    def is_tried(self) -> bool:
+        """True unless levels that began small have not shown yet that the process follows."""
+        return not self._levels.from_small or len(self.cycles) >= _TRIED
 
     def _cycle_that_ended(self) -> Cycle:
         first, last = self.cycle_start[-2:]
@@ -411,8 +442,18 @@ class Oscillation:
         """Complete, unless the last cycles may be noise alone."""
         if noise := self._only_noise(1):
             self._end(Outcome.FAILED, noise)
-        else:
-            self._end(Outcome.COMPLETED, reason)
+            return
+        if self._levels.from_small and not self._levels.grew_enough:
+            untold = (
+                "whether the actuator goes as far as the levels could not be told, since no "
+                "oscillation at a quarter of the amplitude stood clear of the noise: give "
+                "command_min and command_max"
+            )
+            if not self.cycles[-1].converged or self._should_have_told():
+                self._end(Outcome.FAILED, f"{untold}; {reason}")
+                return
+            self.notes.append(untold)
+        self._end(Outcome.COMPLETED, reason)
 
     def _only_noise(self, least: int) -> str:
         """Return why the last cycles are no oscillation, "" if they may be one.
@@ -427,7 +468,13 @@ class Oscillation:
     def _noise_alone(self, first: int, last: int) -> str:
         """Return why the samples first to last - 1 are no oscillation, "" if they may be one."""
         measurement = self._samples.columns(first, last)[1]
-        return why_noise_alone(measurement, self._rest.noise_std, count_cycles(self.cycles))
+        noise = why_noise_alone(measurement, self._rest.noise_std, count_cycles(self.cycles))
+        if noise and self._levels.from_small:
+            noise += (
+                "; give command_min and command_max, so that it need not begin at a quarter of "
+                "the amplitude"
+            )
+        return noise
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self.cycles)

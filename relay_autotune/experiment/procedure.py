@@ -55,6 +55,9 @@ _PROBE_SAMPLES = 2
 # make the amplitude much too large.
 _GROWTH_SETTLINGS = 0.25
 _GROWTH_SAMPLES = 20
+# A given amplitude that begins small has so many times as long, since it is to stay small until
+# the response to it is known.
+_PATIENT = 10.0
 
 
 class State(enum.IntEnum):
@@ -81,6 +84,7 @@ class Procedure:
     :param baseline: command of the operating point [u].
     :param samples: the samples so far; each is appended before it is answered.
     :param until_converged: False: agreement of the cycles does not end it.
+    :param from_small: True: a given amplitude begins at a quarter of that.
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class Procedure:
         samples: Samples,
         *,
         until_converged: bool = True,
+        from_small: bool = False,
     ) -> None:
         self.state = State.SETTLING
         """The present state."""
@@ -108,7 +113,7 @@ class Procedure:
         self._parameters = parameters
         self._samples = samples
         self._baseline = baseline
-        self._levels = Levels(parameters, baseline)
+        self._levels = Levels(parameters, baseline, from_small=from_small)
         self._until_converged = until_converged
         self._sign = parameters.process_gain_sign
         self._oscillation: Oscillation | None = None
@@ -143,6 +148,13 @@ class Procedure:
     def cycles(self) -> list[Cycle]:
         """The whole cycles."""
         return self._oscillation.cycles if self._oscillation else []
+
+    @property
+    def is_tried(self) -> bool:
+        """True unless levels that began small have not shown yet that the process follows."""
+        return not self._levels.from_small or bool(
+            self._oscillation and self._oscillation.is_tried
+        )
 
     @property
     def switches(self) -> int:
@@ -239,7 +251,8 @@ class Procedure:
         is_high = self.sign == 0 or self._starts_high(t, y)
         detector = ResponseDetector(self.rest, t)
         self.state = State.KICK
-        self._grow_after = max(
+        patience = _PATIENT if self._levels.from_small else 1.0
+        self._grow_after = patience * max(
             _GROWTH_SETTLINGS * self._settled_at, _GROWTH_SAMPLES * self._samples.interval
         )
         self.answer = partial(self._await_response, detector, is_high, t)
@@ -257,7 +270,9 @@ class Procedure:
         if detector.add(t, y):
             self.dead_time_seen = detector.last_inside - start
             self._response_time = detector.first_outside - start
-            if self._levels.can_grow:
+            if self._levels.from_small:
+                self._levels.begin_small()
+            elif self._levels.can_grow:
                 # A response that only just exceeds the noise says too little.
                 self._levels.grow()
             if self.sign == 0:

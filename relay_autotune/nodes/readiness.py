@@ -126,12 +126,33 @@ def require_known_range(parameters: ExperimentParameters, baseline: float) -> No
             )
 
 
-def plan_of(parameters: ExperimentParameters, baseline: float, policy: SafePolicy) -> str:
+def is_beyond_known(parameters: ExperimentParameters, baseline: float) -> bool:
+    """Return True if nothing says that the actuator goes as far as the levels.
+
+    That is a level on the other side of zero than the baseline, or more than twice as far from it,
+    without a command limit on that side.
+
+    :param parameters: the experiment's parameters, valid.
+    :param baseline: command of the operating point [u].
+    """
+    if parameters.finds_amplitude:
+        return False
+    middle = baseline + parameters.relay_bias
+    least, most = sorted((0.0, 2.0 * baseline))
+    too_high = middle + parameters.amplitude > most and math.isinf(parameters.command_max)
+    too_low = middle - parameters.amplitude < least and math.isinf(parameters.command_min)
+    return too_high or too_low
+
+
+def plan_of(
+    parameters: ExperimentParameters, baseline: float, policy: SafePolicy, *, from_small: bool
+) -> str:
     """Return a sentence on the commands of a tune.
 
     :param parameters: the experiment's parameters.
     :param baseline: command of the operating point [u].
     :param policy: how the process will be left.
+    :param from_small: True if a given amplitude is not put on at once.
     """
     if parameters.finds_amplitude:
         levels = Levels(parameters, baseline)
@@ -144,6 +165,12 @@ def plan_of(parameters: ExperimentParameters, baseline: float, policy: SafePolic
         middle = baseline + parameters.relay_bias
         low, high = middle - parameters.amplitude, middle + parameters.amplitude
         plan = f"relay between {low:g} and {high:g} about the baseline {baseline:g}"
+        if from_small:
+            small = Levels(parameters, baseline, from_small=True)
+            plan += (
+                f", for the first cycle between {small.low:g} and {small.high:g}, since no "
+                f"command_min and command_max say that the actuator goes as far"
+            )
     if policy.give_back:
         return f"{plan}, then back to controller_command"
     return f"{plan}, then proportional control holds the process" if policy.hold else plan

@@ -32,6 +32,7 @@ from relay_autotune.nodes.quality import why_no_publisher
 from relay_autotune.nodes.readiness import (
     NotReadyError,
     baseline_from,
+    is_beyond_known,
     plan_of,
     policy_from,
     require_connections,
@@ -191,10 +192,11 @@ class RelayNode(ServedNode):
         except RelayAutotuneError as error:
             self.get_logger().warning(f"start refused: {error}")
             return Started(False, str(error))
-        plan = plan_of(parameters, baseline, policy)
+        from_small = self._from_small(parameters, baseline)
+        plan = plan_of(parameters, baseline, policy, from_small=from_small)
         if dry_run:
             return Started(True, f"a tune could start: {plan}")
-        identity, recorded = self._start(parameters, baseline, policy)
+        identity, recorded = self._start(parameters, baseline, policy, from_small)
         reason = f"{plan}; {recorded}"
         self.get_logger().info(f"tune {identity} started: {reason}")
         return Started(True, reason, identity)
@@ -223,8 +225,17 @@ class RelayNode(ServedNode):
         self._loop.require_alone()
         return parameters, baseline, policy
 
+    def _from_small(self, parameters: ExperimentParameters, baseline: float) -> bool:
+        # Who tells where the actuator is, tells of its ends, too.
+        told = self._on_setpoint or self.count_publishers("command_feedback") > 0
+        return not told and is_beyond_known(parameters, baseline)
+
     def _start(
-        self, parameters: ExperimentParameters, baseline: float, policy: SafePolicy
+        self,
+        parameters: ExperimentParameters,
+        baseline: float,
+        policy: SafePolicy,
+        from_small: bool,
     ) -> tuple[str, str]:
         identity = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{secrets.token_hex(4)}"
         clock = self.get_clock()
@@ -234,7 +245,12 @@ class RelayNode(ServedNode):
             kind = partial(SetpointSession, actual=lambda: self._loop.handover.last)
         session = kind(
             RelayExperiment(
-                parameters, baseline, identity, policy=policy, until_converged=converged
+                parameters,
+                baseline,
+                identity,
+                policy=policy,
+                until_converged=converged,
+                from_small=from_small,
             ),
             identity,
             sample_period=parameters.sample_period,
@@ -305,7 +321,7 @@ class RelayNode(ServedNode):
         if running is None or not taken:
             return
         self._action.tell(running.experiment)
-        if running.early is None:
+        if running.early is None or not running.experiment.is_tried:
             return
         if reason := running.early.judge(running.experiment, finding_from_message(message)):
             self._send_safe(command := running.experiment.conclude(reason))

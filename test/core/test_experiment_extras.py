@@ -96,6 +96,47 @@ def test_a_clipped_actuator_shows_in_a_response_that_does_not_grow(end):
     assert command == 0.0
 
 
+@pytest.mark.parametrize("amplitude", [20.0, 100.0])
+@pytest.mark.parametrize("baseline", [0.0, 0.5, 1.0, 2.5, 4.5, 5.0])
+@pytest.mark.parametrize("std", [0.0, 0.05])
+def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
+    amplitude, baseline, std
+):
+    tune = RelayExperiment(ExperimentParameters(amplitude=amplitude), baseline, from_small=True)
+    plant, command, noise = FopdtPlant(1.65, 20.0, 10.0), baseline, gaussian(std)
+    for k in range(40_000):
+        y = plant.advance(0.2 * k, min(max(command, 0.0), 5.0) - baseline) + noise()
+        command = tune.step(0.2 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.FAILED, tune.reason
+    if 0.0 < baseline < 5.0:
+        assert "the actuator is clipped: the amplitude grew from" in tune.reason
+        assert len(tune.cycles) <= 3
+    assert command == baseline
+
+
+@pytest.mark.parametrize("bias", [{}, {"bias": -0.3}, {"bias_ratio": 0.0}])
+@pytest.mark.parametrize("dead_time", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("std", [0.0, 0.005, 0.02])
+def test_an_amplitude_that_begins_small_ends_as_it_was_given(bias, dead_time, std):
+    given = ExperimentParameters(amplitude=0.7, **bias)
+    tune = RelayExperiment(given, 0.0, from_small=True)
+    run(tune, FopdtPlant(2.0, 2.0, dead_time), 0.02, noise=gaussian(std))
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    plain = RelayExperiment(given, 0.0)
+    run(plain, FopdtPlant(2.0, 2.0, dead_time), 0.02, noise=gaussian(std))
+    assert tune.settings.amplitude == plain.settings.amplitude == 0.7
+    assert tune.settings.bias == plain.settings.bias
+    small = tune.record().command[tune.record().command != 0.0][0]
+    assert small == pytest.approx(0.25 * (0.7 + tune.settings.bias))
+    before, now = limit_cycle(plain.record()), limit_cycle(tune.record())
+    assert now.period == pytest.approx(before.period, rel=0.15)
+    # What could not be told is said, where the noise is as large as a quarter of the swing.
+    if std == 0.0:
+        assert "could not be told" not in tune.reason
+
+
 @pytest.mark.parametrize("dead_time", [0.1, 1.0, 10.0])
 @pytest.mark.parametrize("std", [0.0, 0.01])
 def test_a_response_that_grows_is_not_taken_for_a_clipped_one(dead_time, std):
