@@ -1,7 +1,7 @@
-"""What a value means and which values it may take, declared once beside the field that holds it.
+"""Meaning and range of a value, declared once at the field that holds it.
 
-A frozen dataclass declares its fields by :func:`quantity`; checks, ROS parameters with their
-descriptors, command-line flags with their help, and the tables of the guide follow from there::
+A frozen dataclass declares its fields by :func:`quantity`. Checks, ROS parameters with their
+descriptors, command-line flags with their help, and the tables of the guide follow from it::
 
     @dataclass(frozen=True)
     class DesignOptions:
@@ -28,8 +28,8 @@ class Quantity:
     """A value that a user may set.
 
     :param name: its name, as a field and as a ROS parameter.
-    :param default: its default, which also tells its type. NaN: not given. Infinite: no limit. ():
-        an array of numbers that is not given.
+    :param default: its default, which also decides its type. NaN: not given. Infinite: no limit.
+        (): an array of numbers that is not given.
     :param unit: y of the measurement, u of the command, s seconds; "" for a pure number or a word.
     :param description: one sentence for people.
     :param lower: smallest value allowed.
@@ -91,7 +91,7 @@ class Quantity:
         elif not isinstance(value, (int, float)):
             return f"{self.name} is {value!r}, expected {self.range_text}"
         elif math.isinf(value) and value != self.default:
-            # Only the default of a limit, which means that there is no limit, is infinite.
+            # Only the default of a limit may be infinite: there is no limit then.
             return f"{self.name} is {value:g}, expected a finite number{self._or_not_given}"
         elif isinstance(self.default, int) and value != value // 1:
             return f"{self.name} is {value:g}, expected a whole number"

@@ -1,4 +1,4 @@
-"""Numbers and transfer functions as one writes them: in plain text, in LaTeX and in MathML."""
+"""Numbers and transfer functions as text: plain, LaTeX and MathML."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Polynomial = tuple[float, ...]
 
 
 def digits(value: float, count: int = 4) -> str:
-    """Return a number with ``count`` significant digits; a dash for none.
+    """Return a number with ``count`` significant digits; a dash if it is not finite.
 
     :param value: the number.
     :param count: significant digits.
@@ -75,7 +75,7 @@ def process_latex(model: TransferFunction) -> str:
 
 
 def process_mathml(model: TransferFunction) -> str:
-    """Return a transfer function as MathML, which browsers draw without help.
+    """Return a transfer function as MathML, which browsers draw by themselves.
 
     :param model: the process.
     """

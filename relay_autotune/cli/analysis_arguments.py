@@ -1,4 +1,4 @@
-"""Options that decide what a recording gives, for every command that reads recordings."""
+"""Options of all commands that read recordings: which part, how to identify, how to tune."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from relay_autotune.quantities import declared
 
 
 def add_analysis(parser: argparse.ArgumentParser) -> None:
-    """Add what is taken of a recording, how it is identified, and for what it is tuned.
+    """Add options: what is taken from a recording, how it is identified and tuned.
 
     :param parser: of the command.
     """
-    taken = parser.add_argument_group("what is taken of a recording")
+    taken = parser.add_argument_group("what is taken from a recording")
     for signal in ("measurement", "command"):
         taken.add_argument(
             f"--{signal}",
@@ -43,11 +43,11 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         "stamp (%(default)s)",
     )  # fmt: skip
     taken.add_argument(
-        "--join", action="store_true", help="take all BAGs for one recording on one timeline"
+        "--join", action="store_true", help="take all BAGs as one recording on one timeline"
     )
     taken.add_argument(
         "--joint", action="store_true",
-        help="take all experiments for tests of one process, with one model",
+        help="take all experiments as tests of one process, with one model",
     )  # fmt: skip
     taken.add_argument(
         "--max-chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
@@ -75,8 +75,8 @@ def jobs_of(
 
     :param options: with those of :func:`add_analysis`.
     :param recordings: their names.
-    :param with_table: whether results are wanted as the table for people.
-    :raises SelectionError: if options contradict each other, or name what there is not.
+    :param with_table: True if results are printed as tables for people.
+    :raises SelectionError: if options contradict each other, or a name is unknown.
     """
     from relay_autotune.analysis import check_names
     from relay_autotune.identification import ONLY_JOINT

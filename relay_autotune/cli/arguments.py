@@ -16,12 +16,12 @@ from relay_autotune.escape import visible
 from relay_autotune.quantities import Quantity
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
-# What a command of several bags ends with is the worst of theirs.
+# From best to worst; a command for several bags ends with the worst of their statuses.
 _WORSE = (DONE, DOUBTFUL, NOTHING_FOUND, USAGE)
 
 
 def worst(*statuses: int) -> int:
-    """Return the exit status that says the worst of several.
+    """Return the worst of several exit statuses.
 
     :param statuses: at least one.
     """
@@ -44,10 +44,10 @@ def finite(text: str) -> float:
 
 
 def say(program: str, text: str) -> None:
-    """Tell the user something that is no result.
+    """Write a message that is not a result to standard error.
 
     :param program: name of the command.
-    :param text: what it says; names of files and of the command line are made visible here.
+    :param text: the message; control characters in it are made visible.
     """
     print(visible(f"{program}: {text}", keep="\n"), file=sys.stderr)
 
@@ -55,8 +55,8 @@ def say(program: str, text: str) -> None:
 def guarded(program: str, work: Callable[[], int]) -> int:
     """Return the exit status of a command's work; an error becomes one line.
 
-    What the work is known to need is loaded before: from here on Ctrl-C is an exception, so that
-    files and processes are left in order, and an import may lose it.
+    Import what the work needs before: from here on Ctrl-C is an exception, so that files and
+    processes are left in order, but an exception may be lost in an import.
 
     :param program: name of the command.
     :param work: does it, and returns its exit status.
@@ -74,7 +74,7 @@ def guarded(program: str, work: Callable[[], int]) -> int:
         say(program, str(error))
         return NOTHING_FOUND
     except BrokenPipeError:
-        # Whoever read the results has seen enough; nothing may be flushed to it at the end.
+        # The reader closed the pipe, as `head` does; nothing may be flushed to it at the end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return NOTHING_FOUND
     except KeyboardInterrupt:
@@ -94,7 +94,7 @@ _KINDS: dict[type, Callable[[str], Any]] = {int: int, float: finite}
 
 
 def typed_as(quantity: Quantity) -> Quantity:
-    """Return a quantity as people type it: an angle in degrees."""
+    """Return a quantity in the unit of the command line: angles are in degrees."""
     if quantity.unit != "rad":
         return quantity
     numbers = {n: math.degrees(getattr(quantity, n)) for n in ("default", "lower", "upper")}
@@ -142,7 +142,7 @@ def given_quantities(
         value, typed = getattr(options, each.name), typed_as(each)
         if value is None:
             continue
-        # What is not given on a command line is left out, not NaN.
+        # NaN is not allowed here: a flag that is not given is left out.
         asked = replace(typed, default=type(typed.default)()) if typed.is_number else typed
         problem = asked.problem(value)
         if problem is not None:

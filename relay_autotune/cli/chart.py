@@ -1,4 +1,4 @@
-"""What `identify` takes: numbers read off a chart, and the methods that make a model of them."""
+"""The input of `identify`: numbers read off a chart, and the methods that use them."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def identify_thyagarajan_chart(numbers: Mapping[str, float], known: Known) -> Id
         )
     if not math.isnan(half) and math.isnan(shape.rise):
         raise SelectionError("--time-half also needs --time-to-peak")
-    # Whoever reads the time to half of the peak takes the curve for a rectangular one.
+    # The time to half of the peak is used only for almost rectangular curves.
     category = "1a" if math.isnan(half) else "1b"
     return identify_numbers(shape, numbers["relay"], known, category)
 
@@ -147,7 +147,7 @@ def identify_biased_chart(numbers: Mapping[str, float], known: Known) -> Identif
                 "--mean-command must not be 0: the gain is the ratio of the means (eq 6)"
             )
         gain = numbers["mean_measurement"] / numbers["mean_command"]
-    # With the command turned round a reverse-acting process has a positive gain.
+    # With the sign of the command inverted, a reverse-acting process has a positive gain.
     sign = -1 if gain < 0.0 else 1
     high, low = (numbers["period_high"], numbers["period_low"])[::sign]
     cycle = FopdtCycle(high, low, numbers["peak_max"], numbers["peak_min"])
@@ -207,10 +207,10 @@ class Chart:
     """A method with the numbers that it takes.
 
     :param summary: what it does, for the help.
-    :param identify: from the numbers given, by name, and what is known of the process, to a
-        model. The gain, the dead time, structure and order are in the latter.
-    :param required: names of the numbers without which it does nothing.
-    :param optional: names of those that it can do without.
+    :param identify: returns a model from the given numbers, by name, and what is known of the
+        process: gain, dead time, structure and order.
+    :param required: names of the numbers that it needs.
+    :param optional: names of the numbers that it can use.
     :param any_structure: True if it takes a known structure and order.
     """
 
@@ -221,7 +221,7 @@ class Chart:
     any_structure: bool = False
 
 
-# "gain" and "dead_time" reach the methods as what is known of the process.
+# The methods get "gain" and "dead_time" by their argument `known`.
 NUMBERS: dict[str, Number] = {
     "period": Number("s", "period of the limit cycle", POSITIVE),
     "period_high": Number("s", "time that the command stays high", POSITIVE),
@@ -311,10 +311,9 @@ def identify_chart(method: str, numbers: Numbers, known: Known) -> Identificatio
 
     :param method: one of ``CHART_METHODS``.
     :param numbers: those that were given, by name.
-    :param known: what is known of the process beside them; gain and dead time come from
-        ``numbers``.
-    :raises SelectionError: if there is no such method, a number lacks, is out of its range, or
-        is none that the method takes.
+    :param known: what else is known of the process; gain and dead time come from ``numbers``.
+    :raises SelectionError: if the method is unknown, or a number is missing, out of its range, or
+        not used by the method.
     :raises IdentificationError: if no model has these numbers.
     """
     chart = look_up(CHART_METHODS, method, "method", SelectionError)

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=finite,
         default=0.0,
         metavar="S",
-        help="what the time counts from [s since 1970-01-01 UTC] (%(default)s)",
+        help="time zero of the file [s since 1970-01-01 UTC] (%(default)s)",
     )
     options = parser.parse_args(arguments)
     return guarded(PROGRAM, lambda: _convert(options))
@@ -67,14 +67,14 @@ def _convert(options: argparse.Namespace) -> int:
     for topic in topics:
         if not re.fullmatch(r"(/[A-Za-z_]\w*)+", topic):
             raise SelectionError(
-                f"{topic!r} is no topic name; expected one like /tank/level, "
+                f"{topic!r} is not a topic name; expected one like /tank/level, "
                 f"given with --measurement-topic and --command-topic"
             )
     epoch_ns = round(options.epoch * 1e9)
     if epoch_ns + int(measurement.time_ns[0]) < 0:
         raise BagError(
             f"{options.csv} begins at {measurement.time_ns[0] / 1e9:g} s, but a bag has no time "
-            f"before 1970; name the date that its time counts from with --epoch"
+            f"before 1970; give the date at which its time is zero with --epoch"
         )
     facts = {
         "source": options.csv.name,

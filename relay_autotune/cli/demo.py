@@ -32,7 +32,7 @@ NOISE_STD = 0.05
 SEED = 1
 BASELINE, REST = 2.0, 40.0
 AMPLITUDE = 1.0
-# So many simulated seconds in a second, which leaves a fit the time of a cycle.
+# Simulated seconds per second, slow enough to fit a model during each cycle.
 SPEED = 40.0
 PAGE_TITLE = "Relay test of a simulated process"
 
@@ -40,7 +40,7 @@ _DEADLINE = 50.0
 
 
 class DemoError(RelayAutotuneError):
-    """The demo could not go on."""
+    """The demo could not continue."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def main() -> int:
         with free_domain() as domain:
             bag, seen = _run(output, domain)
         shutil.move(bag, output / "bag")
-        # The logs are for the case that something went wrong.
+        # The logs are only needed after an error.
         for left in (output / "records", output / "log"):
             shutil.rmtree(left, ignore_errors=True)
         for log in output.glob("*.log"):
@@ -97,7 +97,7 @@ def _run(output: Path, domain: int) -> tuple[Path, Any]:
         "amplitude": AMPLITUDE,
         "baseline": BASELINE,
         "sample_period": PERIOD,
-        # A machine that is busy with other work is no sensor that has failed.
+        # On a busy machine a late sample must not count as a failed sensor.
         "measurement_timeout": 10.0,
         "record_directory": str(output / "records"),
     }

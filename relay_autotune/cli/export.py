@@ -1,8 +1,8 @@
 """Gains as files that other programs load: ros2_controllers' pid_controller, and plain YAML.
 
-`ros2 param load` reads a file with YAML, turns each value into text and reads that once more, so
-that a number must look like a floating-point number both times: `2` would arrive as an integer,
-`0.00001` as the text 1e-05, and the parameter would be refused.
+`ros2 param load` parses a file as YAML, turns each value into text and parses that again. A number
+must look like a floating-point number both times: `2` would be read as an integer, `0.00001` as
+the text 1e-05, and the parameter would be refused.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ class Target:
 
     def __post_init__(self) -> None:
         if not _NODE.match(self.node):
-            raise SelectionError(f"{self.node!r} is no name of a node, such as /pid_controller")
+            raise SelectionError(f"{self.node!r} is not a node name, such as /pid_controller")
         if not all(_NAME.match(part) for part in self.dof.split("/")):
             raise SelectionError(
-                f"{self.dof!r} is no name of a degree of freedom, such as heater or joint1"
+                f"{self.dof!r} is not a name of a degree of freedom, such as heater or joint1"
             )
         if not self.command_min < self.command_max:
             raise SelectionError(
@@ -84,8 +84,8 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
 def pid_controller(gains: Gains, target: Target) -> str:
     """Return parameters of ros2_controllers' pid_controller for one degree of freedom.
 
-    The file holds one node, since `ros2 param load` applies every section to the node that it
-    is given, and no clamp that is infinite, which would arrive as text.
+    The file holds only one node, since `ros2 param load` applies every section to the node that
+    it is given. Infinite clamps are left out, since they would be read as text.
 
     :param gains: what is to be loaded.
     :param target: where they go.
@@ -99,7 +99,7 @@ def pid_controller(gains: Gains, target: Target) -> str:
             values[name] = value
     if gains.ti > 0.0:
         values["antiwindup_strategy"] = "back_calculation"
-        # What the controller would take for 0, of which the documentation has had two versions.
+        # The value that the controller would use for 0; its documentation has had two versions.
         values["tracking_time_constant"] = (
             math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
         )
@@ -137,7 +137,7 @@ def number(value: float) -> str:
     rounded = float(f"{value:.{_DIGITS}g}")
     text = repr(rounded if math.isfinite(rounded) else float(value))
     while "." not in text:
-        # Only what has a point is a floating-point number in YAML 1.1: 1.0000000000000002e-05.
+        # In YAML 1.1 a floating-point number needs a point: 1.0000000000000002e-05.
         rounded = math.nextafter(rounded, math.copysign(math.inf, rounded))
         text = repr(rounded)
     return text
@@ -147,8 +147,8 @@ def write(text: str, path: str | None) -> None:
     """Write a file, or to standard output.
 
     :param text: what it holds.
-    :param path: where; None: standard output.
-    :raises SelectionError: if it is there already, or cannot be written.
+    :param path: the file; None: standard output.
+    :raises SelectionError: if it exists already, or cannot be written.
     """
     if path is None:
         print(text, end="", flush=True)
@@ -163,7 +163,7 @@ def write(text: str, path: str | None) -> None:
 
 
 def _key(name: str) -> str:
-    # YAML 1.1 reads these as truth values and as nothing.
+    # YAML 1.1 reads these as booleans and as null.
     special = name.lower() in ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
     return f"'{name}'" if special else name
 
@@ -179,7 +179,7 @@ def _comments(gains: Gains, more: Sequence[str]) -> list[str]:
 
 
 def _lacking(gains: Gains) -> list[str]:
-    """Say what of the controller pid_controller has not."""
+    """Return sentences on what pid_controller lacks for these gains."""
     found = []
     if gains.tf > 0.0:
         found.append(

@@ -1,4 +1,4 @@
-"""Many bags: on the processors of this machine, or on a Dask cluster; each done exactly once."""
+"""Many bags, on the processors of this machine or on a Dask cluster; each is done once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from relay_autotune.cli.replay_bag import Done, Job, died, work
 from relay_autotune.errors import BagError
 
 _CONNECT_S = 10.0
-# Of Linux's prctl: the signal that this process gets when its parent ends.
+# Option of Linux's prctl: the signal that a process gets when its parent ends.
 _PR_SET_PDEATHSIG = 1
 _PRELOADED = [
     f"relay_autotune.{name}"
@@ -29,9 +29,9 @@ Work = Callable[[Job], Done]
 
 
 def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[tuple[int, Done]]:
-    """Do jobs in processes of this machine; yield the number of each, and what became of it.
+    """Do jobs in processes of this machine; yield the number of each and its result.
 
-    A job that takes its process down is tried once more in a process of its own, and reported.
+    A job that crashes its process is tried once more in a separate process, and then reported.
 
     :param jobs: what to do.
     :param count: number of processes.
@@ -46,7 +46,7 @@ def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[t
                 try:
                     done = future.result()
                 except BrokenProcessPool:
-                    # One of those that had begun; they begin in the order of their numbers.
+                    # One of the started jobs is the cause; jobs start in the order of numbers.
                     alone = sorted(waiting)[: 2 * count]
                     break
                 number = futures[future]
@@ -65,36 +65,36 @@ def _alone(job: Job, do: Work) -> Done:
 
 
 def _pool(count: int) -> ProcessPoolExecutor:
-    # A fork of a process that has threads, as numpy's may, can stand still for ever.
+    # A fork of a process with threads, which numpy may start, can hang.
     context = multiprocessing.get_context("forkserver")
-    # What every job needs is loaded once, in the process that they are forked from.
+    # The modules that every job needs are loaded once, in the process that is forked.
     context.set_forkserver_preload(_PRELOADED)
     return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_the_command)
 
 
 def _end_with_the_command() -> None:
-    """Let the kernel end this process when the one that it was forked from ends.
+    """Let the kernel end this process when its parent ends.
 
-    That one ends with the command, whichever signal ended that; a worker alone would wait for
-    work for ever.
+    The parent ends with the command, whichever signal ended that; without it a worker would wait
+    for work forever.
     """
     parent = os.getppid()
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0 or os.getppid() != parent:
-        # It has ended already, or this system cannot tell.
+        # The parent has ended already, or the system does not support this.
         os._exit(1)
 
 
 def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[tuple[int, Done]]:
-    """Do jobs on a Dask cluster; yield the number of each, and what became of it.
+    """Do jobs on a Dask cluster; yield the number of each and its result.
 
-    What a worker that dies had begun, others do again; each result comes once.
+    If a worker dies, other workers repeat its jobs; each result comes once.
 
     :param jobs: what to do; the workers must see the recordings under the same paths.
     :param address: of the scheduler, such as ``tcp://host:8786``.
     :param do: does one job.
-    :raises BagError: if there is no dask.distributed, or no scheduler, or it ends before all is
-        done; what is left then has no result.
+    :raises BagError: if dask.distributed is not installed, the scheduler cannot be reached, or it
+        ends before all jobs are done; the rest then has no result.
     """
     try:
         import distributed
@@ -104,7 +104,7 @@ def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[t
             "install it with: pip install distributed"
         ) from None
     for name in ("client", "core", "utils"):
-        # What they would show as tracebacks is raised here as one sentence.
+        # Their tracebacks are not shown; an error is raised here as one sentence.
         logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=_CONNECT_S)
@@ -120,7 +120,7 @@ def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[t
         for future in distributed.as_completed(futures):
             number = futures[future]
             try:
-                # Of a future that was finished the result may be lost on the way.
+                # The result of a finished future may be lost on the way.
                 yield number, _result(future, jobs[number])
             except (CancelledError, TaskCancelledError, OSError) as error:
                 raise BagError(
@@ -129,7 +129,7 @@ def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[t
                     f"ended if it has --output"
                 ) from error
             left.discard(number)
-            # Its result is not kept on the cluster until all are done.
+            # Do not keep the result on the cluster until all are done.
             future.release()
 
 

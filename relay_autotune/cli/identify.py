@@ -13,7 +13,7 @@ PROGRAM = "identify"
 
 _EPILOG = """\
 Results go to standard output, everything else to standard error.
-Exit status: 0 done; 1 no model has these numbers; 2 the command line does not fit.
+Exit status: 0 done; 1 no model has these numbers; 2 the command line is wrong.
 
 Examples:
   identify --method wang_biased --period-high 15.4 --period-low 20.4 --peak-max 0.5 \\
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _joined(arguments: list[str]) -> list[str]:
-    """Join an option to a negative number after it; argparse takes -1e-3 for an option."""
+    """Join an option and a negative number after it; argparse would take -1e-3 for an option."""
     joined: list[str] = []
     for before, argument in itertools.pairwise(["", *arguments]):
         negative = argument[:1] == "-" and argument[1:2] in tuple("0123456789.")

@@ -1,4 +1,4 @@
-"""A node that starts a tune and looks on."""
+"""A node that starts a tune and observes it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Onlooker:
     """Calls relay_node and collects what a tune publishes.
 
     :param domain: the ROS domain of the loop.
-    :param check: called while waiting; raises when waiting has become useless.
+    :param check: called while waiting; raises when there is nothing to wait for any more.
     """
 
     def __init__(self, domain: int, check: Callable[[], None]) -> None:
@@ -82,5 +82,5 @@ class Onlooker:
             if answer.accepted:
                 self._node.destroy_client(client)
                 return answer
-            # The nodes may not have found each other yet.
+            # The nodes may not have discovered each other yet.
             self._executor.spin_once(timeout_sec=0.1)

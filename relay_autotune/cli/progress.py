@@ -1,17 +1,17 @@
-"""How far a long work has come, on a terminal alone."""
+"""Progress of a long computation, shown only on a terminal."""
 
 from __future__ import annotations
 
 import sys
 import time
 
-# A work shorter than this shows nothing [s]; a longer one shows it so often [s].
+# Time before the first line, and between two of them [s].
 _PATIENCE = 1.0
 _INTERVAL = 0.2
 
 
 class ProgressLine:
-    """A line on standard error that is written again and again, and taken away at the end.
+    """A line on standard error that is updated in place and removed at the end.
 
     :param what: what is being done.
     """
@@ -33,7 +33,7 @@ class ProgressLine:
         sys.stderr.flush()
 
     def clear(self) -> None:
-        """Take the line away, so that something else can be written."""
+        """Remove the line, so that something else can be written."""
         if self._shown:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()

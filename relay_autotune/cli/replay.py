@@ -28,7 +28,7 @@ number, that looks like measurement and command.
 
 Results go to standard output, everything else to standard error.
 Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command line, or the
-choice of topics, does not fit; 3 gains of at least one experiment are doubtful.
+choice of topics, is wrong; 3 gains of at least one experiment are doubtful.
 
 Examples:
   replay ~/.ros/relay_autotune/20261120T234315Z_2c010118
@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     add_analysis(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
     parser.add_argument(
-        "--report", metavar="FILE", help="write a report, too: .html, or a .png, .svg or .pdf"
+        "--report", metavar="FILE", help="also write a report: .html, or a .png, .svg or .pdf"
     )
     parser.add_argument(
         "--output", metavar="FILE",
@@ -80,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
         "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
     )
     add_export(parser).add_argument(
-        "--accept-doubtful", action="store_true", help="write gains that are doubtful, too"
+        "--accept-doubtful", action="store_true", help="also write gains that are doubtful"
     )
     return parser
 
@@ -120,7 +120,7 @@ def _run(options: argparse.Namespace) -> int:
 def _jobs(options: argparse.Namespace) -> list[Job]:
     """Return what is to be done.
 
-    :raises SelectionError: if options contradict each other, or name what there is not.
+    :raises SelectionError: if options contradict each other, or a name is unknown.
     """
     with_table = not (options.json or options.output)
     jobs = jobs_of(options, options.bags, with_table=with_table)

@@ -26,7 +26,7 @@ file), or a .json file as `replay --json` prints it.  The page is one file that 
 network; from a .json file the figures that need samples are left out.
 
 Exit status: 0 done; 1 a source could not be read, or nothing was identified in it (the report is
-written all the same); 2 the command line, or the choice of topics, does not fit.
+still written); 2 the command line, or the choice of topics, is wrong.
 
 Examples:
   report ~/.ros/relay_autotune/20261120T234315Z_2c010118 -o tune.html
@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--output", metavar="FILE", default="report.html",
         help="the report: .html, or one picture: .png, .svg or .pdf (%(default)s)",
     )  # fmt: skip
-    parser.add_argument("--figures", metavar="DIR", help="write each figure to a file there, too")
+    parser.add_argument("--figures", metavar="DIR", help="also write each figure to a file in DIR")
     parser.add_argument(
         "--format", choices=("png", "svg"), default="png", help="of these figures (%(default)s)"
     )

@@ -30,7 +30,7 @@ or an object such as {"gain": 1.65, "time_constants": [20], "dead_time": 10}; - 
 input.  Units: y of the measurement, u of the command, s.
 
 Results go to standard output, everything else to standard error.
-Exit status: 0 done; 1 the rule gives no gains; 2 the command line does not fit.
+Exit status: 0 done; 1 the rule gives no gains; 2 the command line is wrong.
 
 Examples:
   tune --gain 1.65 --time-constants 20 --dead-time 10
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    # argparse takes -1e-3 for an option, but nothing that begins with a blank.
+    # argparse takes -1e-3 for an option, but not an argument that begins with a blank.
     options = _parser().parse_args([f" {a}" if _NEGATIVE.match(a) else a for a in given])
     return guarded(PROGRAM, lambda: _run(options))
 
@@ -132,7 +132,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
-    """Return the task; what a record would tell beside the model is computed from the model."""
+    """Return the task; what a record would add to the model is computed from the model."""
     from relay_autotune.tuning import DesignTask
     from relay_autotune.tuning.rules.applicability import is_first_order
     from relay_autotune.tuning.rules.limit_cycle import describing_point_of
@@ -143,7 +143,7 @@ def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
         try:
             simple = two_point_fopdt(model)
         except TuningError:
-            # Rules for FOPDT will say that the model is none.
+            # Rules for FOPDT will then say that the model is not one.
             simple = None
     return DesignTask(
         model=model, options=asked, simple=simple, describing=describing_point_of(model)
@@ -201,7 +201,7 @@ def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> i
 def _compensators(
     task: DesignTask, refused: dict[str, str]
 ) -> list[tuple[Compensator, Performance]]:
-    """Return the controllers with a model inside, and note why others are none."""
+    """Return the controllers with a model inside, and note why others do not apply."""
     from relay_autotune.tuning import analyse_loop
     from relay_autotune.tuning.compensators import COMPENSATORS
 

@@ -1,13 +1,13 @@
-"""tune_loop: start a tune on a running relay_node, show it, and print what came of it.
+"""tune_loop: start a tune on a running relay_node, show its progress, and print the result.
 
-Ctrl-C, or closing the terminal, cancels the tune; the plant is then left at the safe command, and
-what was recorded is kept.
+Ctrl-C, or closing the terminal, cancels the tune; the plant then stays at the safe command, and
+the recording is kept.
 On a terminal the progress is shown in place and in colour (NO_COLOR turns that off), else a line
 for each cycle goes to standard error. The result goes to standard output.
 
-Exit status: 0 the tune completed, with gains (of a dry run: it could start); 1 it did not, or
-there is nobody to do it, or the report was not written; 2 the command line does not fit; 3 the
-gains are doubtful.
+Exit status: 0 the tune completed, with gains (of a dry run: it could start); 1 it did not, or no
+node is there to do it, or the report was not written; 2 the command line is wrong; 3 the gains are
+doubtful.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
 
 PROGRAM = "tune_loop"
-# How often the times on a terminal advance [s].
+# Time between two updates of a terminal [s].
 _TICK = 0.25
-# How long the nodes have to tell what the report needs [s].
+# How long to wait for what the report needs from the nodes [s].
 _PATIENCE = 5.0
 
 
@@ -97,11 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--wait", type=finite, default=5.0, metavar="S",
-        help="how long the nodes may take to be there and ready [s] (%(default)s)",
+        help="how long to wait for the nodes [s] (%(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--report", metavar="FILE",
-        help="write a report of it: .html, or a picture: .png, .svg or .pdf",
+        help="write a report: .html, or a picture: .png, .svg or .pdf",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     return parser
@@ -113,9 +113,9 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     def heed(number: int) -> None:
         signal.signal(number, lambda n, _: interrupted.append(n))
 
-    # An exception could be lost in an import or in a callback of rclpy.
+    # Only note the signal: an exception could be lost in an import or in a callback of rclpy.
     heed(signal.SIGINT)
-    # What a command needs is imported when it is needed: --help waits for no rclpy.
+    # Imported here, so that --help does not load rclpy.
     from relay_autotune.nodes.signals import ending_signals, never_wait_for
     from relay_autotune.nodes.tune_client import TuneClient
 
@@ -135,8 +135,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             needs_identifier=not (options.dry_run or options.record_only),
             leave=lambda: bool(interrupted),
         )
-        # Until here there is nothing that could be left half done.
-        # While it is stopped by Ctrl-Z the tune goes on, which is no harm.
+        # Until here nothing has started. Ctrl-Z may stop this command; the tune then continues.
         heeded = ending_signals() - {signal.SIGTSTP}
         for number in heeded:
             heed(number)
@@ -145,7 +144,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
-        # A signal has to be heeded while nobody reads what is shown, too.
+        # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
         try:
             while True:
@@ -157,7 +156,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             shown.clear()
         finally:
             wait_again()
-        # Nothing moves any more: whoever does not want to wait for the rest may leave.
+        # The tune is over, so a signal may end the command at once.
         for number in heeded:
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -171,7 +170,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
 
 
 def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
-    """Show what comes until the result is there, and cancel when asked to."""
+    """Show the feedback until the result is there, and cancel when asked to."""
     asked = 0
     while not client.done():
         client.spin(_TICK)
@@ -183,10 +182,10 @@ def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
             client.cancel()
             shown.say("cancelling: the safe command goes out, then the recording is closed")
         elif any(number != signal.SIGHUP for number in interrupted[1:]):
-            # A shell that ends with its terminal says so once more.
+            # SIGHUP does not count: a shell that ends with its terminal sends it once more.
             raise LoopError(
-                f"left before the end was seen; {client.name} goes on to the safe command, and "
-                f"its log says how the tune ended"
+                f"stopped waiting; {client.name} still sends the safe command, and its log says "
+                f"how the tune ended"
             )
 
 
@@ -216,7 +215,7 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
 
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
-    """Tell what came of a dry run, or why the node refuses."""
+    """Print the result of a dry run, or why the node refuses."""
     reason = client.result.reason
     if options.json:
         print(json.dumps({"node": client.name, "accepted": client.succeeded, "reason": reason}))
@@ -244,7 +243,7 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
         return flags, ""
     try:
         if values is None:
-            say(PROGRAM, "no identifier_node tells its parameters: the report has the defaults")
+            say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
         told = report_of_tune(
             client.record(_PATIENCE),
             values or defaults(),
@@ -263,10 +262,10 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
 
 
 class Shown:
-    """What is on the screen, or in the log, of a running tune.
+    """The progress of a tune on the screen or in the log.
 
     :param stream: where it is written.
-    :param live: whether it is a terminal, whose lines may be written again.
+    :param live: True for a terminal, whose lines may be overwritten.
     """
 
     def __init__(self, stream: TextIO, live: bool) -> None:
@@ -286,7 +285,7 @@ class Shown:
         self._last, self._came = feedback, time.monotonic()
 
     def tick(self) -> None:
-        """Let the times on a terminal advance."""
+        """Update the times on a terminal."""
         if not self._live or self._last is None:
             return
         since = time.monotonic() - self._came
@@ -301,13 +300,13 @@ class Shown:
         self._write(f"{text}\n")
 
     def clear(self) -> None:
-        """Take away what is shown in place."""
+        """Remove the lines that are shown in place."""
         if self._lines:
             self._write(f"\x1b[{self._lines}A\x1b[J")
             self._lines = 0
 
     def _write(self, text: str) -> None:
-        # The tune goes on where nobody reads of it, or can.
+        # The tune continues even if its progress cannot be written.
         with suppress(OSError):
             self._stream.write(text)
             self._stream.flush()

@@ -24,7 +24,7 @@ def model_of(options: argparse.Namespace) -> TransferFunction:
     """Return the process that the command line gives.
 
     :param options: with ``document`` and the flags of the model, None where not given.
-    :raises SelectionError: if they give none, two, or one that cannot be.
+    :raises SelectionError: if they give no model, two, or an invalid one.
     """
     given = {name: getattr(options, name) for name in _FLAGS if getattr(options, name) is not None}
     if options.document is not None and given:
@@ -166,8 +166,8 @@ def _from_document(name: str, experiment: int | None) -> dict[str, Any]:
         found = json.loads(text, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
         raise SelectionError(
-            f"{name} is no JSON document ({error.msg} in line {error.lineno}); of a replay of "
-            "several bags give one line"
+            f"{name} is not a JSON document ({error.msg} in line {error.lineno}); if it is a "
+            "replay of several bags, give one of its lines"
         ) from error
     if not isinstance(found, dict):
         raise SelectionError(f"{name} holds a JSON {type(found).__name__}, expected an object")

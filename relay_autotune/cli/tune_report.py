@@ -1,4 +1,4 @@
-"""What a tune gave, told once more from its samples, as the identifier_node was asked to."""
+"""The report of a tune: its record is analysed again with the identifier_node's parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NEAR = 1e-6
 
 
 def flags_of(values: Mapping[str, Any]) -> str:
-    """Return what `replay` and `report` must be told to give what the identifier_node gave.
+    """Return the flags with which `replay` and `report` give the identifier_node's result.
 
     :param values: of its parameters, by name.
     :return: the flags of those that are not the default.
@@ -56,7 +56,7 @@ def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
 
 
 def defaults() -> dict[str, Any]:
-    """Return the parameters of an identifier_node that was told nothing, by name."""
+    """Return the default parameters of identifier_node, by name."""
     from relay_autotune.nodes.identifier_parameters import PARAMETERS
 
     return {entry.name: entry.default for entry in PARAMETERS}
@@ -70,9 +70,9 @@ def report_of_tune(
     :param record: its samples.
     :param values: of the identifier_node's parameters, by name.
     :param result: the `Tune.Result`.
-    :param source: how the report calls it.
-    :param output: its file.
-    :return: what the user must know of it; empty: nothing.
+    :param source: name of the tune in the report.
+    :param output: file of the report.
+    :return: a warning for the user; empty: none.
     :raises BagError: if it cannot be written.
     """
     from relay_autotune.report.case import case_of
@@ -84,6 +84,6 @@ def report_of_tune(
     if published.experiment_id and not math.isclose(kc, published.kc, rel_tol=_NEAR):
         return (
             f"the report has kc {kc:.6g} where the identifier_node gave {published.kc:.6g}: "
-            "it was asked for something else, or runs another version"
+            "the node had other parameters, or is of another version"
         )
     return ""

@@ -1,4 +1,4 @@
-"""What `tune` prints for people: one rule in full, or all rules side by side."""
+"""The output of `tune` for people: one rule in full, or all rules side by side."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def process_lines(model: TransferFunction) -> list[str]:
 
 
 def form_lines(gains: Gains, form: str) -> list[str]:
-    """Return gains in the form asked for, beside those that are always shown.
+    """Return gains in the form asked for, in addition to the forms that are always shown.
 
     :param gains: the gains.
     :param form: "isa", "parallel" or "series".
@@ -43,10 +43,10 @@ def form_lines(gains: Gains, form: str) -> list[str]:
 
 
 def side_by_side(gains: Sequence[Gains], recommended: int | None, form: str) -> list[str]:
-    """Return every rule that applies in a line.
+    """Return a line for every rule that applies.
 
     :param gains: of the rules that apply.
-    :param recommended: index of the gains that count.
+    :param recommended: index of the recommended gains; None: there are none.
     :param form: in which they are shown.
     """
     headings = {"parallel": ("p", "i", "d"), "isa": _HEADINGS[:3], "series": _HEADINGS[:3]}[form]

@@ -1,6 +1,6 @@
-"""What a person sees of a tune, as text: its progress, its result, and what to type next.
+"""The text that a tune shows: its progress, its result, and the next commands.
 
-Everything here is made from the messages of the action `Tune` alone, whichever way they came.
+Everything here is made from the messages of the action `Tune` alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from relay_autotune.verdict import Verdict
 STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")
 OUTCOMES = ("unknown", "completed", "aborted", "failed")
 
-# Columns that a terminal must have for lines that are written again.
+# Columns that a terminal needs for lines that are updated in place.
 NARROWEST = 80
 
 _BAR = 16
@@ -40,31 +40,31 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Paint:
-    """How text may look.
+    """The look of text.
 
-    :param colour: whether escape sequences for colours may be used.
-    :param blocks: whether the terminal can show other than ASCII.
+    :param colour: True if escape sequences for colours may be used.
+    :param blocks: True if the terminal can show more than ASCII.
     """
 
     colour: bool = False
     blocks: bool = False
 
     def __call__(self, text: str, code: str) -> str:
-        """Return a text in a colour or weight, where that is possible."""
+        """Return a text in a colour or weight, if that is possible."""
         return f"\x1b[{code}m{text}\x1b[{_PLAIN}m" if self.colour and text else text
 
 
 def wants_colour(is_terminal: bool, environment: Mapping[str, str]) -> bool:
-    """Tell whether colours are wanted: on a terminal that knows them, without NO_COLOR.
+    """Return whether colours are wanted: on a terminal that supports them, without NO_COLOR.
 
-    :param is_terminal: whether a person looks at it.
+    :param is_terminal: True if the output is a terminal.
     :param environment: the variables of the process.
     """
     return is_terminal and not environment.get("NO_COLOR") and environment.get("TERM") != "dumb"
 
 
 def duration(seconds: float) -> str:
-    """Return a duration as people say it.
+    """Return a duration as text, such as "12 min 5 s".
 
     :param seconds: the duration [s], not negative.
     """
@@ -105,7 +105,7 @@ def oscillation(feedback: Any) -> str:
 
 
 def is_news(before: Any, now: Any) -> bool:
-    """Tell whether a feedback is worth a line in a log: another state, or another cycle.
+    """Return whether a feedback needs a line in a log: another state, or another cycle.
 
     :param before: the feedback before it, None for the first.
     :param now: a `Tune.Feedback`.
@@ -133,8 +133,8 @@ def live_lines(
     """Return a feedback as the lines that a terminal shows until the next one.
 
     :param feedback: a `Tune.Feedback`.
-    :param paint: how text may look.
-    :param since: time since it came [s], not negative.
+    :param paint: the look of text.
+    :param since: time since the feedback came [s], not negative.
     :param width: columns of the terminal, at least `NARROWEST`.
     """
     state = STATES[feedback.state]
@@ -163,8 +163,8 @@ def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:
     """Return the result of a tune.
 
     :param result: a `Tune.Result` with an experiment.
-    :param cancelled: whether it was cancelled from here.
-    :param paint: how text may look.
+    :param cancelled: True if this command cancelled it.
+    :param paint: the look of text.
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
@@ -185,7 +185,7 @@ def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:
 
 
 def _verdict_lines(result: Any, paint: Paint) -> list[str]:
-    """Return the verdict with what to look at, in the colour of how good it is."""
+    """Return the verdict in its colour, with what to look at."""
     verdict = Verdict(result.verdict)
     colour = {Verdict.TRUSTED: _GREEN, Verdict.DOUBTFUL: _YELLOW}.get(verdict, _RED)
     lines = [f"  {'verdict':<16} {paint(verdict.name.lower(), f'{_BOLD};{colour}')}"]
@@ -196,7 +196,7 @@ def model_lines(message: Any, paint: Paint) -> list[str]:
     """Return an identified model with its accuracy.
 
     :param message: a `TransferFunction`.
-    :param paint: how text may look.
+    :param paint: the look of text.
     """
     process = process_text(transfer_function_from_message(message))
     lines = [f"  {'process':<16} {process}   ({message.structure}, {message.method})"]
@@ -233,13 +233,13 @@ def next_commands(
     flags: str = "",
     report: str = "",
 ) -> list[tuple[str, str]]:
-    """Return what to type next, each with what it is for.
+    """Return the next commands, each with its purpose.
 
     :param result: a `Tune.Result`.
-    :param controllers: full names of the controller_nodes that hear these gains.
-    :param prefix: what runs the package's executables, where the shell does not find them.
-    :param flags: with which these give what the identifier_node gave.
-    :param report: the report that was written; empty: none was.
+    :param controllers: full names of the controller_nodes that receive these gains.
+    :param prefix: put before the package's executables if the shell does not find them.
+    :param flags: options with which `replay` and `report` give the identifier_node's result.
+    :param report: the report that was written; empty: none.
     """
     steps = []
     if report:
@@ -269,12 +269,12 @@ def next_commands(
 
 
 def document(result: Any, node: str, cancelled: bool, report: str = "") -> dict[str, Any]:
-    """Return a result for a JSON document; null stands for "not estimated", and "none came".
+    """Return a result for a JSON document; null stands for "not estimated" or "none".
 
     :param result: a `Tune.Result`.
     :param node: full name of the relay_node.
-    :param cancelled: whether it was cancelled from here.
-    :param report: the report that was written; empty: none was.
+    :param cancelled: True if this command cancelled it.
+    :param report: the report that was written; empty: none.
     """
     model, gains = result.transfer_function, result.gains
     return {
@@ -292,7 +292,7 @@ def document(result: Any, node: str, cancelled: bool, report: str = "") -> dict[
 
 
 def _fields(value: Any) -> Any:
-    """Return a message as what JSON knows."""
+    """Return a message as dictionaries, lists, texts and finite numbers."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: _fields(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if isinstance(value, float):

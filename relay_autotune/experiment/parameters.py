@@ -16,15 +16,15 @@ class ExperimentParameters:
     amplitude: float = quantity(
         0.0,
         "u",
-        "Half the distance of the two command levels; 0: found by itself between command_min and "
-        "command_max, from small to large.",
+        "Half the distance of the two command levels; 0: the tune finds it between command_min "
+        "and command_max, from small to large.",
         lower=0.0,
     )
     target_amplitude: float = quantity(
         0.0,
         "y",
-        "Half the swing of the measurement at which an amplitude that is found by itself is large "
-        "enough; 0: when the oscillation stands clear of noise, hysteresis and resolution.",
+        "For amplitude 0: half the swing of the measurement that is large enough; 0: when the "
+        "oscillation stands clear of noise, hysteresis and resolution.",
         lower=0.0,
     )
     bias: float = quantity(
@@ -35,7 +35,7 @@ class ExperimentParameters:
     bias_ratio: float = quantity(
         0.3,
         "",
-        "Bias as a fraction of the amplitude, used where bias is 0; a biased relay also tells "
+        "Bias as a fraction of the amplitude, used if bias is 0; a biased relay also determines "
         "the static gain, 0 makes the relay symmetric.",
         lower=-1.0,
         upper=1.0,
@@ -64,7 +64,7 @@ class ExperimentParameters:
     settle_time: float = quantity(
         0.0,
         "s",
-        "Time at the baseline before the kick; 0: until the measurement is seen to be steady.",
+        "Time at the baseline before the kick; 0: until the measurement is steady.",
         lower=0.0,
     )
     min_cycles: int = quantity(
@@ -77,7 +77,7 @@ class ExperimentParameters:
     max_cycles: int = quantity(
         12,
         "",
-        "Number of cycles after which the experiment ends, agreeing or not.",
+        "Number of cycles after which the experiment ends, whether they agree or not.",
         lower=2,
         upper=1000,
     )
@@ -120,8 +120,8 @@ class ExperimentParameters:
     command_rate: float = quantity(
         0.0,
         "u/s",
-        "Fastest change of the relay's command; the safe command at the end is a step all the "
-        "same; 0: no limit.",
+        "Fastest change of the relay's command; the safe command at the end is still a step; 0: "
+        "no limit.",
         lower=0.0,
     )
     extra_delay: float = quantity(
@@ -147,7 +147,7 @@ class ExperimentParameters:
     sample_period: float = quantity(
         0.0,
         "s",
-        "Period of the samples where they carry no time of their own; 0: by their stamps.",
+        "Period of the samples, if they have no time of their own; 0: the time is their stamp.",
         lower=0.0,
     )
 

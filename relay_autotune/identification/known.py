@@ -23,8 +23,8 @@ class Known:
     gain: float = quantity(
         math.nan,
         "y/u",
-        "Static gain of the process, of an integrating one its gain in y/(u s); NaN: to be "
-        "found, which atv, and chang with unequal lags, cannot.",
+        "Static gain of the process, in y/(u s) if it integrates; NaN: to be found, which atv, "
+        "and chang with unequal lags, cannot do.",
     )
     dead_time: float = quantity(
         math.nan, "s", "Dead time of the process; NaN: to be found.", lower=0.0
@@ -41,7 +41,7 @@ class Known:
     loss: str = quantity(
         LOSSES[0],
         "",
-        "How the waveform fit counts residuals; huber and tukey bear many outliers.",
+        "Loss function of the waveform fit; huber and tukey tolerate many outliers.",
         choices=LOSSES,
     )
 

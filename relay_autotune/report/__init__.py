@@ -23,12 +23,12 @@ __all__ = ["PICTURES", "draw", "write_figures", "write_page", "write_picture", "
 def draw(
     analysis: Analysis, path: Path | str, *, title: str, truth: TransferFunction | None = None
 ) -> None:
-    """Draw an experiment, the fit over it and the loop that its gains will make, in one picture.
+    """Draw an experiment, the fit over it and the predicted closed loop, in one picture.
 
     :param analysis: of the record.
     :param path: the picture; its ending says the format (.png, .svg, .pdf).
-    :param title: what it is about.
-    :param truth: the process, where it was a simulated one.
+    :param title: title of the picture.
+    :param truth: the true process, if it was simulated.
     """
     from relay_autotune.report.case import case_of
 
@@ -59,7 +59,7 @@ def write_report(
     :param analyses: at least one.
     :param path: the file.
     :param title: of the page; default: the id of the first experiment.
-    :param truth: the process, where it was a simulated one.
+    :param truth: the true process, if it was simulated.
     """
     from relay_autotune.analysis import Analysis
     from relay_autotune.report.case import case_of
@@ -86,9 +86,9 @@ def write_figures(cases: Sequence[Case], folder: Path | str, kind: str = "png") 
     """Write each figure of each case to a file of its own.
 
     :param cases: at least one.
-    :param folder: made if it is not there.
+    :param folder: created if it does not exist.
     :param kind: "png" or "svg".
-    :return: the files, named for their figures; of several cases, numbered.
+    :return: the files, named after their figures; with several cases the names are numbered.
     """
     from relay_autotune.report.figures import PLATES
     from relay_autotune.report.style import save

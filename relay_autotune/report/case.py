@@ -1,4 +1,4 @@
-"""What a report tells of one experiment, whether it comes from samples or from a document."""
+"""The content of a report about one experiment, from samples or from a document."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Estimate:
     :param low: lower end of the interval; NaN: not estimated.
     :param high: upper end.
     :param unit: "" for a pure number.
-    :param determined: False if the data do not tell it.
-    :param truth: where the process was a simulated one; NaN: not known.
+    :param determined: False if the data do not determine it.
+    :param truth: the true value, if the process was simulated; NaN: not known.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Estimate:
 
     @property
     def title(self) -> str:
-        """The name as a person writes it."""
+        """The name with blanks for underscores."""
         return self.name.replace("_", " ")
 
 
@@ -66,10 +66,10 @@ class ModelCase:
     :param rivals: other structures that the data do not rule out.
     :param fitted: the model's measurement at the samples [y]; empty: not known.
     :param validation: how its limit cycle differs from the record's; None: not compared.
-    :param integrated_error: how far it is from the model that counts [rad/s]; NaN: it is that
-        model, or not known.
-    :param combinations: what the data determine where they do not determine every parameter.
-    :param advice: then, what test would determine it, each a sentence.
+    :param integrated_error: distance from the selected model [rad/s]; NaN: it is that model, or
+        not known.
+    :param combinations: determined combinations, if some parameters are not determined.
+    :param advice: tests that would determine these parameters, each a sentence.
     """
 
     method: str
@@ -87,13 +87,13 @@ class ModelCase:
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """Titles of the parameters that the data do not tell."""
+        """Titles of the parameters that the data do not determine."""
         return tuple(e.title for e in self.estimates if not e.determined)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One experiment and all that was made of it.
+    """One experiment with its models and gains.
 
     :param source: the recording or document that it comes from.
     :param experiment_id: the id of its messages; may be empty.
@@ -102,16 +102,16 @@ class Case:
     :param outcome: how it ended.
     :param reason: why it ended so, or why there is no model or no gains.
     :param models: what each method found.
-    :param selected: index of the one that counts; None: nothing was identified.
+    :param selected: index of the selected model; None: nothing was identified.
     :param gains: what each rule gives.
-    :param recommended: index of the gains that count; None: there are none.
+    :param recommended: index of the recommended gains; None: there are none.
     :param limit_cycle: averages over its cycles; None: no whole cycle.
-    :param samples: how many there are; 0: not known.
-    :param lost_samples: how many were sent and did not come.
+    :param samples: number of samples; 0: not known.
+    :param lost_samples: number of samples that were sent and not received.
     :param record: the samples; None: not known.
     :param settings: of the relay; None: no relay, or not known.
     :param cycles: the whole cycles; empty where there are no samples.
-    :param models_around: models within the uncertainty of the one that counts.
+    :param models_around: models within the uncertainty of the selected one.
     :param points: of the frequency response, by Fourier integrals over the cycles.
     :param added_delay: dead time that the controller's loop adds to the process [s].
     :param judgement: what the checks found, and the verdict.
@@ -140,12 +140,12 @@ class Case:
 
     @property
     def model(self) -> ModelCase | None:
-        """The model that counts."""
+        """The selected model."""
         return None if self.selected is None else self.models[self.selected]
 
     @property
     def best_gains(self) -> Gains | None:
-        """The gains that count."""
+        """The recommended gains."""
         return None if self.recommended is None else self.gains[self.recommended]
 
 
@@ -159,11 +159,11 @@ def in_loop(case: Case, model: TransferFunction) -> TransferFunction:
 
 
 def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None = None) -> Case:
-    """Return what a report tells of an analysed record.
+    """Return the case of an analysed record.
 
     :param analysis: of the record.
     :param source: name of the recording.
-    :param truth: the process, where it was a simulated one.
+    :param truth: the true process, if it was simulated.
     """
     record = analysis.record
     return Case(
@@ -198,11 +198,11 @@ def _cycles(record: Record) -> tuple[Cycle, ...]:
 
 
 def around(model: Identification | None) -> tuple[TransferFunction, ...]:
-    """Return models within the uncertainty of the one that counts, empty where it is not known.
+    """Return models within the uncertainty of the selected one; empty: it is not known.
 
-    :param model: the one that counts; None: there is none.
+    :param model: the selected model; None: there is none.
     """
-    # The seed is that of the analysis, so that the band holds the models that it judged.
+    # The same seed as in the analysis, so that the band shows the models that it judged.
     return () if model is None else ensemble(model, rng=np.random.default_rng(0))
 
 
@@ -217,8 +217,8 @@ def measured_points(models: Sequence[Identification]) -> tuple[FrequencyPoint, .
 def model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
     """Return a model as the report shows it.
 
-    :param found: by one method.
-    :param truth: the process, where it was a simulated one.
+    :param found: the result of one method.
+    :param truth: the true process, if it was simulated.
     """
     low, high = found.ci95_low, found.ci95_high
     structure = found.estimate.structure
@@ -252,7 +252,7 @@ def model_case(found: Identification, truth: TransferFunction | None) -> ModelCa
 
 
 def true_value(parameter: str, model: TransferFunction, truth: TransferFunction | None) -> float:
-    """Return what a parameter is in truth, NaN where that is not known or not comparable.
+    """Return the true value of a parameter; NaN: not known, or not comparable.
 
     :param parameter: its name.
     :param model: the identified transfer function.
@@ -260,7 +260,7 @@ def true_value(parameter: str, model: TransferFunction, truth: TransferFunction 
     """
     if truth is None or _kind(truth) != _kind(model):
         return math.nan
-    # An unstable process is written with K and tau > 0, and held with both turned around.
+    # An unstable process has K and tau > 0 as parameters, and both negated in the model.
     sign = -1.0 if model.structure.startswith("unstable") else 1.0
     if parameter == "time_constant" and len(set(truth.time_constants)) == 1:
         return sign * truth.time_constants[0].real
@@ -268,7 +268,7 @@ def true_value(parameter: str, model: TransferFunction, truth: TransferFunction 
 
 
 def _kind(model: TransferFunction) -> tuple[int, int, int, bool]:
-    """Return what two models of one structure share; a document's truth has no name for it."""
+    """Return what two models of one structure have in common; a document's truth has no name."""
     poles = model.time_constants
     unstable = any(t.real < 0.0 for t in poles)
     return len(poles), len(model.zeros), model.integrators, unstable
@@ -287,7 +287,7 @@ def ultimate_estimates(
     :param gain_std: its standard deviation.
     :param frequency: w_u [rad/s].
     :param frequency_std: its standard deviation.
-    :param truth: the process, where it was a simulated one.
+    :param truth: the true process, if it was simulated.
     """
     from relay_autotune.process.ultimate import ultimate_point
 

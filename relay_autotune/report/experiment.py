@@ -53,7 +53,7 @@ class Switches:
 
 
 def switches_of(record: Record, settings: RelaySettings) -> Switches:
-    """Tell the switches of the relay from what it does before and after.
+    """Return the kicks, switches and releases of a relay from its commands.
 
     :param record: the experiment.
     :param settings: of its relay.
@@ -182,7 +182,7 @@ def _residual(axes: Axes, record: Record, model: ModelCase) -> None:
     axes.plot(time, error, color=INK, lw=0.6, marker=marker, ms=3.0)
     axes.axhline(0.0, color=MUTED, lw=0.8)
     axes.set_ylabel("residual [y]")
-    # Rounding is not worth an axis of its own.
+    # A residual that is only rounding is shown as a flat line.
     least = _ROUNDING * float(np.ptp(record.measurement))
     if np.nanmax(np.abs(error)) < least:
         axes.set_ylim(-least, least)
@@ -225,8 +225,7 @@ def rate_of(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return times, values and their derivative by parabolas over a twelfth of the period.
 
-    A parabola through so many samples keeps the shape of the cycle and averages the noise
-    (Savitzky and Golay 1964).
+    This keeps the shape of the cycle and averages the noise (Savitzky and Golay 1964).
 
     :param record: whose instants the values have.
     :param values: shape (n,).
@@ -245,6 +244,6 @@ def rate_of(
     count = min(max(count, 5), 2 * ((grid.size - 1) // 2) - 1)
     smooth = savgol_filter(even, count, 2)
     rate = savgol_filter(even, count, 2, deriv=1, delta=step)
-    # At its ends a record has no neighbours to fit a parabola to.
+    # At the ends of the record there are too few neighbours to fit a parabola to.
     whole = slice(count // 2, grid.size - count // 2)
     return grid[whole], np.asarray(smooth)[whole], np.asarray(rate)[whole]

@@ -23,7 +23,7 @@ from relay_autotune.report.uncertainty import draw_uncertainty, uncertainty_heig
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
-_NO_SAMPLES = "it needs the samples, which a result without its recording does not hold"
+_NO_SAMPLES = "it needs the samples, which a result without its recording does not have"
 _FEWEST = 20
 _NO_MODEL = "nothing was identified"
 _NO_GAINS = "there are no gains"
@@ -43,7 +43,7 @@ class Plate:
     :param key: its name in files and in the page's links.
     :param title: what it shows.
     :param draw: draws it into an empty figure.
-    :param missing: why a case has no such figure; empty: it has.
+    :param missing: why a case has no such figure; empty: it has one.
     :param reading: how it is to be read, what is good and what is bad.
     :param wide: True if it fills the page, False if two stand side by side.
     :param without_relay: how it is to be read where no relay acted; empty: the same way.
@@ -122,7 +122,7 @@ def _without_intervals(case: Case) -> str:
     if case.model is None:
         return _NO_MODEL
     known = any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate))
-    return "" if known else f"the method {case.model.method} tells no uncertainty"
+    return "" if known else f"the method {case.model.method} gives no uncertainty"
 
 
 PLATES = (
@@ -144,9 +144,9 @@ PLATES = (
         "Model over the data",
         draw_fit,
         _without_fit,
-        "Above, the model follows the measurement. Below, what it leaves. Good: the residual is "
-        "as wide as the band and has no pattern. Bad: it repeats with the cycle (the structure "
-        "is too simple), or it drifts (a disturbance acted during the test).",
+        "Above: the model over the measurement. Below: the residual. Good: the residual is as "
+        "wide as the band and has no pattern. Bad: it repeats with each cycle (the structure is "
+        "too simple), or it drifts (a disturbance acted during the test).",
         lambda _: (4.9, 5.6),
     ),
     Plate(
@@ -155,7 +155,7 @@ PLATES = (
         draw_phase_plane,
         _without_cycles,
         "The rate of the measurement over the measurement itself. Good: the last cycles lie on "
-        "one closed curve, and the model's lies on them. Bad: curves that do not close or do "
+        "one closed curve, and the model's curve on them. Bad: curves that do not close or do "
         "not coincide; corners that the model cuts.",
         lambda _: (5.0, 4.3),
         wide=False,
@@ -189,7 +189,7 @@ PLATES = (
         _without_gains,
         "A step of the set-point, then one of the load at the process input, on the identified "
         "model and on some of those within its uncertainty. Good: one small overshoot and a quick "
-        "return, on all of them. Bad: ringing, or a load error that lingers.",
+        "return, on all of them. Bad: ringing, or a load error that lasts long.",
         lambda _: (4.6, 5.0),
     ),
     Plate(
@@ -207,9 +207,9 @@ PLATES = (
         draw_uncertainty,
         _without_intervals,
         "95 % intervals as distance from the estimate; within the shaded 20 % a quantity counts "
-        "as determined. K_u and w_u decide on the gains, and are often surer than the "
-        "parameters. Good: the methods agree on them. Bad: one that should suit the test is far "
-        "off. A star is the truth, where the process was a simulated one.",
+        "as determined. K_u and w_u decide the gains, and often have narrower intervals than the "
+        "parameters. Good: the methods agree on them. Bad: a method that suits the test is far "
+        "off. A star is the true value, if the process was simulated.",
         uncertainty_height,
     ),
 )

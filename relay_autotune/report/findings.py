@@ -1,4 +1,4 @@
-"""What a report says in words: the verdict, its checks, the numbers, what remains in doubt."""
+"""The words of a report: the verdict, its checks, the numbers, and what remains uncertain."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _VERDICTS: dict[Verdict, tuple[str, Tone]] = {
 
 @dataclass(frozen=True)
 class Chip:
-    """What came of an experiment, in a few words.
+    """The outcome of an experiment in a few words.
 
     :param text: for people.
-    :param tone: how good that is.
+    :param tone: how good it is.
     """
 
     text: str
@@ -60,7 +60,7 @@ class Check:
 
     @property
     def mark(self) -> str:
-        """A sign that says the tone without colour."""
+        """A sign that shows the tone without colour."""
         return _MARKS[self.tone]
 
 
@@ -77,7 +77,7 @@ class Number:
 
 
 def verdict_of(case: Case) -> Chip:
-    """Return what came of an experiment.
+    """Return the verdict on an experiment.
 
     :param case: the experiment.
     """
@@ -123,7 +123,7 @@ def warnings_of(case: Case) -> tuple[str, ...]:
 
 
 def checks_of(case: Case) -> tuple[Check, ...]:
-    """Return what speaks for the result and what against it.
+    """Return the checks of the result.
 
     :param case: the experiment.
     """
@@ -146,7 +146,7 @@ def _number(value: float) -> str:
 
 
 def numbers_of(case: Case) -> tuple[Number, ...]:
-    """Return what the limit cycle itself says.
+    """Return the numbers of the limit cycle.
 
     :param case: the experiment.
     """
@@ -170,7 +170,7 @@ def numbers_of(case: Case) -> tuple[Number, ...]:
 
 
 def doubts_of(case: Case) -> tuple[str, ...]:
-    """Return what remains uncertain and what would tell, in sentences.
+    """Return what remains uncertain, in sentences.
 
     :param case: the experiment.
     """

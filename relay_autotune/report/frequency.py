@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-# 95 % of a normal distribution in the plane lie within so many standard deviations.
+# 95 % of a normal distribution in the plane lie within this number of standard deviations.
 _ELLIPSE = math.sqrt(-2.0 * math.log(0.05))
 _CORNERS = 24
 _TURNS = -2.5
@@ -92,7 +92,7 @@ def _margins(axes: Axes, gains: Gains, loop: ComplexArray) -> None:
 
     :param axes: of the Nyquist figure.
     :param gains: with their margins.
-    :param loop: its values, shape (f,), whose side of the axis the second crossing takes.
+    :param loop: its values, shape (f,); they decide on which side of the axis the phase margin is.
     """
     if math.isfinite(gains.gain_margin) and gains.gain_margin > 0.0:
         axes.plot(
@@ -110,9 +110,9 @@ def _margins(axes: Axes, gains: Gains, loop: ComplexArray) -> None:
 
 
 def _loop_frequencies(loop: TransferFunction) -> FloatArray:
-    """Return frequencies from where the loop is large to where it has died away.
+    """Return frequencies from where the loop is large to where it is small.
 
-    A dead time turns what is left about the origin for ever, which says no more after a few turns.
+    A dead time turns the loop about the origin without end; a few turns are shown.
     """
     from relay_autotune.loop.analysis import frequencies
 
@@ -164,7 +164,7 @@ def _hull(points: FloatArray) -> FloatArray:
 
 
 def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
-    """Draw magnitude and phase of the process, with the points that the cycles themselves gave.
+    """Draw magnitude and phase of the process, with the points measured from the cycles.
 
     :param case: with a model.
     :param figure: empty, to be drawn into.
@@ -187,11 +187,11 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
         at = np.array([p.frequency for p in points])
         value = np.array([p.value for p in points]) * model.process_sign
         lag = np.degrees(np.angle(value))
-        # The branch of the angle that is nearest to the model's phase.
+        # Take the branch of the angle that is nearest to the model's phase.
         lag += 360.0 * np.round((np.interp(at, w, phase) - lag) / 360.0)
         style = {"fmt": "D", "ms": 6, "mfc": PAPER, "mec": INK, "mew": 1.4, "ecolor": INK}
         std = np.nan_to_num([p.std for p in points])
-        # To first order the two parts' deviations are those of magnitude and angle, too.
+        # To first order, magnitude and angle have the deviation of the real and imaginary part.
         above.errorbar(at, np.abs(value), yerr=NORMAL_95 * std, label="measured, 95 %", **style)
         below.errorbar(at, lag, yerr=np.degrees(NORMAL_95 * std / np.abs(value)), **style)
     if case.model.ultimate:
@@ -220,7 +220,7 @@ def _band(axes: Axes, w: FloatArray, values: FloatArray) -> None:
 
 
 def _bode_frequencies(case: Case) -> FloatArray:
-    """Return two decades about what the experiment excited, or about the model's corner."""
+    """Return frequencies around those that the experiment excited, or the model's corner."""
     assert case.model is not None
     if case.model.ultimate:
         middle = case.model.ultimate[1].value

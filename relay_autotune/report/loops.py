@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 _SAMPLES = 500
-# Of the models within the uncertainty, so many are simulated.
+# Number of models within the uncertainty that are simulated.
 _SHOWN = 10
 
 
@@ -56,7 +56,7 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     split = "\n" if narrow else " "
     above.set_ylabel(f"measurement,{split}deviation [y]")
     below.set(ylabel="command,\ndeviation [u]", xlabel="time [s]")
-    # A loop that is not stable on a model far out is not worth the scale of all others.
+    # A loop that is unstable on an extreme model must not set the scale for all others.
     low, high = above.get_ylim()
     above.set_ylim(max(low, -1.0), min(high, 2.5))
     if case.models_around:
@@ -100,7 +100,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
             axes.set_xlabel("time [s]")
         if k % columns == 0:
             axes.set_ylabel("deviation [y]")
-    # A loop that rings far out is not worth the scale of all others.
+    # A loop that rings strongly must not set the scale for all others.
     low, high = grid[0, 0].get_ylim()
     grid[0, 0].set_ylim(max(low, -1.0), min(high, 2.5))
     finish(figure)
@@ -119,7 +119,7 @@ def rules_height(case: Case) -> tuple[float, float]:
 def _columns(count: int, *, narrow: bool) -> int:
     if narrow:
         return min(count, 2)
-    # Few rows, and few places left empty.
+    # Prefer few rows, and few empty places.
     return min((4, 5, 3), key=lambda c: 2 * -(-count // c) - count % -c) if count > 3 else count
 
 
@@ -131,8 +131,8 @@ def _steps(axes: Axes, half: float) -> None:
 def distinct_gains(case: Case) -> tuple[Gains, ...]:
     """Return the recommended gains and those of the other rules that differ from them.
 
-    Of rules that give the same gains, as an automatic choice does with the one it chose, the
-    first stands for all.
+    If several rules give the same gains, as an automatic rule does with the one it chose, only the
+    first is kept.
 
     :param case: with gains.
     """
@@ -145,7 +145,7 @@ def distinct_gains(case: Case) -> tuple[Gains, ...]:
 
 
 def _half(gains: Gains, model: TransferFunction) -> float:
-    """Return how long a step is followed [s]: until it has died away, with some room."""
+    """Return how long a step is simulated [s]: until it has settled, with some margin."""
     slowest = max((abs(t) for t in model.time_constants), default=0.0)
     reset = gains.ti / abs(gains.kc * model.gain) if model.is_stable and gains.ti else gains.ti
     return 2.5 * (2.0 * model.dead_time + max(slowest, gains.ti) + reset)
@@ -153,7 +153,7 @@ def _half(gains: Gains, model: TransferFunction) -> float:
 
 @functools.lru_cache(maxsize=64)
 def _run(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop | None:
-    # About half of what the set-point step needs, in the other direction.
+    # About half of the command that the set-point step needs, in the other direction.
     load = -0.5 / abs(model.gain) if model.is_stable else -0.2 * abs(gains.kc)
     fine = min(half / _SAMPLES, max(gains.tf, model.dead_time) / 5.0 or math.inf)
     try:
@@ -162,5 +162,5 @@ def _run(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop | Non
             setpoint=1.0, load=load, load_time=half,
         )  # fmt: skip
     except RelayAutotuneError:
-        # Gains that cannot be run at any sampling period are in the table all the same.
+        # Gains that cannot run at any sampling period are still in the table.
         return None

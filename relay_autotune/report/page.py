@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing beside itself."""
+"""The report as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from relay_autotune.report.findings import (
 from relay_autotune.report.style import COLOURS, inline
 from relay_autotune.text import digits, process_mathml, process_text
 
-# Of the page itself, in dark mode; those of figures come from COLOURS.
+# Colours of the page in dark mode; those of the figures come from COLOURS.
 _NIGHT = (
     "--page: #101318; --card: #171b21; --line: #2c343d; --text: #e8ebee; --soft: #9fabb7; "
     "--accent: #6db8ea; --accent-soft: #1b2f3d; --good: #5fd6ae; --good-soft: #15322a; "
@@ -61,7 +61,7 @@ class _Drawn:
 
 @dataclass(frozen=True)
 class _Section:
-    """What the page tells of one experiment."""
+    """The section of the page about one experiment."""
 
     case: Case
     name: str
@@ -79,7 +79,7 @@ class _Section:
 def page(cases: Sequence[Case], *, title: str = "") -> str:
     """Return the report of some experiments as an HTML page.
 
-    The same cases give the same bytes. Whatever comes from a recording is escaped.
+    The same cases give the same bytes. All text from a recording is escaped.
 
     :param cases: at least one.
     :param title: of the page; default: the first case's source.

@@ -1,4 +1,4 @@
-"""The report in one picture: what was measured, what the model says, what the gains will do."""
+"""The report in one picture: experiment, fit, Nyquist and predicted closed loop."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _ROWS = ((("experiment",), 4.2), (("fit",), 3.8), (("nyquist", "closed_loop"), 4
 def draw_picture(case: Case, path: Path, *, title: str) -> None:
     """Draw experiment, fit, Nyquist and closed loop into one picture.
 
-    What a case does not have is left out, and the reason stands in its place.
+    If a figure is missing, the reason stands in its place.
 
-    :param case: what was made of an experiment.
+    :param case: the experiment.
     :param path: the picture; its ending says the format (.png, .svg, .pdf).
-    :param title: what it is about.
+    :param title: title of the picture.
     """
     plates = {plate.key: plate for plate in PLATES}
     figure = new_figure(WIDE, sum(height for _, height in _ROWS) + 0.4)
@@ -43,5 +43,5 @@ def draw_picture(case: Case, path: Path, *, title: str) -> None:
 
 
 def _plain(text: str) -> str:
-    # Between two dollar signs matplotlib reads a formula.
+    # matplotlib takes text between two dollar signs for a formula.
     return visible(text).replace("$", r"\$")

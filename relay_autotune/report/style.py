@@ -1,6 +1,6 @@
-"""How figures look, and how one becomes a picture or a part of a page.
+"""The look of figures, and how a figure becomes a file or a part of a page.
 
-The colours are those of Okabe and Ito, which people of any colour vision can tell apart; lines
+The colours are those of Okabe and Ito, which people of any colour vision can distinguish; lines
 differ in dashes as well. In a page each colour is a CSS variable, so that dark mode needs no
 second figure.
 """
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-# Name of the CSS variable, colour on white, colour on black. No two are equal, since the
-# variables are put in where the colours stand.
+# Name of the CSS variable, colour on white, colour on black. All colours differ, since each colour
+# in a figure is replaced by its variable.
 COLOURS = {
     "ink": ("#20262d", "#e7eaee"),
     "muted": ("#68727d", "#9aa5b1"),
@@ -111,7 +111,7 @@ def thinned(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     """Return a signal with fewer points that looks the same: the extremes of each stretch.
 
     :param time: s, shape (n,).
-    :param values: shape (n,); NaN where there is none.
+    :param values: shape (n,); NaN: no value.
     """
     n = time.size
     if n <= 4 * _BUCKETS:
@@ -176,7 +176,7 @@ def inline(figure: Figure, prefix: str, label: str) -> str:
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     body = re.sub(r"<style[^>]*>.*?</style>", "", body, flags=re.DOTALL)
     body = re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL)
-    # What stands between the tags is text, and stays as it is.
+    # Text between the tags is kept unchanged.
     body = re.sub(r"<[^>]*>", lambda tag: _adapted(tag[0], prefix), body)
     body = re.sub(r"\n\s*", "\n", body)
     return (

@@ -1,4 +1,4 @@
-"""The figure of how sure a model is, and how far the methods agree."""
+"""The figure of a model's uncertainty, and of how well the methods agree."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ __all__ = [
 def rule_named(name: str) -> Rule:
     """Return a rule by its name.
 
-    :raises TuningError: if there is none of that name; the message lists those there are.
+    :raises TuningError: if the name is unknown; the message lists the known names.
     """
     return look_up(RULES, name, "rule", TuningError)
 
@@ -52,15 +52,15 @@ def tune(
     options: DesignOptions | None = None,
     describing: UltimatePoint | None = None,
 ) -> Gains:
-    """Return the gains of a rule, judged on the model and on the models around it.
+    """Return the gains of a rule, judged on the model and on models within its uncertainty.
 
     :param identification: the model and its uncertainty.
     :param rule: one of ``RULES``.
     :param models: models within the uncertainty, from :func:`ensemble`.
-    :param simple: the FOPDT that fits best, on which a rule for FOPDT designs where the model is
-        of another structure; its gains are judged on the model all the same.
+    :param simple: the FOPDT that fits best; a rule for FOPDT designs on it if the model has
+        another structure. The gains are still judged on the model.
     :param options: what is asked of the controller.
-    :param describing: what the describing function reads from the limit cycle.
+    :param describing: K_u and w_u by the describing function from the limit cycle.
     :raises TuningError: if the rule does not apply, or its loop is unstable on the model or on
         more than 5 % of ``models``.
     """
@@ -75,10 +75,10 @@ def tune(
 
 
 def design(task: DesignTask, rule: str) -> Gains:
-    """Return the gains of a rule, judged on the model and on the models around it.
+    """Return the gains of a rule, judged on the model and on models within its uncertainty.
 
-    Both are judged with the delay that the loop adds to the process: half a sampling period, and
-    what else the options say.
+    They are judged with the delay that the loop adds to the process: half a sampling period, and
+    the loop's own delay.
 
     :param task: the process and what is asked of the controller.
     :param rule: one of ``RULES``.

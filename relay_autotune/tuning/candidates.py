@@ -1,4 +1,4 @@
-"""Controllers that a search compares, and what limits what they make of the noise."""
+"""Controllers that a search compares, and the limit on the noise in their command."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Candidates:
-    """Controllers to compare, the sign of their process left out.
+    """Controllers to compare, with positive gains whatever the sign of the process.
 
     :param kp: proportional gains, shape (k,).
     :param ki: integral gains, shape (k,).
@@ -39,7 +39,7 @@ class Candidates:
         return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
 
     def controller(self, k: int, sign: int) -> Controller:
-        """Return one of them for a process of a sign."""
+        """Return controller k with the sign of the process."""
         kp, ki = float(self.kp[k]), float(self.ki[k])
         return Controller(sign * kp, kp / ki, float(self.td[k]), float(self.tf[k]))
 
@@ -49,7 +49,7 @@ class Optimum:
     """The controller that a search found.
 
     :param controller: the gains.
-    :param iae: of a unit step of the load, as the search saw it [y s/u].
+    :param iae: IAE after a unit step of the load, as computed in the search [y s/u].
     """
 
     controller: Controller

@@ -9,10 +9,10 @@ without its dead time:
     eq 54:  1/(n K lambda s) (tau s + 1)^n/(...) = (tau s + 1)^n/(K [(lambda s + 1)^n - 1]),
             lambda = 0.45 tau,
 
-the latter here for any n, and with the dead time that the model has. On a perfect model the
-set-point response is that of the filter, whatever lambda. What limits them is the model: as the
-dead time grows over lambda, the Ms of eq 50 grows towards 2 and its delay margin falls to about
-1.5 lambda, so that a dead time known to 10 % does not allow the lambda of a few percent of it.
+the latter here for any n, and with the model's dead time. On a perfect model the set-point
+response is that of the filter, whatever lambda. The model limits them: as D/lambda grows, the Ms
+of eq 50 grows towards 2 and its delay margin falls to about 1.5 lambda. So if the dead time is
+known to 10 %, lambda must not be only a few percent of it.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class _Section:
     def __init__(self, tau: float, slow: float, period: float) -> None:
         ratio = period / slow
         self._decay = math.exp(-ratio)
-        # What the slope of the input leaves behind in the state over one period.
+        # Weights of the present and the last input in the state, for an input with constant slope.
         self._present = 1.0 + math.expm1(-ratio) / ratio
         self._past = 1.0 - self._decay - self._present
         self._through = tau / slow
@@ -216,5 +216,5 @@ def _lambda(task: DesignTask, default: float, why: str) -> tuple[float, str]:
 
 
 def _clean(value: complex) -> complex:
-    """Take away an imaginary part that is rounding; conjugates must match to the last digit."""
+    """Remove an imaginary part due to rounding; conjugates must match to the last digit."""
     return complex(value.real) if abs(value.imag) < 1e-12 * abs(value) else value

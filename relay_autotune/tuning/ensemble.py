@@ -33,11 +33,11 @@ def ensemble(
 ) -> tuple[TransferFunction, ...]:
     """Draw models from the uncertainty of an identification.
 
-    Other structures that the data do not rule out are there by their support.
+    Other structures that the data do not rule out have a share by their support.
 
     :param identification: with a covariance; without one the ensemble is empty.
     :param count: models to draw.
-    :param rng: the source.
+    :param rng: source of the random numbers.
     """
     if not identification.estimate.known:
         return ()
@@ -71,8 +71,8 @@ class Peaks:
 def ensemble_peaks(controller: Controller, models: ModelSet) -> Peaks:
     """Return the robustness of a controller on each of many models.
 
-    Stability is read off how often each loop turns on the grid; where two points are too far
-    apart for that, the argument principle decides.
+    Stability follows from the number of turns of each loop on the grid; where two points are too
+    far apart to count them, the argument principle decides.
 
     :param controller: the gains.
     :param models: at least one.
@@ -83,7 +83,7 @@ def ensemble_peaks(controller: Controller, models: ModelSet) -> Peaks:
 
 
 def ensemble_ms(controller: Controller, models: ModelSet) -> float:
-    """Return the Ms below which 95 % of the models stay with one controller.
+    """Return the Ms that 95 % of the models do not exceed with one controller.
 
     :param controller: the gains.
     :param models: at least one.
@@ -106,7 +106,7 @@ def _loops(
 ) -> tuple[ComplexArray, FloatArray, NDArray[np.bool_]]:
     """Return loops L and |1 + L| on a grid, shape (n, m), and which are unstable, shape (m,)."""
     grid = frequencies(*controller.characteristic(models.models[0]))
-    # All but integrators has come to rest there.
+    # At the first frequency all dynamics except integrators are at rest.
     w = np.concatenate(([1e-6 * grid[0]], grid))
     loops = controller(1j * w)[:, None] * models(w)
     moved = 1.0 + loops

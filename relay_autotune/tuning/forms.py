@@ -1,14 +1,14 @@
-r"""The three forms of a PID controller, and the exact ways between them.
+r"""The three forms of a PID controller, and the exact conversions between them.
 
-ISA, in which everything here is computed, parallel and series:
+All computations use the ISA form; the others are the parallel and the series form:
 
     kc (1 + 1/(ti s) + td s),    p + i/s + d s,    kc (1 + 1/(ti s)) (1 + td s).
 
-They differ in the numbers alone: the filter on the measurement, of time constant tf, is the same
-factor in all three. Luyben (2003, eq 11) writes the filter of the series form as
-``1/(alpha td s + 1)``, alpha typically 0.1; ``alpha = tf/td`` here, with the second-order filter
-of :class:`~relay_autotune.loop.gains.Controller` in the place of his first-order one, whose
-delay is the same.
+Only the numbers differ: the filter on the measurement, of time constant tf, is the same factor in
+all three. Luyben (2003, eq 11) writes the filter of the series form as ``1/(alpha td s + 1)``,
+alpha typically 0.1. Here ``alpha = tf/td``, and the second-order filter of
+:class:`~relay_autotune.loop.gains.Controller` replaces his first-order one; both have the same
+delay.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class SeriesForm:
     :param kc: proportional gain of the PI part [u/y].
     :param ti: integral time [s]; 0: no integral action.
     :param td: derivative time [s]; 0: no derivative action.
-    :param alpha: time constant of the filter over ``td``; 0: none.
+    :param alpha: time constant of the filter over ``td``; 0: no filter.
     """
 
     kc: float

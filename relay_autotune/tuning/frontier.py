@@ -1,4 +1,4 @@
-r"""The largest integral gain that bounds on the sensitivities leave, in closed form.
+r"""The largest integral gain that bounds on Ms and Mt allow, in closed form.
 
 With a filter F, ``L = (kp (1 + td s) + ki/s) F G``. A bound on the sensitivity keeps L(jw) out of
 a circle around -1, one on the complementary sensitivity out of a circle around a point further
@@ -15,10 +15,10 @@ So for given kp, td and tf every frequency forbids the integral gains between
 
     w (kp w td + c y -+ sqrt(r^2 (x^2 + y^2) - (kp + c x)^2)),
 
-where the root is real. A loop that is stable without integral action stays so up to the least
-``ki = w (kp w td + y)`` at a frequency with ``kp + x = 0``, where it reaches -1. The largest
-integral gain below that which no frequency forbids is sought. It need not be connected to zero:
-with derivative action a certain integral gain can be what keeps a bound.
+where the root is real. A loop that is stable without integral action stays stable up to the
+least ``ki = w (kp w td + y)`` at a frequency with ``kp + x = 0``, where it reaches -1. The result
+is the largest integral gain below that limit which no frequency forbids. The allowed range need
+not begin at zero: with derivative action a bound may need some integral gain.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ IntArray = NDArray[np.integer[Any]]
 
 _ALL = slice(None)
 
-# Times the crossover: from where on the proportional and derivative action make the loop.
+# Beyond this multiple of the crossover the integral action adds little to the loop.
 _BEYOND = 3.0
-# Lower end of a gap over its upper end.
+# A gap whose lower end is above this part of its upper end is ignored.
 _NARROW = 0.9
 # Part of kp within which a loop is near -1.
 _NEAR = 0.3
@@ -55,7 +55,7 @@ class Bounds:
     """Largest magnitudes of sensitivity and complementary sensitivity that are allowed.
 
     :param ms: above 1.
-    :param mt: above 1; infinite: none.
+    :param mt: above 1; infinite: no bound.
     """
 
     ms: float
@@ -75,7 +75,7 @@ class Responses:
     """Frequency responses of models on one grid, with the sign that makes feedback negative.
 
     :param models: m of them, all with the sign of the first.
-    :param grid: rad/s, shape (n,), increasing; its precision is that of all that is computed.
+    :param grid: rad/s, shape (n,), increasing; its floating-point type is used throughout.
     :param crossover: frequency about which loops are closed [rad/s].
     """
 
@@ -88,7 +88,7 @@ class Responses:
         self.crossover = crossover
         self._keep(self._evaluate(grid))
         self._poles = np.array([unstable_at_small_gain(m) for m in models])
-        # Their loops pass -1 at w = 0 as the gain grows.
+        # The loops of these models reach -1 at w = 0 as the gain grows.
         self._at_rest = np.array(
             [m.integrators == 0 and m.gain * m.process_sign < 0.0 for m in models]
         )
@@ -201,7 +201,7 @@ def _largest_ki(
         root = w * np.sqrt(np.maximum(room, 0.0))
         middle = w * (lead + c * y)
         low, high = middle - root, middle + root
-        # Nor does an ellipse matter that lies below ki = 0, or where no loop is stable.
+        # An ellipse below ki = 0, or where no loop is stable, does not matter.
         forbids = (room > 0.0) & (high > 0.0) & (low < stable[..., None])
         column = np.asarray(forbids.any(axis=(0, 1)))
         # The neighbours show where the envelope bends.
@@ -238,7 +238,7 @@ def _first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> Flo
     with np.errstate(invalid="ignore", divide="ignore"):
         share = before / (before - after)
     at = ki[..., :-1] + share * (ki[..., 1:] - ki[..., :-1])
-    # Within one cell of the gain at which no integral is needed for that, the sign is not known.
+    # Within one cell of the marginal proportional gain the sign of ki is not known.
     near = np.maximum(np.abs(before), np.abs(after)) < _NEAR * kp[:, None, None]
     marginal = crosses & near & ((ki[..., :-1] > 0.0) != (ki[..., 1:] > 0.0))
     at = np.where(marginal, 0.0, at)
@@ -250,7 +250,7 @@ def _highest_gap(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the ends of the highest gap below ``start`` that no interval reaches into.
 
-    Gaps that are narrow only come of the distance between frequencies.
+    Narrow gaps are ignored: they are caused by the distance between frequencies.
 
     :param edges: abscissae, lower and upper ends of intervals, the ends of shape (k, m, n).
     :param start: shape (k, m); infinite: above all intervals.

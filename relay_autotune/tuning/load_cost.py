@@ -47,7 +47,7 @@ def load_iaes(
     """
     reset = kp / ki
     if model.is_stable:
-        # With a small gain the integral alone has to bring the process round.
+        # With a small gain the response is that of the integral alone.
         reset = reset + 1.0 / (ki * abs(model.gain))
     duration = _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
     period = 2.0 * duration[:, None]

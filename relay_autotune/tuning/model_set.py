@@ -17,7 +17,7 @@ _Constants = Sequence[tuple[complex, ...]]
 
 
 class ModelSet:
-    """Models like one another, as those within an uncertainty are.
+    """Similar models, such as those within an uncertainty.
 
     :param models: m of them, at least one.
     :ivar integrators: of each model, shape (m,).
@@ -40,8 +40,8 @@ class ModelSet:
     def __call__(self, frequency: FloatArray) -> ComplexArray:
         """Return the response of each model at each frequency.
 
-        Those at the frequencies of the first call are kept, since grids for the loops of one
-        process have most of their frequencies in common.
+        The values at the frequencies of the first call are kept, since the grids for the loops
+        of one process have most of their frequencies in common.
 
         :param frequency: rad/s, shape (n,), increasing.
         :return: y/u, shape (n, m).

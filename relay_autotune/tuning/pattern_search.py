@@ -1,7 +1,7 @@
-"""Least cost by a pattern search, whose directions change from step to step.
+"""Least cost by a pattern search whose directions change from step to step.
 
 The cost need not be smooth. Where two of its pieces meet in a ridge, few directions lead down
-along it, which is why no direction is tried twice.
+along it; so the directions change at each step.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FloatArray = NDArray[np.floating[Any]]
 _SHRINK, _GROW = 0.5, 1.5
 _ON_A_LINE = np.array([-1.0, -0.5, -0.25, -0.125, 0.125, 0.25, 0.5, 1.0])
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-# What is gained by less than this is not gained.
+# A smaller improvement does not count.
 _GAINED = 1.0 - 1e-7
 
 
@@ -32,12 +32,13 @@ def pattern_search(
 ) -> tuple[FloatArray, float]:
     """Return the point of least cost near another, and its cost.
 
-    :param costs: of points, shape (k, n), where they may be below a cost; shape (k,).
+    :param costs: returns the costs, shape (k,), of points, shape (k, n); a cost above its second
+        argument need not be exact.
     :param point: where to begin, shape (n,); its last coordinate stays at 0 or below.
-    :param cost: there, positive.
-    :param size: how many coordinates to move, the first ones.
+    :param cost: cost at that point, positive.
+    :param size: number of coordinates to move, the first ones.
     :param steps: the first step and the last.
-    :param directions: that are tried at once.
+    :param directions: number of directions tried at once.
     """
     rng = np.random.default_rng(0)
     (step, least), last, turns = steps, np.zeros((0, point.size)), 0
@@ -49,7 +50,7 @@ def pattern_search(
         found = costs(tried, cost)
         best = int(np.argmin(found))
         if found[best] < cost * _GAINED:
-            # Along a ridge the way that led on once leads on again.
+            # Along a ridge the last successful direction is often good again.
             last = (tried[best] - point)[None] / step
             step *= _GROW * float(np.linalg.norm(last))
             point, cost = tried[best], float(found[best])
@@ -60,11 +61,11 @@ def pattern_search(
 
 
 def _moves(size: int, directions: int, turns: int, rng: np.random.Generator) -> FloatArray:
-    """Return what to try, at most 1 away, shape (k, size)."""
+    """Return the moves to try, of length at most 1, shape (k, size)."""
     if size == 1:
         return _ON_A_LINE[:, None]
     if size == 2:
-        # Turned by the golden section of the angle between two, they never come back.
+        # Turned by the golden section of the angle between two, the directions never repeat.
         angles = (np.arange(directions) + _GOLDEN * turns) * (2.0 * math.pi / directions)
         return np.column_stack((np.cos(angles), np.sin(angles)))
     found = rng.standard_normal((directions, size))

@@ -30,10 +30,10 @@ class PredictedMs:
 def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
     """Return the Ms of the gains that a rule gives for the model alone, and its interval.
 
-    The interval holds 95 % of the Ms that the same gains have on the models around it: what the
-    process may make of gains that a shorter or a longer experiment would give much alike.
+    The interval holds 95 % of the Ms that the same gains have on the models within the
+    uncertainty.
 
-    :param task: the process, the models around it, and what is asked for.
+    :param task: the process, the models within its uncertainty, and what is asked for.
     :param rule: gives the gains, from the model alone.
     :return: None where the rule does not apply, or the uncertainty is not known.
     """
@@ -45,6 +45,6 @@ def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
         return None
     models = ModelSet([task.in_loop(model) for model in (task.model, *task.models)])
     own, *others = ensemble_peaks(controller, models).ms
-    # Between a finite order statistic and an infinite one lies nothing.
+    # No interpolation: some values may be infinite.
     low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")
     return PredictedMs(float(own), float(low), float(high))

@@ -1,4 +1,4 @@
-"""Robust design: the PI or PID controller of least IAE within bounds on the sensitivities."""
+"""Robust design: the PI or PID controller with the smallest IAE within bounds on Ms and Mt."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from relay_autotune.tuning.task import MS_RANGE, DesignOptions, DesignTask
 
 # PID has to lower the IAE at least this far to be worth its derivative.
 WORTH = 0.75
-# Above the least bound that any controller attains.
+# A bound that cannot be kept is relaxed to this factor above the least that any attains.
 _RELAXED = 1.15
 _KINDS = {False: "PI", True: "PID"}
 
@@ -31,13 +31,14 @@ class _Attempt:
 
 
 def robust(task: DesignTask) -> tuple[Controller, str]:
-    """Return the controller of least IAE after a load step, with bounds on Ms and Mt.
+    """Return the controller with the smallest IAE after a load step, with bounds on Ms and Mt.
 
-    The bounds hold on the model and on 95 % of those around it, with half a sampling period and
-    the loop's own delay added to the dead time. The optimisation follows Astrom, Panagopoulos
-    and Hagglund (1998) in its bounds and Garpinger and Hagglund (2015) in its cost. PI is
-    preferred; PID is chosen where its IAE is lower by 25 % or more, or where no PI controller
-    keeps the bounds. Where none does, the bound is put 15 % above the least that any attains.
+    The bounds hold on the model and on 95 % of the models within its uncertainty, with half a
+    sampling period and the loop's own delay added to the dead time. The optimisation follows
+    Astrom, Panagopoulos and Hagglund (1998) in its bounds and Garpinger and Hagglund (2015) in
+    its cost. PI is preferred; PID is chosen if its IAE is lower by 25 % or more, or if no PI
+    controller keeps the bounds. If no controller keeps a bound, it is raised to 15 % above the
+    least that any attains.
 
     :param task: the process and what is asked for.
     :return: the controller, and the reason, which says what could not be kept.
@@ -68,7 +69,7 @@ def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
     try:
         other = _within(search, bounds, True)
     except TuningError:
-        # Nothing limits PID on a model without dead time, and PI was found.
+        # Nothing limits the gain of a PID on a model without dead time; the PI is taken.
         other = None
     if other is None:
         return pi.optimum.controller, _promise(pi, search)
@@ -126,7 +127,7 @@ def _relaxed(search: Search, asked: Bounds, derivative: bool) -> _Attempt:
     mt = _RELAXED * least_mt if least_mt > asked.mt else asked.mt
     found = _within(search, Bounds(ms, mt), derivative)
     if found is None:
-        # Some controller keeps them, but so few that none was met.
+        # Some controllers keep the bounds, but too few for the scan to find one.
         ms, mt = max(ms, _RELAXED * least_ms), max(mt, _RELAXED * least_mt)
         found = _within(search, Bounds(ms, mt), derivative)
     if found is None:

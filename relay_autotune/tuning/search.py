@@ -1,9 +1,10 @@
-"""The search for the PI or PID controller of least IAE within bounds on the sensitivities.
+"""The search for the PI or PID controller with the smallest IAE within bounds on Ms and Mt.
 
-Where the integral gain is as large as the bounds leave, only kp and td remain to be chosen. A
-scan of both finds the region of the optimum; a pattern search closes in on it, and then tries
-whether a smaller integral gain is better still. Models around the process come last, and few at
-first: those that what was found fails are added until it fails no more of all than it may.
+With the largest integral gain that the bounds allow, only kp and td remain to be chosen. A scan
+of both finds the region of the optimum. A pattern search then finds the optimum, and tries
+whether a smaller integral gain is better still. The models within the uncertainty come last. The
+search begins with the few hardest ones; models on which its result breaks a bound are added until
+these are at most 5 % of all models.
 """
 
 from __future__ import annotations
@@ -42,17 +43,17 @@ _TIMES = np.geomspace(3e-3, 1.0, 14)
 _WHOLE, _ROUGH, _FINE = (0.12, 1e-3), (0.12, 0.03), (0.08, 1e-3)
 _AGAIN = 0.67
 _DIRECTIONS = 20
-# Steps of kp, of the share of the largest ki, and of kd, that show whether less of it is better.
+# Steps of kp, of the share of the largest ki, and of kd, that show whether a smaller ki is better.
 _INWARD = np.array(
     [(p, f, d) for p in (-0.03, 0.0, 0.03) for f in (-0.02, -0.1) for d in (0.0, 0.03)]
 )
 _TRIED_AT_ONCE = 40
-# What a bound may exceed 1 by.
+# Range of a bound above 1, and the relative tolerance in it.
 _LEAST_EXCESS, _LARGEST_EXCESS, _EXCESS_TOLERANCE = 0.01, 100.0, 0.01
 _MARGIN = 1.2
-# How far above the lower end of their range integral gains have to be.
+# Integral gains have to be above the lower end of their range by this factor.
 _CLEAR = 1.02
-# Bounds are kept to this part, after so many additions to the grid.
+# A bound counts as kept up to this factor; frequencies are added to the grid at most so often.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
 _NO_LIMIT = (
@@ -63,12 +64,12 @@ _NO_LIMIT = (
 
 @dataclass(frozen=True)
 class Search:
-    """A process, what a controller must keep to, and where to look for it.
+    """A process, and the limits that its controller must keep.
 
     :param model: the process, with all dead time of the loop.
-    :param models: models around it, on all but 5 % of which the bounds hold as well.
+    :param models: models within its uncertainty; the bounds also hold on all but 5 % of them.
     :param filter_ratio: largest td/tf.
-    :param noise: the limit of the noise in the command; None: none.
+    :param noise: the limit of the noise in the command; None: no limit.
     """
 
     model: TransferFunction
@@ -87,7 +88,7 @@ class Search:
 
     @cached_property
     def _largest_kp(self) -> float:
-        """A gain beyond all that is of use, where no gain makes the loop unstable."""
+        """A gain that is larger than any useful one, for loops that are stable at every gain."""
         return 1e4 / abs(complex(self.model(1j * self.frequency)))
 
     @cached_property
@@ -97,7 +98,7 @@ class Search:
 
     @cached_property
     def around(self) -> Surroundings | None:
-        """The models around the process."""
+        """The models within the uncertainty of the process."""
         if not self.models:
             return None
         grid = self.responses.grid
@@ -106,14 +107,14 @@ class Search:
         return Surroundings(Responses(self.models, some, self.frequency))
 
     def _among(self, around: Surroundings | None) -> Search:
-        """Return this search with others around the process, whose own responses are kept."""
+        """Return this search with other models around the process; its responses are kept."""
         search = replace(self, models=self.models if around else ())
         known = {"frequency": self.frequency, "responses": self.responses, "around": around}
         search.__dict__.update(known)
         return search
 
     def optimum(self, bounds: Bounds, *, derivative: bool) -> Optimum | None:
-        """Return the controller of least IAE, or None where none keeps the bounds.
+        """Return the controller with the smallest IAE; None: no controller keeps the bounds.
 
         :param bounds: on the sensitivities.
         :param derivative: True: PID, False: PI.
@@ -143,12 +144,12 @@ class Search:
     def _among_models(
         self, bounds: Bounds, point: FloatArray, asked: Surroundings
     ) -> tuple[Candidates, float] | None:
-        """Return the best controller and its IAE with the models around the process as well.
+        """Return the best controller and its IAE, with bounds on the models around it as well.
 
         :param bounds: on the sensitivities.
-        :param point: the optimum on the process itself, roughly.
-        :param asked: the few models.
-        :return: None where no controller keeps the bounds.
+        :param point: the rough optimum on the process itself.
+        :param asked: the few hardest models.
+        :return: None if no controller keeps the bounds.
         """
         steps = _ROUGH
         while True:
@@ -166,21 +167,21 @@ class Search:
             asked, steps = more or asked, _FINE
 
     def _beginning(self, bounds: Bounds, point: FloatArray) -> tuple[FloatArray, float] | None:
-        """Return a point that keeps the bounds, near another if there is one; and its IAE."""
+        """Return a point that keeps the bounds, if possible near ``point``, and its IAE."""
         iae = float(self._worth(bounds, point[None], math.inf)[0])
         if math.isfinite(iae):
             return point, iae
         found = self._nearby(bounds, point)
         if found is None:
-            # Bounds that can just be kept are kept somewhere else, if anywhere.
+            # Tight bounds may hold far from this point only, so everything is scanned.
             scanned = self.scan(bounds, self._times(point.size > 2))
             found = None if scanned is None else self.least(scanned)
         return found
 
     def settle(self, bounds: Bounds, point: FloatArray, iae: float) -> tuple[FloatArray, float]:
-        """Return the optimum once the bounds hold between the frequencies of the grid as well.
+        """Return the optimum for bounds that also hold between the frequencies of the grid.
 
-        Where they do not, the frequencies at which they are exceeded join the grid.
+        Frequencies at which a bound is exceeded are added to the grid.
 
         :param bounds: on the sensitivities.
         :param point: as for :meth:`descend`.
@@ -221,7 +222,7 @@ class Search:
     def scan(
         self, bounds: Bounds, times: FloatArray, gains: tuple[float, float] = (0.0, math.inf)
     ) -> Candidates | None:
-        """Return controllers all over the stable range that keep the bounds; None: none does.
+        """Return controllers from the whole stable range that keep the bounds; None: none does.
 
         :param bounds: on the sensitivities.
         :param times: derivative times [s], shape (n,); one of 0: PI.
@@ -270,7 +271,7 @@ class Search:
                 low = middle
                 continue
             high = middle
-            # The tighter the bound, the narrower the range of gains and times that attain it.
+            # A tighter bound is attained in a narrower range of gains and times.
             gains = float(found.kp.min()) / _MARGIN, float(found.kp.max()) * _MARGIN
             if derivative:
                 ends = found.td.min() / _MARGIN, found.td.max() * _MARGIN
@@ -278,9 +279,9 @@ class Search:
         return 1.0 + math.exp(high)
 
     def least(self, scanned: Candidates) -> tuple[FloatArray, float]:
-        """Return where the IAE is least among some controllers, and how large it is there.
+        """Return the point of the smallest IAE among some controllers, and that IAE.
 
-        The IAE is at least ``1/ki``, so that few have to be followed in time.
+        The IAE is at least ``1/ki``, so few of them have to be simulated.
         """
         order = np.argsort(-scanned.ki)
         first, rest = order[:_TRIED_AT_ONCE], order[_TRIED_AT_ONCE:]
@@ -306,11 +307,11 @@ class Search:
         :param steps: the first and the last.
         """
         free, costs = point.size - 1, partial(self._worth, bounds)
-        # Each costs more with the models around the process.
+        # Each direction costs more with the models around the process.
         count = _DIRECTIONS // 2 if self.models else _DIRECTIONS
         point, iae = pattern_search(costs, point, iae, free, steps, count)
         if self.models and point[-1] == 0.0:
-            # On the process itself a smaller integral gain was no better.
+            # A smaller integral gain was not better on the process itself.
             return point, iae
         inward = point + _INWARD[:, [0, *[2] * (free - 1), 1]]
         if costs(inward, iae).min() < iae:
@@ -321,8 +322,8 @@ class Search:
         return point, iae
 
     def _nearby(self, bounds: Bounds, point: FloatArray) -> tuple[FloatArray, float] | None:
-        """Return where to begin with the models around the process as well."""
-        # Smaller gains, the derivative's along with the proportional one or left as it is.
+        """Return a start for the search with the models around the process."""
+        # Smaller gains: with the same td, then with the same kd.
         factors = np.log(np.geomspace(1.2, 0.02, 12))
         tried = np.repeat(point[None], 24, axis=0)
         tried[:, 0] += np.tile(factors, 2)
@@ -333,7 +334,7 @@ class Search:
         return (tried[best], float(iaes[best])) if math.isfinite(iaes[best]) else None
 
     def _worth(self, bounds: Bounds, points: FloatArray, iae: float) -> FloatArray:
-        """Return the IAE of each point, infinite where it is larger than ``iae`` for certain."""
+        """Return the IAE of each point; infinite where it is certainly larger than ``iae``."""
         c = self._at(bounds, points, iae)
         useful = (c.ki > 0.0) & np.isfinite(c.ki)
         useful[useful] &= c.ki[useful] * iae > 1.0
@@ -343,9 +344,9 @@ class Search:
         return iaes
 
     def _at(self, bounds: Bounds, points: FloatArray, iae: float = math.inf) -> Candidates:
-        """Return the controllers of points, with ki = -inf those that there are not.
+        """Return the controllers of points; ki is -inf where none keeps the bounds.
 
-        :param iae: of a larger IAE than this none is asked for [y s/u].
+        :param iae: controllers with a larger IAE are of no interest [y s/u].
         """
         kp = np.exp(points[:, 0])
         td = np.exp(points[:, 1] - points[:, 0]) if points.shape[1] > 2 else np.zeros(kp.size)
@@ -370,7 +371,7 @@ class Search:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the largest integral gains and the least, shape (k,).
 
-        :param least: what the largest have to exceed to be of interest, shape (k,).
+        :param least: gains below this are of no interest, shape (k,).
         """
         found = self.responses.largest_ki(bounds, kp, td, tf)
         upper, lower = found[0][:, 0], found[1][:, 0]

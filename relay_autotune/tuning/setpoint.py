@@ -1,4 +1,4 @@
-"""The weight of the set-point, with which the response to it does not overshoot needlessly."""
+"""The set-point weight b that avoids an unnecessary overshoot after a set-point step."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from relay_autotune.process.transfer_function import TransferFunction
 _WEIGHTS = np.linspace(0.0, 1.0, 101)
 _POINTS = 2048
 _RESETS, _TURNS = 8.0, 6.0
-# What a set-point response may overshoot, and how much more than it must where it must more: to
-# press out the rest with b = 0 would cost most of the speed.
+# Allowed overshoot, and what is allowed beyond the least overshoot if that is larger: to avoid the
+# last part with b = 0 would make the response much slower.
 _OVERSHOOT, _SPARE = 0.05, 0.02
 
 
 def with_setpoint_weight(
     controller: Controller, model: TransferFunction, frequency: float
 ) -> Controller:
-    """Return the controller with the largest weight b that does not overshoot needlessly.
+    """Return the controller with the largest weight b without unnecessary overshoot.
 
-    The response is ``y_i + b y_p`` with one part from the integral and one from the proportional
-    action, so that all weights are compared at the cost of one. The largest b is taken whose
-    overshoot is at most 5 %, or at most 2 % more than the least.
+    The response is ``y_i + b y_p``, with one part from the integral and one from the proportional
+    action, so all weights are compared at the cost of one simulation. The largest b is taken
+    whose overshoot is at most 5 %, or at most 2 % more than the least.
 
     :param controller: PI or PID, of a stable loop.
     :param model: the process, with all dead time of the loop.

@@ -1,4 +1,4 @@
-"""What the models around a process leave of its range of integral gains."""
+"""The range of integral gains that the models around a process allow."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ FloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.integer[Any]]
 
 _SHARE = 0.95
-# So many times the models that may exceed a bound are asked first.
+# The first models to be asked are this factor times the number that may exceed a bound.
 _FIRST = 3
-# Single precision, and frequencies that depend on what is asked together, move a limit so far.
+# Single precision, and a frequency grid that depends on the models asked together, change a limit
+# by up to this factor.
 _SAME = 1.0 - 1e-5
 
 
 def allowed_outside(count: int) -> int:
-    """Return how many of so many models may exceed a bound."""
+    """Return how many of ``count`` models may exceed a bound."""
     return int((1.0 - _SHARE) * count + 1e-9)
 
 
@@ -30,18 +31,18 @@ class Surroundings:
     """Models around a process, on all but 5 % of which bounds have to hold.
 
     :param responses: of the models.
-    :param asked: which of them are asked; None: all. The bounds may fail on as many of those as
-        they may fail on of all.
+    :param asked: which of them are asked; None: all. The number of models on which the bounds
+        may fail is 5 % of all in either case.
     """
 
     def __init__(self, responses: Responses, asked: IntArray | None = None) -> None:
         self._responses = responses
-        # Those that left the least range for the controllers before come first.
+        # The models that left the smallest range for earlier controllers come first.
         self._order = np.arange(responses.count) if asked is None else asked
         self._outside = allowed_outside(responses.count)
 
     def hardest(self, bounds: Bounds, c: Candidates) -> Surroundings:
-        """Return the few that leave a controller the least range of integral gains.
+        """Return the few models that leave a controller the smallest range of integral gains.
 
         :param bounds: on the sensitivities.
         :param c: the controller.
@@ -51,7 +52,7 @@ class Surroundings:
         return Surroundings(self._responses, order[: _FIRST * (self._outside + 1)])
 
     def with_failed(self, bounds: Bounds, c: Candidates) -> Surroundings | None:
-        """Return these and those of all models that a controller fails; None: it fails no others.
+        """Return these models and all others on which a controller fails; None: no others.
 
         :param bounds: on the sensitivities.
         :param c: the controller.
@@ -66,7 +67,7 @@ class Surroundings:
         return Surroundings(self._responses, np.concatenate((new, self._order)))
 
     def _largest_ki(self, bounds: Bounds, c: Candidates) -> tuple[FloatArray, FloatArray]:
-        """Return what each of all models leaves of the range, shape (k, m)."""
+        """Return the ends of the range that each of all models leaves, shape (k, m)."""
         kp, td, tf = (x.astype(np.float32) for x in (c.kp, c.td, c.tf))
         return self._responses.largest_ki(bounds, kp, td, tf)
 
@@ -86,8 +87,8 @@ class Surroundings:
         :param td: derivative times [s], shape (k,).
         :param tf: time constants of the filter [s], shape (k,).
         :param upper: the largest integral gain on the process itself, shape (k,).
-        :param least: what it has to exceed to be of interest, shape (k,).
-        :return: the largest is -inf where there is none, or none of interest.
+        :param least: gains below this are of no interest, shape (k,).
+        :return: the largest is -inf if there is none, or none of interest.
         """
         outside = self._outside
         split = _FIRST * (outside + 1)

@@ -1,4 +1,4 @@
-"""What a design rule is given: the process, what is known around it, and what is asked for."""
+"""What a design rule is given: the process, its uncertainty, and the options."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from relay_autotune.tuning.model_set import ModelSet
 
 CONTROLLERS = ("auto", "pi", "pid")
 MS_RANGE = (1.2, 4.0)
-# What was asked for may be exceeded by this factor without a remark.
+# A bound may be exceeded by this factor without a warning.
 _HELD = 1.01
 # +2 dB is Luyben's bound on the resonance of the level of a vessel (2003).
 MT_SELF_REGULATING, MT_INTEGRATING = 1.4, 1.26
@@ -23,7 +23,7 @@ MT_SELF_REGULATING, MT_INTEGRATING = 1.4, 1.26
 
 @dataclass(frozen=True, kw_only=True)
 class DesignOptions:
-    """What is asked of a controller, the same for every rule; each rule reads what it needs.
+    """Options of a design, the same for every rule; each rule reads what it needs.
 
     :raises TuningError: if a value is out of its range.
     """
@@ -45,14 +45,14 @@ class DesignOptions:
     sample_period: float = quantity(
         0.0,
         "s",
-        "Period of the controller to be, half of which counts as dead time; 0: the recording's, "
-        "or continuous where there is no recording.",
+        "Sampling period of the controller, half of which counts as dead time; 0: the "
+        "recording's, or continuous where there is no recording.",
         lower=0.0,
     )
     loop_delay: float = quantity(
         0.0,
         "s",
-        "Dead time that the loop of the controller to be adds to the process.",
+        "Dead time that the controller's loop adds to the process.",
         lower=0.0,
     )
     noise_std: float = quantity(
@@ -64,14 +64,14 @@ class DesignOptions:
     amplitude: float = quantity(
         math.nan,
         "u",
-        "What a command may move; NaN: the relay's amplitude, or not known.",
+        "How far the command may move; NaN: the relay's amplitude, or not known.",
         lower=0.0,
     )
     noise_share: float = quantity(
         0.1,
         "",
-        "Standard deviation of the noise in the command over the amplitude that derivative "
-        "action may cause.",
+        "Largest standard deviation of the noise in the command that derivative action may cause, "
+        "as a fraction of the amplitude.",
         lower=0.0,
         open_ended=True,
     )
@@ -113,9 +113,9 @@ class DesignOptions:
         return 0.5 * self.sample_period + self.loop_delay
 
     def largest_mt(self, model: TransferFunction) -> float:
-        """Return the bound on Mt that holds for a process.
+        """Return the bound on Mt for a process.
 
-        :param model: the process; integrating ones have a default of their own.
+        :param model: the process; integrating processes have their own default.
         """
         if not math.isnan(self.mt):
             return self.mt
@@ -130,8 +130,8 @@ class DesignTask:
     :param options: what is asked for.
     :param simple: the FOPDT that fits best, for rules that need one; None: not known.
     :param models: models within the uncertainty; empty: the uncertainty is not known.
-    :param describing: K_u and w_u that the describing function reads from the limit cycle; None:
-        not known.
+    :param describing: K_u and w_u by the describing function from the limit cycle; None: not
+        known.
     """
 
     model: TransferFunction
@@ -143,7 +143,7 @@ class DesignTask:
     def in_loop(self, model: TransferFunction) -> TransferFunction:
         """Return a process with the dead time that the loop adds to it.
 
-        :param model: the process, or one of those around it.
+        :param model: the process, or a model within its uncertainty.
         """
         return replace(model, dead_time=model.dead_time + self.options.added_delay)
 

@@ -276,7 +276,7 @@ def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):
     assert "name two of them" in capsys.readouterr().err
     bad = ("--measurement-topic", "no topic")
     assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, *bad]) == 2
-    assert "'no topic' is no topic name" in capsys.readouterr().err
+    assert "'no topic' is not a topic name" in capsys.readouterr().err
     assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, "--epoch", "-9"]) == 1
     assert "no time before 1970" in capsys.readouterr().err
     assert csv_to_bag.main([str(path), str(tmp_path), *columns]) == 1

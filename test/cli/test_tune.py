@@ -244,7 +244,7 @@ REFUSED = [
     (FOPDT + " --phase-peak -30", 2, "between -180 and -90"),
     (FOPDT + " --output there", 2, "--output is for --export"),
     (FOPDT + " --table --export yaml", 2, "leave out --table"),
-    (FOPDT + " --export pid_controller --dof 2nd", 2, "'2nd' is no name"),
+    (FOPDT + " --export pid_controller --dof 2nd", 2, "'2nd' is not a name"),
     (FOPDT + " there.json", 2, "given twice"),
     ("there.json", 2, "there.json cannot be read: No such file"),
     (FOPDT + " --rule lcmax", 1, "3 or more equal lags, found fopdt"),
@@ -270,7 +270,7 @@ def test_refusals_are_one_line_and_no_gains(flags, status, said, capsys):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "is no JSON document"),
+        ("", "is not a JSON document"),
         ("[1]", "holds a JSON list"),
         ("{}", "holds no model"),
         ('{"gain": NaN, "time_constants": [1]}', "must be finite, found NaN"),
