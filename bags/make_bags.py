@@ -57,7 +57,7 @@ def record_tune(target: Path, *, plant: dict[str, Any], relay: dict[str, Any]) -
 
 
 def write_step_test(target: Path) -> None:
-    """Write a step test of another process, as a robot's own recorder might have left it.
+    """Write a step test of another process, as a robot's own recorder might record it.
 
     The measurement comes at about 10 Hz with jitter, the command only when it changes; the
     process is 0.8 e^(-3.4 s)/(12 s + 1), the noise white with 0.05 degC.
@@ -79,7 +79,7 @@ def write_step_test(target: Path) -> None:
     with BagWriter(target, topics, start_ns=STEP_START_NS) as bag:
         for t, topic, value in sorted(messages):
             sent = STEP_START_NS + round(t * 1e9)
-            # What the recorder receives it receives a little later.
+            # The recorder receives a message a little later.
             bag.write(
                 topic, sent + int(rng.integers(80_000, 400_000)), sent, encode_float64(value)
             )

@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 RATIOS = (0.05, 0.1, 0.2)
 MAIN_RATIO = 0.1
 FITS, SEEDS = 500, 10
-# An interval wider than this share of the value tells that the data do not hold the parameter.
+# If the interval is wider than this share of the value, the data do not determine the parameter.
 DETERMINED = 0.2
 MOST_OVER_BOUND = 1.1
 FOPDT = Known(structure="fopdt")
@@ -71,7 +71,7 @@ def tallied(case: Case, ratio: float, seen: bool, records: int) -> Tally:
     :param case: the process.
     :param ratio: noise-to-signal ratio.
     :param seen: True: the relay sees the noise.
-    :param records: how many.
+    :param records: number of records.
     """
     tally = Tally()
     std = case.noise_std(ratio)
@@ -85,7 +85,7 @@ def tallied(case: Case, ratio: float, seen: bool, records: int) -> Tally:
             continue
         bound = unseen_bound
         if seen:
-            # What this relay did with this noise tells this much.
+            # The information in this record, with these commands and this noise.
             bound = std * np.sqrt(np.diag(case.bound(record.time, record.input())))
         tally.errors.append(found(model) / case.truth - 1.0)
         tally.bounds.append(bound)

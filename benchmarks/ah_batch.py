@@ -40,7 +40,7 @@ NARROW, WIDE = (2.0, 1.0), (4.0, 2.0)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one process.
+    """The result of one process.
 
     :param title: its parameters.
     :param errors: of K_u and w_u [%]; infinite where there is no model.

@@ -2,7 +2,7 @@
 
 Two topics of std_msgs/Float64 are read with their times, by this package and by the fastest way of
 each library that reads the same file, in one run. The files, up to 4 GB, are made in a temporary
-folder and taken away again.
+folder and removed at the end.
 """
 
 from __future__ import annotations
@@ -93,10 +93,10 @@ LIBRARIES: dict[str, Callable[[Path], int]] = {
 
 
 def seconds(work: Callable[..., object], *arguments: object) -> float:
-    """Return the time of the processor that a work takes.
+    """Return the processor time of a piece of work.
 
-    All of them run in one thread on files in the page cache, so that this is the time by the
-    clock on a machine that does nothing else, and nearly the same on one that does.
+    All of them run in one thread on files in the page cache. So this is the elapsed time on an
+    idle machine, and nearly the same on a busy one.
     """
     begin = time.process_time()
     work(*arguments)
@@ -104,7 +104,7 @@ def seconds(work: Callable[..., object], *arguments: object) -> float:
 
 
 def from_disk(path: Path, work: Callable[..., object], *arguments: object) -> float:
-    """Return the time by the clock that a work takes with a file that is not in memory."""
+    """Return the elapsed time of a piece of work with a file that is not in memory."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -120,7 +120,7 @@ def compressed_chunks(chunks: Iterable[Chunk]) -> list[tuple[bytes, int]]:
 
 
 def expand(chunks: list[tuple[bytes, int]]) -> None:
-    """Do what zstd alone has to do."""
+    """Only decompress, as zstd itself does."""
     decompressor = zstandard.ZstdDecompressor()
     for data, size in chunks:
         decompressor.decompress(data, max_output_size=size)
@@ -174,7 +174,7 @@ def images(folder: Path, length: int, turns: int) -> list[tuple[str, ...]]:
         path = folder / "images.mcap"
         write_recording(path, among_images(length, apart=apart), compression=compression)
         plain = needed_bytes(path)
-        # What is imported at first use is no part of it.
+        # Imports at first use are not counted.
         ours(path)
         # Mixed, each turn reads all of the file.
         counted = range(turns if apart else min(turns, 3))
@@ -205,7 +205,7 @@ def memory(path: Path) -> tuple[float, float]:
 
 
 def print_memory(path: Path) -> None:
-    """Print what `memory` asks for."""
+    """Print the result for `memory`."""
     begin = high_water()
     values = ours(path)
     print(high_water() - begin, 16 * values / 1e6)

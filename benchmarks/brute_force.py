@@ -1,8 +1,8 @@
-"""Search for the controller of least IAE over a grid of gains, to judge what finds it otherwise.
+"""Search for the controller with the smallest IAE over a grid of gains, as an independent check.
 
 Nothing of the search in `relay_autotune.tuning` is used: the bounds are tested loop by loop on a
-grid of frequencies, and so is stability, by how often the loop turns. Only the integrated errors
-come from there, and those of the winners are computed anew, and accurately, by what calls this.
+grid of frequencies, and so is stability, by the number of turns of the loop. Only the integrated
+errors come from there; the callers compute those of the best controllers again, accurately.
 """
 
 from __future__ import annotations

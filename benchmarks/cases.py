@@ -147,7 +147,7 @@ CASES = (
 Figures = tuple[tuple[float, float], ...]
 
 # Median and 95th percentile of the error in % of each of QUANTITIES, by case and noise-to-signal
-# ratio, as another implementation of the same fit reached them over 30 seeds.
+# ratio, of another implementation of the same fit over 30 seeds.
 TARGETS: dict[tuple[int, float], Figures] = {
     (0, 0.05): ((0.97, 2.6), (1.1, 2.8), (0.12, 0.38), (0.10, 0.31), (0.05, 0.11)),
     (0, 0.1): ((2.0, 5.5), (2.2, 5.7), (0.26, 0.78), (0.21, 0.62), (0.10, 0.22)),

@@ -1,8 +1,8 @@
 """The studies of Chang, Shen and Yu 1992: `python3 benchmarks/chang_studies.py [--quick]`.
 
 Its Figures 2 to 6 as tables, with the errata: errors of the original ATV and of the exact
-equations over frequency, dead time and error of the dead time, and what they do to a controller;
-and what a hysteresis does to the equations that do not know of it.
+equations over frequency, dead time and error of the dead time, and their effect on a controller;
+and the effect of a hysteresis on the equations without one.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def limit_cycle(model: TransferFunction, hysteresis: float = 0.0) -> tuple[float
 def percent(found: Sequence[float], truth: Sequence[float]) -> list[str]:
     """Return relative errors in per cent."""
     errors = [100.0 * (f / t - 1.0) for f, t in zip(found, truth, strict=True)]
-    # Rounding of the limit cycle is no error of a method.
+    # Rounding of the limit cycle does not count as an error of a method.
     return [f"{e:+.2f}" if abs(e) > 1e-4 else "0" for e in errors]
 
 
@@ -238,7 +238,7 @@ def figure_6_one_lag() -> str:
 
 
 def hysteresis() -> str:
-    """Return what a hysteresis does to eq 8 as printed and with it on the right-hand side."""
+    """Return the errors due to a hysteresis, of eq 8 as printed and with it on the right side."""
     truth = ultimate(EXAMPLE)
     ideal = limit_cycle(EXAMPLE)[1]
     rows = []

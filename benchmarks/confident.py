@@ -1,16 +1,16 @@
 """How early `stop_when: confident` ends a test: `python3 benchmarks/confident.py [--records N]`.
 
-Each process of the papers that a relay test is shown of is tested as relay_node does it, at a
-noise-to-signal ratio of 0.1, with the sign of its gain given. At the looks that relay_node would
-take, the record so far is fitted, as identifier_node does, and the test ends when the 95 %
-interval of K_u is narrow enough. The classic criterion (three cycles whose half periods and peaks
-agree within 2 %) is judged on the same process without noise. Lengths are counted from the kick
-on. Beside each length stands the least one: the time at which the Cramer-Rao bound of K_u, for
-whoever knows the structure and for the same commands, reaches what was asked.
+Each process for which the papers show a relay test is tested as relay_node does it, at a
+noise-to-signal ratio of 0.1, with the sign of its gain given. Whenever relay_node would send the
+record, it is fitted as identifier_node does it, and the test ends when the 95 % interval of K_u is
+narrow enough. The classic criterion (three cycles whose half periods and peaks agree within 2 %)
+is applied to the same process without noise. Lengths are counted from the kick on. Beside each
+length stands the least one: the time at which the Cramer-Rao bound of K_u reaches the wanted
+accuracy, for the same commands and a known structure.
 
 A target may be missed where that bound needs more than half of the classic time; the exit status
-is 1 if one is missed elsewhere. 50 tests tell a median to a sixth of itself, so that the errors of
-the tests of all other processes together are told, too. `--unknown-sign` lets each test find the
+is 1 if one is missed elsewhere. A median of 50 tests is known to a sixth of itself, so the errors
+of all other processes together are printed, too. `--unknown-sign` lets each test find the
 sign of the gain first, which is then part of both lengths. `--of ms` ends the tests by the
 interval of the predicted Ms in place of that of K_u; the error is then that of the predicted Ms
 against the Ms of the gains on the process, and no target is set. `--jobs 2` takes two processes
@@ -58,7 +58,7 @@ MOST_ERROR = (0.005, 0.015)
 MOST_ERROR_OF_TINY = (math.inf, 0.035)
 MOST_CYCLES = 60
 _MOST_SAMPLES = 200_000
-# The least length is told to so many parts of the classic one.
+# The least length is found to this fraction of the classic one.
 _GRID = 200
 _LONGEST = 4.0
 
@@ -211,7 +211,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class Row:
-    """What came of a process.
+    """The result of a process.
 
     :param cells: of the table.
     :param fine: True: the targets were met.
@@ -227,7 +227,7 @@ class Row:
 
 def _row(case: Case, seeds: range, sought: str, unknown_sign: bool) -> Row:
     """Return the row of a process."""
-    # The pulse that finds the sign wants a process that comes back by itself.
+    # The pulse that finds the sign needs a process that returns by itself.
     bench = Bench(case, 0 if unknown_sign and case.model.is_stable else case.model.process_sign)
     usual = bench.classic.time
     runs = [bench.confident(seed, sought) for seed in seeds]

@@ -45,14 +45,14 @@ from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
 RUNS = 200
-# Kills come at any moment from the call of ~/apply on until so much later [s].
+# Kills come at a random moment between the call of ~/apply and this time after it [s].
 WITHIN = 2.5
 PHASES = ("apply", "between", "verify", "after it")
 
 
 @dataclass(frozen=True)
 class Kill:
-    """A kill, and what came of it.
+    """A kill and its result.
 
     :param kind: whose gains: ``own`` or ``another node's``.
     :param phase: what had been asked for and had not been answered.
@@ -101,7 +101,7 @@ class Course:
 
 @contextmanager
 def rig_of_its_own() -> Iterator[Rig]:
-    """Yield a rig in a domain that nobody else uses."""
+    """Yield a rig in a domain of its own."""
     with free_domain() as domain, tempfile.TemporaryDirectory() as folder:
         rig = Rig(domain, Path(folder))
         try:
@@ -139,7 +139,7 @@ def own(runs: int, deadline: float) -> list[Kill]:
 
 
 def another(runs: int, deadline: float) -> list[Kill]:
-    """Kill a node that looks after another one's gains: that one must get back what it had."""
+    """Kill a node that sets another node's gains: that node must get back its previous gains."""
     found: list[Kill] = []
     with rig_of_its_own() as rig:
         loop = Loop(rig)
@@ -167,7 +167,7 @@ def another(runs: int, deadline: float) -> list[Kill]:
             loop.controller.wait()
             begun = time.monotonic()
             loop.start()
-            # Gains that were applied to the end, and not being verified, stay.
+            # Gains stay if ~/apply was finished and no verification was running.
             allowed = [before, [kc, kc / 0.3, 0.0]] if phase == "between" else [before]
             problem = ""
             try:

@@ -39,7 +39,7 @@ def known(process: Process) -> Known:
 def covers(found: Identification, truth: Identification) -> NDArray[np.bool_]:
     """Return whether the intervals of the parameters, K_u and w_u hold the truth."""
     if found.parameters != truth.parameters:
-        # Two lags read as an oscillating pair, or the reverse: none of them was found.
+        # Two real lags were identified as an oscillating pair, or the reverse: no interval holds.
         same = np.zeros(truth.values.size, dtype=np.bool_)
     else:
         same = (found.ci95_low <= truth.values) & (truth.values <= found.ci95_high)

@@ -1,8 +1,8 @@
 """Gains from noisy experiments: `python3 benchmarks/design_identified.py [--quick]`.
 
 Each of the 133 processes goes through RelayExperiment with its default parameters, which sees the
-noise; the fit chooses the structure, the gains are designed on the model and 100 around it, and
-judged on the process itself.
+noise. The fit chooses the structure; the gains are designed on the model and on 100 models within
+its uncertainty, and judged on the process itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RATIO = 0.1
 
 @dataclass(frozen=True)
 class Outcome:
-    """What gains from one experiment do on the process; nothing where there are none."""
+    """Performance on the process of the gains from one experiment; empty if there are no gains."""
 
     title: str
     reason: str = ""
@@ -72,7 +72,7 @@ def outcome(title: str, model: TransferFunction, record: Record, derivative: boo
 
 
 def row(title: str, outcomes: list[Outcome]) -> tuple[object, ...]:
-    """Return what became of some processes."""
+    """Return the results of some processes."""
     ms = np.array([o.ms for o in outcomes])
     ratios = np.array([o.ratio for o in outcomes])
     return (

@@ -51,7 +51,7 @@ class Design:
 
     @property
     def excess(self) -> float:
-        """By how much the bounds are exceeded, negative where there is room."""
+        """By how much the bounds are exceeded; negative: they are kept."""
         return max(self.ms - MS, self.mt - self.largest_mt)
 
 
@@ -78,7 +78,7 @@ def designed(model: TransferFunction, derivative: bool) -> Design:
 
 
 def row(title: str, designs: list[Design]) -> tuple[object, ...]:
-    """Return what became of some processes with one kind of controller."""
+    """Return the results of some processes with one kind of controller."""
     return (
         title,
         len(designs),
@@ -102,7 +102,7 @@ def fopdt_of(model: TransferFunction) -> TransferFunction | None:
 
 @dataclass
 class Tally:
-    """What became of a rule over the batch."""
+    """The results of a rule over the batch."""
 
     refused: int = 0
     unstable: int = 0
@@ -111,7 +111,7 @@ class Tally:
 
 
 def judged(model: TransferFunction, best: float, tallies: dict[str, Tally]) -> None:
-    """Add one process to what became of each rule.
+    """Add one process to the results of each rule.
 
     :param model: the process.
     :param best: IAE of the robust PI controller [y s/u].

@@ -48,9 +48,9 @@ QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TIMES, AND = 2, 5
 MOST_MEMORY = 5.0
-# Five numbers of a sample are the record; three of them are in the cycles that wait for late ones.
+# The record has five numbers for a sample; the cycles kept for late subscribers have three.
 RECORD_BYTES, CYCLE_BYTES = 5 * 8, 3 * 8
-# Share of the tune after which memory is looked at: buffers of a fixed size are full by then.
+# Memory is measured after this share of the tune: buffers of a fixed size are full by then.
 WARM = 0.2
 MEGA = 1e6
 # So slow that a stall of the machine does not change how it oscillates.
@@ -76,7 +76,7 @@ TUNE = {
 
 
 def echo(file: Path) -> None:
-    """Be the bare node; keep when each sample was taken and when it was answered."""
+    """Run the bare node; keep the times of each sample and of its answer."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     ended: list[int] = []
     signal.signal(signal.SIGINT, lambda number, _: ended.append(number))
@@ -99,7 +99,7 @@ def echo(file: Path) -> None:
 
 
 def spin() -> None:
-    """Be a load."""
+    """Load a processor."""
     while True:
         pass
 
@@ -112,7 +112,7 @@ def resident(pid: int) -> int:
 
 @dataclass
 class Watched:
-    """What was seen from outside while the tune ran."""
+    """Observations from outside while the tune ran."""
 
     samples: list[float] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
@@ -135,7 +135,7 @@ class Bench:
         self.node.create_subscription(
             RelayExperiment, "/tuned/relay_experiment", self._on_experiment, LATCHED
         )
-        # Whoever publishes to nobody has less to do.
+        # A publisher without subscribers would have less to do.
         self.node.create_subscription(Float64, "/bare/command", self._on_echo, QOS)
         this = [sys.executable, __file__, "--role"]
         self.echo_file = folder / "echo.npz"

@@ -37,17 +37,17 @@ from loop_rig import Rig
 from ros_domain import free_domain
 
 RUNS = 200
-# For so long what an ended process has said may be on its way [s].
+# Messages of an ended process may arrive for this time [s].
 _LAST_WORDS = 1.0
 
 
 @dataclass(frozen=True)
 class Run:
-    """What came of a fault.
+    """The result of a fault.
 
     :param fault: its name.
     :param seconds: from the cause to the safe command.
-    :param problem: what was not as it must be; empty: nothing.
+    :param problem: what was wrong; empty: nothing.
     """
 
     fault: str
@@ -86,7 +86,7 @@ def work(names: list[str], runs: int, deadline: float) -> list[Run]:
                     if loop.process is not None:
                         loop.process.end()
                         loop.process = None
-                        # What it said at its end is not of the next one.
+                        # Its last messages do not belong to the next fault.
                         loop.rig.run_for(_LAST_WORDS)
                 else:
                     found.append(Run(name, taken))

@@ -26,7 +26,7 @@ TARGETS = {
     ("any", 1_000_000): 20_000,
 }
 RATIOS = (0.0, 0.1)
-# Beyond, nobody waits for a second time.
+# A fit that takes longer than this is not repeated.
 WARMED_UP = 1_000_000
 STRUCTURES = {"FOPDT": Known(structure="fopdt"), "any": Known()}
 # Turns of each number of samples.

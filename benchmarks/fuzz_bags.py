@@ -48,7 +48,7 @@ def flip(data: bytearray, rng: np.random.Generator) -> bytearray:
 
 
 def cut(data: bytearray, rng: np.random.Generator) -> bytearray:
-    """Leave the end away."""
+    """Cut off the end."""
     return data[: int(rng.integers(0, len(data)))]
 
 
@@ -160,7 +160,7 @@ def read(path: Path, number: int) -> str:
 
 @dataclass(frozen=True)
 class Trial:
-    """What is made of a number, and what came of it; both are found by name in a new process.
+    """How to make a bag from a number and how to judge it; a new process finds both by name.
 
     :param make: returns the bag of a number, from the seeds.
     :param judge: reads a file with the bag of a number, and returns one of ``EXPECTED``.
@@ -172,7 +172,7 @@ class Trial:
 
 def worker(connection: Connection, path: Path, trial: Trial) -> None:
     """Read one bag after the other; tell what came of each, and the memory taken so far."""
-    # A warning of numpy would be a line on a command's standard error that nobody understands.
+    # A warning of numpy would be an unclear line on the standard error of a command.
     warnings.simplefilter("error", RuntimeWarning)
     bags = seeds()
     read_experiments_once(path, bags)
@@ -188,7 +188,7 @@ def worker(connection: Connection, path: Path, trial: Trial) -> None:
 
 
 def read_experiments_once(path: Path, bags: list[bytes]) -> None:
-    """Load what is loaded at the first bag, so that it is not counted with another."""
+    """Load everything that the first bag loads, so that it is not counted for another bag."""
     for number, bag in enumerate(bags):
         path.write_bytes(bag)
         read(path, number)
@@ -212,7 +212,7 @@ class Watched:
         theirs.close()
 
     def ask(self, number: int, limit: float) -> tuple[str, float]:
-        """Return what came of a bag, and the most memory so far [MB]."""
+        """Return the result of a bag, and the peak memory so far [MB]."""
         self._mine.send(number)
         said: tuple[str, float] = ("took too long", 0.0)
         try:

@@ -2,11 +2,11 @@
 
 A small recording is taken apart into its records, and one to three of them are changed: lengths
 and counts within messages, schemas, names, times, what chunks and their indexes declare, what the
-indexes list, the summary. Then it is put together again, so that every record has its length,
-every chunk its size and checksum, and every index its place, but for the lie. Each bag is read
-twice: as it is, and without indexes and statistics, which leaves nothing but its messages to
-believe. A find is an error or a warning that is not one of ours; an answer that differs between
-the two without a word; a control character in what is said; more than 5 s, or more than 1 GB.
+indexes list, the summary. Then it is put together again with correct lengths, sizes, checksums
+and places, except for the lie. Each bag is read twice: as it is, and without indexes and
+statistics, so that only its messages count. A find is an error or a warning that is not one of
+ours; an answer that differs between the two without a message; a control character in a message;
+more than 5 s, or more than 1 GB.
 """
 
 from __future__ import annotations

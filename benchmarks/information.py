@@ -16,7 +16,7 @@ from relay_autotune.record.record import Record
 FloatArray = NDArray[np.float64]
 
 _STEP = 1e-5
-# A direction of which the samples tell less than this part of what they tell of the best one.
+# A direction counts as unknown if its information is below this part of the largest one.
 _UNSEEN = 1e-13
 _FELT = 1e-9
 

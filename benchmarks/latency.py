@@ -46,7 +46,7 @@ def measurement(t: float) -> float:
 
 
 def echo() -> None:
-    """Be the bare node."""
+    """Run the bare node."""
     rclpy.init()
     node = Node("echo", namespace="bare")
     publisher = node.create_publisher(Float64, "command", QOS)
@@ -56,7 +56,7 @@ def echo() -> None:
 
 
 def send(rate: float) -> None:
-    """Be the sender: for each line "namespace count file" publish and note the times."""
+    """Run the sender: for each line "namespace count file" publish and note the times."""
     rclpy.init()
     node = Node("sender")
     publishers = {
@@ -170,7 +170,7 @@ class Bench:
     def phase(self, name: str, count: int) -> tuple[np.ndarray, int]:
         """Run one phase; return its latencies [ms] and how many samples were lost."""
         if name == "tuned":
-            # What the relay answers must be known to come from a tune.
+            # Make sure that the relay's answers come from a tune.
             self.send(name, 1)
             self.tune(start=True)
         first = len(self.arrived[name])
@@ -178,7 +178,7 @@ class Bench:
         arrived = np.array(self.arrived[name][first:][:count])
         if name == "tuned":
             self.tune(start=False)
-            # The safe command, and its repeats, are no answers.
+            # The safe command and its repeats do not count as answers.
             self.until(lambda: len(self.arrived[name]) > first + arrived.size, 5.0, "abort")
         lost = count - arrived.size
         return (arrived - sent[: arrived.size]) * 1e-6, lost

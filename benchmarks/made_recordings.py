@@ -50,7 +50,7 @@ def _header(k: int) -> bytes:
 
 def imu(k: int) -> bytes:
     """Return a message of the definition IMU."""
-    # Aligned to 8 behind the encapsulation, which a header of 16 bytes is.
+    # Aligned to 8 after the encapsulation, which holds since the header has 16 bytes.
     return _header(k) + np.array([k, k % 29, 9.81, *range(9)], dtype="<f8").tobytes()
 
 

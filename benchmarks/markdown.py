@@ -22,7 +22,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def three(value: float) -> str:
-    """Return a number with three digits, never with an exponent where two zeros would do."""
+    """Return a number with three digits, without an exponent where two zeros are enough."""
     if value == 0.0 or not abs(value) < float("inf"):
         return f"{value:g}"
     if 1e-3 <= abs(value) < 1e6:

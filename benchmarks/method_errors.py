@@ -23,9 +23,9 @@ FloatArray = NDArray[np.float64]
 
 RATIOS = (0.0, 0.05, 0.1, 0.2)
 SHOWN = 0.1
-# What chang and atv have models of; they are given gain and dead time.
+# Structures that chang and atv can identify; they are given gain and dead time.
 _LAGS = ("fopdt", "lag_n", "sopdt", "two_equal_one")
-# What fourier can be told; of any other process it gives a FOPDT, and K_u from the points.
+# Structures that fourier can be given; for others it fits a FOPDT, and takes K_u from the points.
 _ONE_LAG = ("fopdt", "lag_n", "ipdt", "integrator_lag", "unstable_fopdt")
 _ADDED = 0.25
 
@@ -65,7 +65,7 @@ def methods(process: Process) -> tuple[str, ...]:
 
 
 def known(process: Process, method: str) -> Known:
-    """Return what a method is told of a process."""
+    """Return the known facts about a process that a method is given."""
     model = process.model
     order = model.order if TABLE[model.structure].any_order else 0
     if method == "waveform" or (method == "fourier" and model.structure in _ONE_LAG):
@@ -129,7 +129,7 @@ def method_table(processes: Iterable[Process], ratios: tuple[float, ...], seeds:
     rows: list[tuple[object, ...]] = []
     for process in processes:
         for seen in (False, True):
-            # A relay that looks at samples is late even without noise.
+            # A sampled relay switches late even without noise.
             found = {r: errors(process, r, seeds, seen=seen) for r in ratios}
             for method in methods(process):
                 cells = [found[r][method].cell(0) for r in ratios]

@@ -141,7 +141,7 @@ def _cells(task: DesignTask, rule: str, kind: str) -> tuple[str, str, str, str]:
     try:
         found = design(task, rule)
     except TuningError:
-        # Stable, with a response that rings longer than it can be followed.
+        # Stable, but its response rings longer than the simulation.
         return three(controller.kc), times, "nearly unstable", ""
     return three(found.kc), times, f"{found.ms:.2f}", three(found.iae_load)
 

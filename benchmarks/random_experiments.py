@@ -70,7 +70,7 @@ def random_process(rng: np.random.Generator) -> TransferFunction:
     zero = -tau * float(rng.uniform(0.1, 1.0))
     order = int(rng.integers(2, 6))
     swing = {"natural_frequency": 1.0 / tau, "damping": float(rng.uniform(0.3, 0.9))}
-    # What is unstable must not wait long: D/tau stays below what a biased relay can hold.
+    # For an unstable process D/tau must stay below the value that a biased relay can hold.
     short = tau * float(np.exp(rng.uniform(math.log(0.03), math.log(0.4))))
 
     def build(structure: str, **fields: Any) -> TransferFunction:
@@ -115,7 +115,7 @@ def random_process(rng: np.random.Generator) -> TransferFunction:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """What the relay does to a process when it sees its noise.
+    """The oscillation of a process under a relay that sees the noise.
 
     :param cycle: the last cycle, without noise.
     :param noise_std: of the sensor [y].
@@ -223,7 +223,7 @@ class Experiment:
             try:
                 return model, oscillation(model, float(self.rng.uniform(0.0, LARGEST_RATIO)))
             except ModelError:
-                # No relay of this kind gets hold of this process: not one to be tuned so.
+                # A relay of this kind cannot hold this process, so it is left out.
                 continue
 
     def _given(self, rest: float) -> dict[str, float | int]:

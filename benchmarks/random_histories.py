@@ -1,4 +1,4 @@
-"""Random histories of a relay experiment: whether every one ends, and how long it takes.
+"""Random histories of a relay experiment: whether each one ends, and how long it takes.
 
     python3 benchmarks/random_histories.py [--seeds A:B] [--file FILE] [--summary] [--quick]
 
@@ -6,8 +6,8 @@ A history is a process, parameters and one to four happenings: an actuator that 
 a gap in the samples, a load, a step of the clock, samples that are repeated, lost or swapped, a
 silent sensor, a spike; at any moment, for any time, see test/support/histories.py. Each has to end
 with a reason and the safe command within the bound of docs/safety.md. With --file each outcome is
-written to a line of that file, and a run that was broken off is gone on with. The exit status is 1
-if a history does not end so.
+written to a line of that file, and an interrupted run is continued. The exit status is 1 if a
+history does not end in this way.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ QUICK = 20
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one history.
+    """The result of one history.
 
     :param seed: of the history.
     :param happenings: what happened in it.
@@ -44,7 +44,7 @@ class Result:
     :param begin: the first words of its reason.
     :param periods: how long it went on after its settling [periods of the process].
     :param share: the same as a share of the bound.
-    :param problem: what was not as it must be; empty: nothing.
+    :param problem: what was wrong; empty: nothing.
     """
 
     seed: int
@@ -72,7 +72,7 @@ def run(seed: int) -> Result:
 
 
 def summary(done: list[Result]) -> str:
-    """Return the table of what came of histories."""
+    """Return the table of results."""
     rows = []
     for kind in ("any", *sorted(set(HAPPENINGS))):
         those = [r for r in done if kind in ("any", *r.happenings)]

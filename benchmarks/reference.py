@@ -1,4 +1,4 @@
-"""A fixed workload beside which times are taken, so that they mean something on any machine.
+"""A fixed reference workload, so that times can be compared between machines.
 
 Import this before numpy: it pins the linear algebra to one thread.
 """
@@ -34,7 +34,7 @@ class Timing:
 
 
 def workload() -> float:
-    """Do what a fit does, in fixed amounts: exponentials, look-ups, tall QR decompositions."""
+    """Do the operations of a fit in fixed amounts: exponentials, look-ups, tall QR factors."""
     total = 0.0
     for _ in range(_ROUNDS):
         decayed = np.exp(-_TIMES / 20.0)[np.searchsorted(_EDGES, _TIMES[::-1])]
@@ -53,7 +53,7 @@ def clocked(work: Callable[[], object]) -> float:
 def take_turns(
     works: Mapping[str, Callable[[], object]], turns: int, *, warm_up: bool = True
 ) -> dict[str, Timing]:
-    """Time several works and the reference, in turns, so that all meet the same machine.
+    """Time several pieces of work and the reference in turns, so that the conditions are equal.
 
     :param works: what is timed, by name.
     :param turns: how often each is timed.

@@ -6,8 +6,8 @@ Each draws a process of a known structure, a sample period, a noise, and what ha
 disturbance (load, drift, coarse sensor, sticking valve, lost samples), or a fault (NaN, silence, a
 frozen sensor, a limit, a clock that goes backwards, a wrong sign, an actuator that is stuck, an
 abort). Gains are those of the default method and rule. With --file each outcome is written to a
-line of that file, and a run that was broken off is gone on with; --summary only shows what the
-file holds. A file holds outcomes of one state of the code. The exit status is 1 if a target is
+line of that file, and an interrupted run is continued; --summary only shows what the file
+holds. A file holds outcomes of one state of the code. The exit status is 1 if a target is
 missed.
 """
 
@@ -42,7 +42,7 @@ QUICK = 4
 
 @dataclass
 class Result:
-    """What came of one experiment.
+    """The result of one experiment.
 
     :param seed: of the experiment.
     :param state: of the code.

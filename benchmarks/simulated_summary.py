@@ -1,4 +1,4 @@
-"""Tables of what came of simulated experiments."""
+"""Tables of the results of simulated experiments."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def summary(results: Sequence[Result]) -> tuple[str, bool]:
             "Undisturbed experiments without gains, by reason:",
             table(("reason", "experiments"), reasons.most_common(12)),
         ]
-    # A heading of a table without rows says nothing.
+    # The heading of an empty table is left out.
     shown = [
         part
         for k, part in enumerate(parts)
@@ -125,7 +125,7 @@ def _delays(results: Sequence[Result]) -> str:
     rows = []
     for name in FAULTS:
         some = [r for r in results if r.happening == name and r.delay >= 0]
-        # Whatever came before its moment had another cause.
+        # An end before the happening had another cause.
         if some and name not in ("measurement limit", "deviation", "wrong sign"):
             cycles = [r.delay / r.per_cycle for r in some]
             values = [r.delay for r in some]

@@ -47,7 +47,7 @@ class Choices:
 
 
 def choices(process: Process, records: int) -> Choices:
-    """Return what is chosen for so many records of a process."""
+    """Return what is chosen for a number of records of a process."""
     tally, truth = Choices(records), process.truth
     for seed in range(records):
         try:

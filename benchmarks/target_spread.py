@@ -1,8 +1,8 @@
-"""What the targets' 30 seeds can tell: `python3 benchmarks/target_spread.py [--quick]`.
+"""The scatter of the targets over 30 seeds: `python3 benchmarks/target_spread.py [--quick]`.
 
 The targets are medians and 95th percentiles over 30 records of another implementation. Some lie
-below what the Cramer-Rao bound lets one expect of any. Here sets of 30 efficient estimates are
-drawn, and compared with the targets, for each reading of how the records were made.
+below the values expected from the Cramer-Rao bound. Here sets of 30 efficient estimates are drawn
+and compared with the targets, for each possible way in which the records may have been made.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 
 RATIO = 0.1
 SEEDS = 30
-# The biased relay's target lies far above the bound in every reading and tells nothing here.
+# The biased relay's target lies far above the bound in every case, so it is not compared.
 UNBIASED = (0, 1, 2, 4)
 WINDOWS = {
     "from the first kick; offset and drift estimated": False,

@@ -1,6 +1,6 @@
 """Thyagarajan and Yu's studies: `python3 benchmarks/thyagarajan_studies.py [--seeds N] [--quick]`.
 
-The category map (their Fig 4), how noise and hysteresis change what is read, the shapes of the
+The category map (their Fig 4), how noise and hysteresis change the category, the shapes of the
 equivalent models (Fig 9), the equations literally and exactly, and the noise study of Tables 6
 and 7 as statistics over many records instead of single draws.
 """
@@ -162,7 +162,7 @@ def equivalent_shapes() -> str:
         cells = []
         flat = shape.category == "1b"
         for make in (flat_of if flat else fopdt_of, two_lags_of, five_lags_of):
-            # An ideal relay switches at zero, where the exact equations are told so.
+            # The exact equations are given zero as the level at which an ideal relay switches.
             found = validate(make(shape, 0.0), record)
             cells.append("none" if found.reason else f"{100.0 * found.shape:.2g}")
         rows.append((title, shape.category, *cells))

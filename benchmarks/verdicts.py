@@ -1,4 +1,4 @@
-"""How often each check speaks on right and on wrong models: records of many kinds, with the truth.
+"""How often each check fails on right and on wrong models, over records of many kinds.
 
     . ./env.sh && python3 -m benchmarks.verdicts [RUNS]
 
@@ -59,8 +59,8 @@ class Kind:
 
     :param name: for the table.
     :param process: the truth.
-    :param noise: what is added to its response.
-    :param bend: what the sensor or the process makes of the response.
+    :param noise: noise that is added to its response.
+    :param bend: nonlinearity of the sensor or the process.
     """
 
     name: str

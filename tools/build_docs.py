@@ -40,7 +40,7 @@ def pages() -> dict[str, str]:
 
 
 def contents(index: str) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the sections of the site, and in each its pages with the words of the link to them.
+    """Return the sections of the site, each with its pages and the texts of their links.
 
     A page belongs where it is linked first.
 
@@ -62,7 +62,7 @@ def contents(index: str) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def contents_block(index: str) -> str:
-    """Return the tables of contents that Sphinx wants, for the end of docs/index.md.
+    """Return the tables of contents that Sphinx needs, for the end of docs/index.md.
 
     :param index: its text.
     """
@@ -85,7 +85,7 @@ def with_site_links(text: str, path: str) -> str:
 
     def adapted(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(folder, link[2]))
-        # what is no page is a file to download, from below docs/ (as pictures are) or elsewhere
+        # every other file is a download, from docs/ (such as pictures) or elsewhere
         name = names.get(target) or posixpath.relpath(target, "docs")
         if name.startswith("../"):
             name = f"files/{target}"
@@ -114,7 +114,7 @@ def stage(source: Path) -> None:
 
 
 def main() -> int:
-    """Build the site; Sphinx says what is wrong."""
+    """Build the site; Sphinx prints its errors."""
     stage(BUILD / "source")
     options = ["--fail-on-warning", "--keep-going", "--quiet", "--builder", "html"]
     folders = [str(BUILD / name) for name in ("source", "html", "doctrees")]

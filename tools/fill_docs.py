@@ -1,4 +1,4 @@
-"""Write into the pages of docs/ what the code says itself; a test compares the two.
+"""Write tables and texts from the code into the pages of docs/; a test compares the two.
 
     . ./env.sh && python3 tools/fill_docs.py
 
@@ -45,7 +45,7 @@ _BLOCK = re.compile(
 
 
 def filled(page: str) -> str:
-    """Return a page with what the code says in the places that ask for it.
+    """Return a page with its generated blocks filled from the code.
 
     :param page: the text of the page.
     :raises KeyError: if it asks for the parameters of a node that is not known here.
@@ -100,7 +100,7 @@ def checks_table(checks: Iterable[Check]) -> str:
 
 
 def limit_text(check: Check, limit: float) -> str:
-    """Return a limit with its unit; a dash for none.
+    """Return a limit with its unit; a dash if there is none.
 
     :param check: whose limit it is.
     :param limit: the number; inf: there is none.
@@ -142,7 +142,7 @@ def parameter_file() -> str:
         for entry in entries:
             text = f"{entry.description} ({entry.range_text})"
             lines += [f"    # {line}" for line in textwrap.wrap(text, 93)]
-            # what is not given has no value that a file could hold
+            # a parameter that is not given has no value for the file
             mark = "# " if entry.default == () else ""
             lines.append(f"    {mark}{entry.name}: {yaml_value(entry.default)}")
     return "\n".join(lines) + "\n"

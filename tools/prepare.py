@@ -5,7 +5,7 @@
     prepare.py oldest   the second one: .venv-oldest/, no ROS, the oldest numeric libraries
     prepare.py docs     what builds the user guide: .venv-docs/, Sphinx and nothing else
 
-What is up to date is left alone. The first lines run on any Python 3, to say that it is too old.
+Parts that are up to date are kept. The first lines run on any Python 3, to report one too old.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VENV_OLDEST = ROOT / ".venv-oldest"
 VENV_DOCS = ROOT / ".venv-docs"
 INSTALL = ROOT / "install"
 REQUIREMENTS = ROOT / "requirements"
-# what each package is built from; the Python files of the second are linked, not copied
+# sources of each package; the Python files of the second are linked, not copied
 PACKAGES = {
     "relay_autotune_msgs": [
         f"relay_autotune_msgs/{name}"
@@ -137,7 +137,7 @@ def sourced_ros() -> str | None:
 
 
 def check_build_tools() -> None:
-    """Say in one line what the machine lacks for building the messages."""
+    """Print in one line what is missing on the machine for building the messages."""
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     header = Path(sysconfig.get_path("include"), "Python.h")
     tools = {
@@ -154,7 +154,7 @@ def check_build_tools() -> None:
 
 
 def base_python() -> str:
-    """Return the interpreter itself, also where a virtual environment's one runs this."""
+    """Return the base interpreter, also when this runs in a virtual environment."""
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     if sys.prefix == sys.base_prefix:
         return os.path.realpath(sys.executable)
@@ -209,7 +209,7 @@ def build(packages: list[str], ros: str | None) -> None:
     environment["PATH"] = f"{VENV / 'bin'}{os.pathsep}{environment['PATH']}"
     if not ros:
         environment["AMENT_PREFIX_PATH"] = environment["CMAKE_PREFIX_PATH"] = str(VENV)
-    # By itself colcon compiles one file at a time on a machine that is busy with something else.
+    # Without this, colcon compiles one file at a time on a busy machine.
     environment["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
     python = str(VENV / "bin/python")
     cmake = ["-Wno-dev", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF"]
@@ -252,30 +252,30 @@ def digest(paths: list[Path], words: str) -> str:
 
 
 def is_current(folder: Path, stamp: str) -> bool:
-    """Tell whether a folder was made from the same sources."""
+    """Return whether a folder was made from the same sources."""
     file = folder / ".prepared"
     return file.is_file() and file.read_text() == stamp
 
 
 def mark(folder: Path, stamp: str) -> None:
-    """Note what a folder was made from, once it is whole."""
+    """Store the digest of the sources in a finished folder."""
     (folder / ".prepared").write_text(stamp)
 
 
 def run(command: list[str], environment: dict[str, str]) -> None:
-    """Run a command; its own output says what went wrong."""
+    """Run a command; its own output reports errors."""
     done = subprocess.run(command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL)
     if done.returncode:
         fail(f"`{' '.join(command[:5])} ...` failed with status {done.returncode}, see above")
 
 
 def say(text: str) -> None:
-    """Tell the user what takes time."""
+    """Print which step runs now."""
     print(f"setup: {text}", file=sys.stderr, flush=True)
 
 
 def fail(text: str) -> NoReturn:
-    """End with one line."""
+    """Exit with a one-line message."""
     sys.exit(f"setup: {text}")
 
 

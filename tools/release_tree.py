@@ -1,4 +1,4 @@
-"""Lay the two packages side by side, as the tools of the ecosystem look for them.
+"""Lay the two packages side by side, as ROS release tools expect them.
 
     python3 tools/release_tree.py FOLDER      `make release` calls it with release/
 
@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 OUTER, INNER = "relay_autotune", "relay_autotune_msgs"
-# What names the inner package's place in the repository, and what is for the repository alone.
+# Files that name the place of the inner package, or are only for the repository.
 _LEFT_OUT = ("colcon_defaults.yaml", ".ci/", ".gitignore")
 
 

@@ -43,8 +43,8 @@ def main() -> int:
     if sys.argv[1:]:
         first_screen(sys.argv[1], case)
     for picture in (IMAGES / "demo.png", *IMAGES.glob("report_*.png")):
-        # A palette is enough for lines, and a third of the size; this one keeps the colours that
-        # few points have, by which the signs on a curve are told apart.
+        # A palette is enough for lines and makes the file three times smaller; this one keeps rare
+        # colours, such as those of the markers on a curve.
         with Image.open(picture) as image:
             few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
             few.save(picture, optimize=True)
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def tune_as_the_demo() -> Analysis:
-    """Return what the demo finds; in lockstep its samples can be had without processes."""
+    """Return the demo's result; in lockstep its samples can be computed without processes."""
     process = VirtualProcess(
         demo.TRUTH,
         rest_measurement=demo.REST,
@@ -70,7 +70,7 @@ def tune_as_the_demo() -> Analysis:
 
 
 def first_screen(browser: str, case: Case) -> None:
-    """Take a picture of what a report shows first.
+    """Take a picture of the first screen of a report.
 
     :param browser: that takes Chromium's options.
     :param case: in the report.
