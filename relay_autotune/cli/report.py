@@ -102,7 +102,7 @@ def check_output(output: str) -> None:
     """Refuse a report that could not be written, before any work is done.
 
     :param output: name of its file.
-    :raises SelectionError: if the ending is none of those known, or the folder is not there.
+    :raises SelectionError: if the ending is unknown, or the folder does not exist.
     """
     path = Path(output)
     if path.suffix.lower() not in (".html", *PICTURES):

@@ -216,7 +216,7 @@ def _warnings(
         if record.lost_samples:
             found.append(f"{which}{record.lost_samples} samples were lost on the way")
     if fit.problem.drift:
-        found.append("the measurement drifts beside the response; the drift was estimated")
+        found.append("the measurement drifts; the drift was fitted together with the model")
     if fit.loss != "squares":
         found.append(f"the {fit.loss} loss was minimised, as asked for, in place of the squares")
     return found
