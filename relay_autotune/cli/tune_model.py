@@ -5,19 +5,23 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from relay_autotune.errors import ModelError, SelectionError
-from relay_autotune.process.structures import GENERAL, STRUCTURES, TABLE, structure_named
+from relay_autotune.process.structures import (
+    GENERAL,
+    STRUCTURES,
+    TABLE,
+    recognised,
+    structure_named,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 
 _FLAGS = (
     *("gain", "time_constants", "zeros", "dead_time", "integrators", "order", "structure"),
     *("natural_frequency", "damping", "numerator", "denominator"),
 )
-_EQUAL = 1e-9
 
 
 def model_of(options: argparse.Namespace) -> TransferFunction:
@@ -40,7 +44,8 @@ def model_of(options: argparse.Namespace) -> TransferFunction:
     if options.document is not None:
         given = _from_document(options.document, options.experiment)
     try:
-        return _recognised(_built(given))
+        model = _built(given)
+        return recognised(model) if model.structure == GENERAL else model
     except ModelError as error:
         raise SelectionError(f"this is no model: {error}") from error
 
@@ -118,41 +123,6 @@ def _unnamed(
     if not lags and not integrators:
         raise SelectionError("the model has no dynamics: give --time-constants or --integrators")
     return TransferFunction(gain, zeros, lags, integrators, dead_time)
-
-
-def _recognised(model: TransferFunction) -> TransferFunction:
-    """Name the structure of a model that was built from its factors."""
-    if model.structure != GENERAL:
-        return model
-    lags, zeros = model.time_constants, model.zeros
-    real = all(t.imag == 0.0 for t in lags)
-    stable = all(t.real > 0.0 for t in lags)
-    equal = real and len(lags) > 1 and max(abs(t - lags[0]) for t in lags) <= _EQUAL * abs(lags[0])
-    name = GENERAL
-    match (model.integrators, len(lags), len(zeros)):
-        case (0, 1, 0) if stable:
-            name = "fopdt"
-        case (0, _, 0) if equal and stable:
-            name = "lag_n"
-        case (0, _, 1) if equal and stable:
-            name = "lag_n_zero"
-        case (0, 2, 0 | 1) if stable:
-            name = "sopdt_zero" if zeros else "sopdt"
-        case (0, 3, 0) if stable and real:
-            name = "three_lags"
-        case (0, 3, 0) if stable:
-            name = "lag_complex"
-        case (1, 0, 0):
-            name = "ipdt"
-        case (1, 1, 0) if stable:
-            name = "integrator_lag"
-        case (1, 1, 1) if stable and zeros[0].real < 0.0:
-            name = "integrator_inverse"
-        case (0, 1, 0):
-            name = "unstable_fopdt"
-        case (0, 2, 0) if real and lags[0].real * lags[1].real < 0.0:
-            name = "unstable_sopdt"
-    return replace(model, structure=name)
 
 
 def _from_document(name: str, experiment: int | None) -> dict[str, Any]:

@@ -43,6 +43,8 @@ GENERAL = "general"
 # Below this damping two lags are reported as a pair. Not 1, because there the lags merge and their
 # time constants are not smooth.
 _DAMPING_OF_A_PAIR = 1.02
+# Time constants nearer to each other than this share are equal.
+_EQUAL = 1e-9
 
 
 @dataclass(frozen=True)
@@ -215,6 +217,28 @@ class Structure:
                 return self if same else self.form(pair) if self.either else None
         return self
 
+    def holds(self, model: TransferFunction) -> bool:
+        """Return whether a model is of this structure, by its poles and zeros.
+
+        :param model: any; lags of which some are equal are lags, unless all of them are.
+        """
+        lags, zeros = model.time_constants, model.zeros
+        unstable = sum(f.unstable for f in self.factors)
+        if model.integrators != self.integrators or len(zeros) != len(self.powers) - 1:
+            return False
+        if sum(t.real <= 0.0 for t in lags) != unstable:
+            return False
+        if self.zero is not None and self.zero.turned and not zeros[0].real < 0.0:
+            return False
+        pair = any(t.imag != 0.0 for t in lags)
+        if self.any_order:
+            far = max((abs(t - lags[0]) for t in lags), default=math.inf)
+            return len(lags) > 1 and not pair and far <= _EQUAL * abs(lags[0])
+        told_alike = any(f.multiplicity > 1 for f in self.factors)
+        if told_alike or len(lags) != self.order - self.integrators:
+            return False
+        return self.either or pair is any(f.parameters == PAIR for f in self.factors)
+
     def of_fields(
         self,
         *,
@@ -332,6 +356,15 @@ def structure_named(name: str) -> Structure:
     :raises ModelError: if the name is unknown; the message lists the known names.
     """
     return look_up(TABLE, name, "structure", ModelError)
+
+
+def recognised(model: TransferFunction) -> TransferFunction:
+    """Return a model with the name of the first structure that it is of; as it is: of none.
+
+    :param model: any.
+    """
+    name = next((s.name for s in TABLE.values() if s.holds(model)), model.structure)
+    return replace(model, structure=name)
 
 
 def structure_of(model: TransferFunction, names: Sequence[str]) -> Structure:

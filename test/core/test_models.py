@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from relay_autotune.errors import ModelError
-from relay_autotune.process.structures import STRUCTURES, structure_named
+from relay_autotune.process.structures import STRUCTURES, recognised, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 
 W = np.logspace(-3, 3, 50)
@@ -60,6 +61,19 @@ def test_phase_is_continuous_and_agrees_with_the_angle(structure):
     np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * angle), atol=1e-9)
     fine = np.linspace(W[0], 20.0 / (1.0 + model.dead_time), 20001)
     assert np.abs(np.diff(model.phase(fine))).max() < 0.5
+
+
+@pytest.mark.parametrize("structure", EXAMPLES)
+def test_a_model_is_recognised_by_its_poles_and_zeros(structure):
+    model = structure_named(structure).of_fields(**EXAMPLES[structure])
+    # Of three lags two may happen to be equal.
+    wanted = "three_lags" if structure == "two_equal_one" else structure
+    assert recognised(replace(model, structure="general")).structure == wanted
+
+
+def test_a_model_of_no_structure_stays_general():
+    for lags, zeros in (((1.0, -1.0, -2.0), ()), ((1.0, 2.0, 3.0, 4.0), ()), ((2.0,), (1.0,))):
+        assert recognised(TransferFunction(1.0, zeros, lags)).structure == "general"
 
 
 def test_the_controllers_sign_follows_the_process():
