@@ -32,6 +32,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record
+from relay_autotune.record.thinning import thinned
 from relay_autotune.tuning import (
     DEFAULT_RULE,
     RULES,
@@ -262,10 +263,11 @@ class _Chosen:
 
 def _chosen(record: Record, method: str, known: Known) -> _Chosen | Analysis:
     """Return the model that counts; where there is none, the analysis that says why."""
+    record = thinned(record)
     cycles: tuple[Cycle, ...] = ()
     try:
         cycles = cycles_of(record)
-        chosen = _guarded(record, method, known)
+        chosen = _with_remarks(_guarded(record, method, known), (record,))
     except RelayAutotuneError as error:
         return _nothing(record, cycles, error)
     chosen = without_disturbance(
@@ -288,7 +290,7 @@ def _chosen_so_far(record: Record, method: str, known: Known) -> _Chosen | Analy
     if isinstance(chosen, Analysis):
         # What there is not yet is no verdict.
         return replace(chosen, judgement=NOT_JUDGED)
-    if not is_far_off(chosen.model, record):
+    if not is_far_off(chosen.model, chosen.record):
         return chosen
     # Its interval is that of a model which the record contradicts: nothing to end a test on.
     model = replace(chosen.model, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
@@ -340,11 +342,12 @@ def analyse_jointly(
     :raises RelayAutotuneError: if method or rule are unknown.
     """
     rule_named(rule)
+    records = [thinned(record) for record in records]
     first = records[0]
     cycles: tuple[Cycle, ...] = ()
     try:
         cycles = cycles_of(first)
-        chosen = identify_jointly(records, method, known)
+        chosen = _with_remarks(identify_jointly(records, method, known), records)
     except RelayAutotuneError as error:
         return _nothing(first, cycles, error)
     told = unequal_amplitudes(records, chosen.model)
@@ -394,6 +397,12 @@ def _judged(
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     return replace(tuned, judgement=judgement)
+
+
+def _with_remarks(found: Identification, records: Sequence[Record]) -> Identification:
+    """Say with a model what was made of the records before."""
+    said = [record.unthinned.remark for record in records if record.unthinned is not None]
+    return replace(found, warnings=(*found.warnings, *said))
 
 
 def _refusal(record: Record) -> str:
@@ -459,16 +468,19 @@ def _task(
 def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
     """Take noise, amplitude and sampling period from the record where they are not given."""
     record, chosen = found.record, found.models[0]
+    # The controller will see single samples, not means of many.
+    before = record.unthinned
     if math.isnan(options.noise_std):
         measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
+        measured = measured if before is None else before.noise
         options = replace(options, noise_std=measured)
     if math.isnan(options.amplitude):
         # Of another's experiment, half of what the command moved.
         settings, half = record.settings, 0.5 * float(np.ptp(record.command))
         options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
     if options.sample_period == 0.0 and len(record) > 1:
-        # The controller will see the same measurement.
-        options = replace(options, sample_period=record.interval)
+        period = record.interval if before is None else before.interval
+        options = replace(options, sample_period=period)
     return options
 
 

@@ -245,6 +245,22 @@ def _as_column(name: str, value: object, length: int | None) -> FloatArray:
 
 
 @dataclass(frozen=True)
+class Unthinned:
+    """What a record was before its samples were averaged in blocks.
+
+    :param samples: how many it had.
+    :param interval: median time between them [s].
+    :param noise: standard deviation of the noise of each [y].
+    :param remark: what was done, a sentence.
+    """
+
+    samples: int
+    interval: float
+    noise: float
+    remark: str
+
+
+@dataclass(frozen=True)
 class Record:
     """The immutable record of one experiment.
 
@@ -273,6 +289,7 @@ class Record:
         follows from ``command`` and ``command_time``.
     :param continuous_command: True: the command moved along straight lines between its instants,
         as from an analogue controller; False: it was held.
+    :param unthinned: what it was before it was thinned; None: it was not.
     :ivar answers: what was asked of the record before, see :func:`asked_once`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
         goes backwards, or the noise is negative.
@@ -293,6 +310,7 @@ class Record:
     lost_samples: int = 0
     held_input: PiecewiseConstant | None = None
     continuous_command: bool = False
+    unthinned: Unthinned | None = None
     answers: dict[Hashable, Any] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
