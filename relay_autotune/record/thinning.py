@@ -7,6 +7,7 @@ white noise of standard deviation sigma becomes one of sigma/sqrt(k) in the mean
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -128,7 +129,7 @@ def _begins(record: Record, changes: IntArray, size: int) -> IntArray:
     kept.append(len(record))
     pieces = [
         np.linspace(a, b, max(1, round((b - a) / size)), endpoint=False).astype(np.int64)
-        for a, b in zip(kept[:-1], kept[1:], strict=True)
+        for a, b in itertools.pairwise(kept)
     ]
     return np.concatenate(pieces)
 
@@ -145,10 +146,9 @@ def _averaged(record: Record, begins: IntArray, before: Unthinned, *, often: boo
             values = np.interp(at, held.times, held.values, left=held.initial)
             held = PiecewiseConstant(at, values, held.initial)
         else:
-            before = np.append(at[0] - 1.0, at[:-1])
-            held = PiecewiseConstant.from_samples(
-                before, np.append(held.initial, _means(held, at))
-            )
+            from_then_on = np.append(at[0] - 1.0, at[:-1])
+            means = np.append(held.initial, _means(held, at))
+            held = PiecewiseConstant.from_samples(from_then_on, means)
     mean = np.add.reduceat(record.measurement, begins) / count
     # Noise that is not white loses less in a mean.
     left = roughness(mean) / max(roughness(record.measurement), np.finfo(float).tiny)

@@ -15,6 +15,7 @@ QUICK = {
     "fit_time": ("--quick",),
     "accuracy": ("--quick",),
     "target_spread": ("--quick",),
+    "replay_shapes": ("--quick",),
     "replay_time": ("--quick",),
     "lockstep": ("--quick",),
     "latency": ("--quick",),
