@@ -43,3 +43,7 @@ MOST_NOTES = 20
 
 # No quantity of a process is beyond it, in whatever unit; its square is still a number.
 LARGEST_VALUE = 1e100
+
+# Bytes of a text with columns, and characters of a line in it.
+LARGEST_TEXT = 2 << 30
+LONGEST_LINE = 1 << 20

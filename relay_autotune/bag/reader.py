@@ -167,5 +167,7 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
     from relay_autotune.bag.foreign import take_apart
 
     columns = (wanted.measurement, wanted.command, wanted.time)
-    measured, commanded, dated = read_csv(path, *columns)
-    return take_apart(join(measured, commanded, dated=dated), whole=wanted.is_part)
+    log = read_csv(path, *columns)
+    record = join(log.measurement, log.command, dated=log.dated)
+    records, notes = take_apart(record, whole=wanted.is_part)
+    return records, [*log.notes, *notes]

@@ -57,9 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    measurement, command, _ = read_csv(
-        options.csv, options.measurement, options.command, options.time
-    )
+    log = read_csv(options.csv, options.measurement, options.command, options.time)
+    for note in log.notes:
+        say(PROGRAM, f"{options.csv}: {note}")
+    measurement, command = log.measurement, log.command
     topics = (
         options.measurement_topic or topic_name(measurement.name),
         options.command_topic or topic_name(command.name),
@@ -87,16 +88,16 @@ def _convert(options: argparse.Namespace) -> int:
         start_ns=epoch_ns + int(measurement.time_ns[0]),
         custom=facts,
     ) as bag:
-        rows = zip(
-            (measurement.time_ns + epoch_ns).tolist(),
-            measurement.values.tolist(),
-            command.values.tolist(),
-            strict=True,
-        )
-        for time_ns, measured, commanded in rows:
-            bag.write(topics[0], time_ns, time_ns, encode_float64(measured))
-            bag.write(topics[1], time_ns, time_ns, encode_float64(commanded))
-    say(PROGRAM, f"{options.bag}: {len(measurement)} messages on each of {' and '.join(topics)}")
+        rows = [
+            (int(time_ns) + epoch_ns, topic, float(value))
+            for topic, signal in zip(topics, (measurement, command), strict=True)
+            for time_ns, value in zip(signal.time_ns, signal.values, strict=True)
+        ]
+        # Of one row, the measurement comes first.
+        for time_ns, topic, value in sorted(rows, key=lambda row: row[0]):
+            bag.write(topic, time_ns, time_ns, encode_float64(value))
+    counts = f"{len(measurement)} messages on {topics[0]}, {len(command)} on {topics[1]}"
+    say(PROGRAM, f"{options.bag}: {counts}")
     return DONE
 
 

@@ -108,11 +108,14 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
     ):
         return []
     held = record.input()
-    inside = (held.times > record.time[first]) & (held.times <= record.time[last])
+    # A change at the first sample of a recording is its step.
+    after = held.times > record.time[first]
+    inside = (after if first else held.times >= record.time[0]) & (held.times <= record.time[last])
     times, values = held.times[inside], held.values[inside]
     if times.size == 0:
         return []
-    before = float(held(record.time[first : first + 1])[0])
+    earlier = held.values[: int(np.argmax(inside))]
+    before = float(earlier[-1]) if earlier.size else held.initial
     if times.size >= max(_FEWEST_CHANGES, _CONTINUOUS * (last - first)):
         found = _moving_parts(record, first, last)
     else:

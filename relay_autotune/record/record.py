@@ -182,10 +182,11 @@ class PiecewiseConstant:
         """
         times = np.asarray(times, dtype=np.float64)
         values = np.asarray(values, dtype=np.float64)
-        last = np.append(np.diff(times) > 0.0, True)
+        last, initial = np.append(np.diff(times) > 0.0, True), float(values[0])
         times, values = times[last], values[last]
-        changed = np.flatnonzero(np.diff(values) != 0.0) + 1
-        return cls(times[changed], values[changed], float(values[0]))
+        # A change at the first instant of all is known by two values there.
+        changed = np.flatnonzero(np.diff(values, prepend=initial) != 0.0)
+        return cls(times[changed], values[changed], initial)
 
     def __call__(self, t: FloatArray) -> FloatArray:
         """Return the level in force at each time ``t`` [s], any shape."""

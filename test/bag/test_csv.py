@@ -61,15 +61,15 @@ def test_dates_in_seconds_become_the_start(tmp_path):
     [
         ("", "is empty; expected a header line"),
         ("\n\n", "is empty; expected a header line"),
-        ("0,1,2\n1,2,3\n", "has no header line: its first line is 0, 1, 2"),
-        ("t;y;u\n0;1;2\n", r"has the columns 't;y;u'; expected at least three"),
+        ("t y u\n0 1 2\n", r"has the columns 't y u'; expected at least three"),
+        ("t;y;u\n0;1,5;2\n1;1.5;2\n", "a decimal comma and others with a point"),
+        ("t;y;u\n0;1.000,5;2\n1;2;2\n", r"line 2: 'y' is '1.000,5'; expected a number"),
+        ("t,y,u\n0,1,2\n2026-01-01T00:00:00,2,1\n", "of 2 cells of 't' 1 are dates"),
+        ("t,y,u\n" + "0" * (1 << 20) + ",1,2\n", "a line of more than 1048576 characters"),
         ("t,y,u\n", "has 0 rows of numbers"),
-        ("t,y,u\n0,1,2\n1,,2\n", r"line 3: the column 'y' is missing"),
-        ("t,y,u\n0,1,2\n1,5\n", r"line 3: the column 'u' is missing"),
         ("t,y,u\n0,1,2\n1,nan,2\n", r"line 3: 'y' is nan; expected a finite number"),
         ("t,y,u\n0,1,2\n1,3,-inf\n", r"line 3: 'u' is -inf; expected a finite"),
         ("t,y,u\n0,1,2\n1,3 V,2\n", r"line 3: 'y' is '3 V'; expected a number"),
-        ("t,y,u\n0,1,2\n5,2,2\n4,1,3\n", r"line 4: the time goes back from 5 s to 4 s"),
         ("t,y,u\n0,1,2\n1e18,2,3\n", "expected a time in seconds"),
         ("t,y,u\n0,1,2\n1,1,3\n", r"the measurement y is constant \(1 in all of 2 values\)"),
         ("t,y,u\n0,1,2\n1,4,2\n", r"the command u never changes \(2 in all of 2 values\)"),
@@ -84,7 +84,7 @@ def test_bad_content_is_a_sentence(tmp_path, text, sentence):
 def test_a_file_that_is_not_there_or_no_text(tmp_path):
     with pytest.raises(BagError, match="does not exist"):
         read_experiments(tmp_path / "a.csv")
-    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
+    (tmp_path / "b.csv").write_bytes(b"\xff\x00\x01\x02")
     with pytest.raises(BagError, match="is not a text file"):
         read_experiments(tmp_path / "b.csv")
     (tmp_path / "c.csv").mkdir()
@@ -102,3 +102,160 @@ def test_a_controller_at_rest_is_refused_unless_a_part_is_named(tmp_path):
         read_experiments(path)
     (record,) = read_experiments(path, Selection(start=0.0)).experiments
     assert len(record) == 600
+
+
+def line(k, separator=",", point="."):
+    cells = (f"{k * 0.5!r}", f"{k % 7 + 0.25!r}", f"{k // 5 % 2}.5")
+    return separator.join(cell.replace(".", point) for cell in cells)
+
+
+def same_as_plain(tmp_path, recording):
+    plain = "t,y,u\n" + "\n".join(line(k) for k in range(20))
+    (expected,) = read_experiments(write(tmp_path / "plain.csv", plain)).experiments
+    (record,) = recording.experiments
+    np.testing.assert_array_equal(record.time, expected.time)
+    np.testing.assert_array_equal(record.measurement, expected.measurement)
+    np.testing.assert_array_equal(record.input().times, expected.input().times)
+    np.testing.assert_array_equal(record.input().values, expected.input().values)
+    return record
+
+
+@pytest.mark.parametrize(
+    ("separator", "point", "said"),
+    [
+        (";", ".", ["columns are taken as separated by semicolons"]),
+        ("\t", ".", ["columns are taken as separated by tabs"]),
+        (
+            ";",
+            ",",
+            [
+                "columns are taken as separated by semicolons",
+                "a comma within a number is taken as the decimal point",
+            ],
+        ),
+    ],
+)
+def test_separators_and_decimal_commas(tmp_path, separator, point, said):
+    text = separator.join("tyu") + "\n"
+    text += "\n".join(line(k, separator, point) for k in range(20))
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    same_as_plain(tmp_path, found)
+    assert list(found.notes) == said
+
+
+def test_a_header_may_be_missing(tmp_path):
+    text = "\n".join(line(k) for k in range(20))
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    same_as_plain(tmp_path, found)
+    assert found.notes == ("there is no header line; the columns are called '1', '2', '3'",)
+    chosen = read_experiments(tmp_path / "a.csv", Selection("2", "3", "1"))
+    same_as_plain(tmp_path, chosen)
+
+
+def stamped(form):
+    cells = [line(k).split(",") for k in range(20)]
+    return "\n".join(",".join((form(float(t)), y, u)) for t, y, u in cells)
+
+
+@pytest.mark.parametrize(
+    ("header", "form", "said", "start"),
+    [
+        ("t [ms]", lambda t: f"{1e3 * t:g}", "the time is taken in ms, as 't [ms]' says", 0.0),
+        ("t (min)", lambda t: f"{t / 60:.12f}", "the time is taken in min, as", 0.0),
+        ("t", lambda t: f"{1.79e12 + 1e3 * t:.0f}", "'t' is taken as milliseconds", 1.79e9),
+        ("t", lambda t: f"{1.79e15 + 1e6 * t:.0f}", "'t' is taken as microseconds", 1.79e9),
+        ("t", lambda t: f"2026-09-21T13:46:{40 + t:06.3f}Z", "taken as dates in UTC", None),
+        ("t", lambda t: f"2026-09-21 15:46:{40 + t:06.3f}+02:00", "taken as dates", None),
+    ],
+)
+def test_times_in_other_units_and_dates(tmp_path, header, form, said, start):
+    text = f"{header},y,u\n" + stamped(form)
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    record = same_as_plain(tmp_path, found)
+    assert said in found.notes[0]
+    assert record.start == (1789998400.0 if start is None else start)
+
+
+def test_a_unit_in_a_header_need_not_be_typed(tmp_path):
+    text = "t,T1 [degC],T2 [degC],Q1 (%)\n" + "\n".join(
+        line(k).replace(",", ",0,", 1) for k in range(20)
+    )
+    path = write(tmp_path / "a.csv", text)
+    same_as_plain(tmp_path, read_experiments(path, Selection("T2", "Q1")))
+    with pytest.raises(SelectionError, match="no column 'T'"):
+        read_experiments(path, Selection("T", "Q1"))
+
+
+def test_a_line_of_units_below_the_header_is_left_out_and_said(tmp_path):
+    text = "t,y,u\ns,degC,%\n" + "\n".join(line(k) for k in range(20))
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    same_as_plain(tmp_path, found)
+    assert found.notes == ("line 2 holds no number and is taken for units",)
+
+
+def test_empty_cells_are_a_gap_that_is_said(tmp_path):
+    cells = [line(k).split(",") for k in range(20)]
+    cells[6][1] = cells[7][1] = ""
+    cells[8][2] = ""
+    text = "t,y,u\n" + "\n".join(",".join(row) for row in cells)
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    (record,) = found.experiments
+    assert len(record) == 18
+    np.testing.assert_array_equal(record.input().times, [2.5, 5.0, 7.5])
+    assert found.notes == (
+        "2 cells of the column 'y' are empty and left out; the longest gap is 1.5 s",
+        "1 cells of the column 'u' are empty and left out; the longest gap is 1 s",
+    )
+
+
+def test_of_two_rows_at_one_time_the_second_has_the_step(tmp_path):
+    text = "t,y,u\n0,1,0\n0,1,5\n" + "".join(f"{k},{k},5\n" for k in range(1, 20))
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    (record,) = found.experiments
+    held = record.input()
+    assert (held.initial, held.times.tolist(), held.values.tolist()) == (0.0, [0.0], [5.0])
+    assert "1 rows have the time of the row before" in found.notes[0]
+
+
+def test_rows_are_put_into_the_order_of_their_time(tmp_path):
+    order = np.random.default_rng(3).permutation(20).tolist()
+    text = "t,y,u\n" + "\n".join(line(k) for k in order)
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    same_as_plain(tmp_path, found)
+    assert found.notes[0].endswith("rows are put into its order")
+
+
+def test_two_recordings_in_one_file_are_not_mixed(tmp_path):
+    body = "\n".join(line(k) for k in range(30))
+    with pytest.raises(BagError, match=r"line 32: the time goes back from 14.5 s to 0 s"):
+        read_experiments(write(tmp_path / "a.csv", f"t,y,u\n{body}\n{body}\n"))
+
+
+def test_latin_1_utf_16_and_what_spreadsheets_add(tmp_path):
+    body = "\n".join(line(k, ";") for k in range(20))
+    text = f"sep=;\nt;T [\u00b0C];u\n{body}"
+    (tmp_path / "a.csv").write_bytes(text.encode("latin-1"))
+    found = read_experiments(tmp_path / "a.csv", Selection("T", "u"))
+    same_as_plain(tmp_path, found)
+    assert "the text is not UTF-8 and is taken as Latin-1" in found.notes
+    (tmp_path / "b.csv").write_bytes(text.encode("utf-16"))
+    same_as_plain(tmp_path, read_experiments(tmp_path / "b.csv", Selection("T", "u")))
+
+
+def test_a_hash_begins_a_remark_or_the_header(tmp_path):
+    body = "\n".join(line(k) for k in range(20))
+    for k, head in enumerate(("# made by a logger\nt,y,u", "# t, y, u")):
+        path = write(tmp_path / f"{k}.csv", f"{head}\n{body}")
+        same_as_plain(tmp_path, read_experiments(path))
+
+
+def test_a_record_that_begins_with_its_step_is_an_experiment(tmp_path):
+    rng = np.random.default_rng(5)
+    t = 0.5 * np.arange(300)
+    y = 3.0 * (1.0 - np.exp(-t / 20.0)) + 0.01 * rng.standard_normal(300)
+    text = "t,y,u\n0,0,0\n" + "\n".join(
+        f"{a!r},{b!r},5" for a, b in zip(t.tolist(), y.tolist(), strict=True)
+    )
+    (record,) = read_experiments(write(tmp_path / "a.csv", text)).experiments
+    held = record.input()
+    assert (held.initial, held.values.tolist()) == (0.0, [5.0])
