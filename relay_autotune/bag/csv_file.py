@@ -16,9 +16,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import BinaryIO, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.bag.limits import LARGEST_TEXT, LONGEST_LINE
 from relay_autotune.bag.signals import Signal
@@ -129,7 +129,7 @@ class _Table:
     :param file: the file, from its beginning.
     """
 
-    def __init__(self, path: Path, file: io.BufferedIOBase | io.BufferedReader) -> None:
+    def __init__(self, path: Path, file: BinaryIO) -> None:
         self._path = path
         self.notes: list[str] = []
         self.lines: IntArray = np.empty(0, dtype=np.int64)
@@ -214,7 +214,9 @@ class _Table:
             if any(cell.strip() for cell in row):
                 yield self._reader.line_num, row
 
-    def columns(self, chosen: Sequence[str]) -> tuple[NDArray[np.float64] | IntArray, ...]:
+    def columns(
+        self, chosen: Sequence[str]
+    ) -> tuple[FloatArray | IntArray, FloatArray, FloatArray]:
         """Return three columns, the time first; NaN: an empty cell of the others.
 
         Dates are whole nanoseconds since 1970.
@@ -288,7 +290,7 @@ class _Table:
         return value
 
 
-def _lines(path: Path, text: io.TextIOWrapper) -> Iterator[str]:
+def _lines(path: Path, text: TextIO) -> Iterator[str]:
     """Yield the lines of a text, none of which may fill the memory."""
     while line := text.readline(LONGEST_LINE + 1):
         if len(line) > LONGEST_LINE:
