@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 from endurance import resident
-from markdown import table, three
+from markdown import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
 
@@ -172,7 +172,7 @@ def report(seen: list[Held], seconds: float) -> tuple[str, bool]:
                     name,
                     f"{what} [{unit}]" if unit else _NAMES[what],
                     *(f"{v:.0f}" for v in (first, held[later][0] / scale, last, largest)),
-                    three(slope / scale),
+                    f"{round(slope / scale, 2) + 0.0:.2f}",
                     "grows" if grows else "flat",
                 )
             )

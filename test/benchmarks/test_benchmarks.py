@@ -24,6 +24,7 @@ QUICK = {
     "simulated_experiments": ("--quick",),
     "random_histories": ("--quick",),
     "endurance": ("--quick",),
+    "back_to_back": ("--quick",),
     "confident": ("--quick",),
     "chang_studies": ("--quick",),
     "structure_choice": ("--quick",),
