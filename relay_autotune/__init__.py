@@ -1,7 +1,7 @@
 """Relay-feedback autotuning: experiments, identification and controller design.
 
-What is listed in ``__all__`` is the interface for programs and notebooks; it is loaded when it is
-asked for, so that nodes and commands pay only for what they use::
+The names in ``__all__`` are the interface for programs and notebooks. Each is loaded at its first
+use, so that nodes and commands load only the parts that they need::
 
     from relay_autotune import analyse, draw, read_records
 

@@ -1,4 +1,4 @@
-"""From a record to models and gains: the one path that live nodes and replay share."""
+"""From a record to models and gains; live nodes and replay share this path."""
 
 from __future__ import annotations
 
@@ -57,20 +57,20 @@ _LOAD = 2
 
 @dataclass(frozen=True)
 class Analysis:
-    """What one record gave.
+    """Result of the analysis of one record.
 
     :param record: the record.
     :param cycles: its whole cycles.
-    :param models: every method's model that could be had, the chosen method's first.
-    :param selected: index of the model that counts; None: nothing was identified.
-    :param gains: every rule's gains that apply to the selected model, the chosen rule's first.
-    :param recommended: index of the gains that count; None: there are none.
-    :param reason: why there is no model or no gains; empty where there are both.
+    :param models: the models of all methods that apply, the chosen method's first.
+    :param selected: index of the selected model; None: nothing was identified.
+    :param gains: the gains of all rules that apply to that model, the chosen rule's first.
+    :param recommended: index of the recommended gains; None: there are no gains.
+    :param reason: why there is no model or no gains; empty if there are both.
     :param added_delay: dead time beside the process's own with which the gains were judged [s]:
         half a sampling period of the controller, and what else its loop adds.
-    :param judgement: what the checks found, and the verdict.
-    :param predicted: of a running experiment, Ms with the gains that its model would give; None:
-        not asked for, or there would be none.
+    :param judgement: findings of the checks, and the verdict.
+    :param predicted: for a running experiment, Ms with the gains of its model; None: not asked
+        for, or no gains.
     """
 
     record: Record
@@ -86,12 +86,12 @@ class Analysis:
 
     @property
     def model(self) -> Identification | None:
-        """The identification that counts."""
+        """The selected identification."""
         return None if self.selected is None else self.models[self.selected]
 
     @property
     def best_gains(self) -> Gains | None:
-        """The gains that count."""
+        """The recommended gains."""
         return None if self.recommended is None else self.gains[self.recommended]
 
     @property
@@ -101,7 +101,7 @@ class Analysis:
 
     @property
     def finding(self) -> Finding:
-        """What the model and its prediction say of a running experiment."""
+        """Result of the fit and its prediction for a running experiment."""
         model, ms = self.model, self.predicted
         if model is None:
             return Finding()
@@ -110,7 +110,7 @@ class Analysis:
 
     def _repr_html_(self) -> str:
         """Return model and gains as a table, as notebooks show it."""
-        # Imported here, since nothing else needs it.
+        # Imported here, because only notebooks need it.
         from relay_autotune.exchange.notebook import analysis_html
 
         return analysis_html(self)
@@ -119,7 +119,7 @@ class Analysis:
 def check_names(method: str, rule: str) -> None:
     """Refuse unknown names before any work is done.
 
-    :raises RelayAutotuneError: if there is no such method or rule; the message lists the known.
+    :raises RelayAutotuneError: for an unknown method or rule; the message lists the known ones.
     """
     method_named(method)
     rule_named(rule)
@@ -136,17 +136,17 @@ def analyse(
 ) -> Analysis:
     """Identify a record and, where the experiment was completed, tune: by all methods and rules.
 
-    Data that tell no model are a result, not an exception: the reason says what was found and
-    what to do. Only a completed experiment, or data that carry no outcome at all, yield gains,
-    and only where no check of the table in ``identification.judgement`` failed; the verdict says
-    whether they may be used.
+    Data without a usable model are a result, not an exception: the reason says what was found and
+    what to do. Only a completed experiment, or data without any outcome, yield gains, and only if
+    no check of the table in ``identification.judgement`` failed. The verdict says whether the
+    gains may be used.
 
     :param record: the experiment.
-    :param method: the method whose model counts.
-    :param rule: the rule whose gains count.
-    :param known: what is known of the process beforehand.
-    :param options: what is asked of the controller; noise and amplitude come from the record
-        where they are not given.
+    :param method: the method of the selected model.
+    :param rule: the rule of the recommended gains.
+    :param known: known values of the process.
+    :param options: design options of the controller; noise and amplitude come from the record if
+        they are not given.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
     :raises RelayAutotuneError: if method or rule are unknown.
@@ -171,13 +171,13 @@ def analyse_alone(
 ) -> Analysis:
     """Identify a record by one method and, where the experiment was completed, tune by one rule.
 
-    Model and gains are those of :func:`analyse`, without what would stand beside them; for many
+    Model and gains equal those of :func:`analyse`, without the other methods and rules; for many
     records.
 
     :param record: the experiment.
     :param method: the method.
     :param rule: the rule.
-    :param known: what is known of the process beforehand.
+    :param known: known values of the process.
     :param options: as for :func:`analyse`.
     :param rng: as for :func:`analyse`.
     :raises RelayAutotuneError: if method or rule are unknown.
@@ -193,13 +193,13 @@ def analyse_alone(
 def model_so_far(
     record: Record, *, method: str = DEFAULT_METHOD, known: Known = NOTHING
 ) -> Analysis:
-    """Identify the record of an experiment that still runs, by one method.
+    """Identify the record of a running experiment by one method.
 
     This takes a fraction of the time of :func:`analyse`. There are no gains.
 
-    :param record: of the experiment so far.
+    :param record: the record so far.
     :param method: the method.
-    :param known: what is known of the process beforehand.
+    :param known: known values of the process.
     :raises RelayAutotuneError: if the method is unknown.
     """
     method_named(method)
@@ -216,12 +216,12 @@ def prediction_so_far(
     options: DesignOptions | None = None,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
-    """Identify as :func:`model_so_far` does, and predict the Ms that the gains would have.
+    """Identify like :func:`model_so_far`, and predict the Ms of the gains.
 
-    :param record: of the experiment so far.
+    :param record: the record so far.
     :param method: the method.
     :param rule: the rule of the gains.
-    :param known: what is known of the process beforehand.
+    :param known: known values of the process.
     :param options: as for :func:`analyse`.
     :param rng: as for :func:`analyse`.
     :raises RelayAutotuneError: if method or rule are unknown.
@@ -236,12 +236,12 @@ def prediction_so_far(
 
 @dataclass(frozen=True)
 class _Chosen:
-    """The model that counts.
+    """The selected model.
 
     :param record: the record.
     :param cycles: its whole cycles.
     :param model: the identification.
-    :param driven: the record as the process was driven, with a load that came.
+    :param driven: the record including the load step, if one was found.
     """
 
     record: Record
@@ -251,18 +251,18 @@ class _Chosen:
 
     @property
     def alone(self) -> Analysis:
-        """The analysis that has nothing else."""
+        """The analysis with this model only."""
         return Analysis(self.record, self.cycles, (self.model,), 0)
 
     def simple(self, known: Known, rule: str) -> TransferFunction | None:
-        """Return the FOPDT on which a rule is built, if it is built on one."""
+        """Return the FOPDT for a rule, None if the rule needs none or there is none."""
         if self.model.structure == FOPDT.name:
             return self.model.model
         return None if rule == DEFAULT_RULE else _simple((self.driven,), known, self.model)
 
 
 def _chosen(record: Record, method: str, known: Known) -> _Chosen | Analysis:
-    """Return the model that counts; where there is none, the analysis that says why."""
+    """Return the selected model; without a model, the analysis with the reason."""
     record = thinned(record)
     cycles: tuple[Cycle, ...] = ()
     try:
@@ -285,14 +285,14 @@ def _chosen(record: Record, method: str, known: Known) -> _Chosen | Analysis:
 
 
 def _chosen_so_far(record: Record, method: str, known: Known) -> _Chosen | Analysis:
-    """Return the model that counts while an experiment runs, or why there is none."""
+    """Return the selected model of a running experiment, or the analysis with the reason."""
     chosen = _chosen(record, method, known)
     if isinstance(chosen, Analysis):
-        # What there is not yet is no verdict.
+        # A running experiment without a model is not judged yet.
         return replace(chosen, judgement=NOT_JUDGED)
     if not is_far_off(chosen.model, chosen.record):
         return chosen
-    # Its interval is that of a model which the record contradicts: nothing to end a test on.
+    # The record contradicts this model, so its interval must not end a test.
     model = replace(chosen.model, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
     return replace(chosen, model=model)
 
@@ -306,7 +306,7 @@ def _assessed(
     options: DesignOptions | None,
     rng: np.random.Generator | None,
 ) -> Analysis:
-    """Judge models, the one that counts first, and tune it."""
+    """Judge models, the selected one first, and tune it."""
     record = chosen.record
     found = Analysis(record, chosen.cycles, assess(models, record), 0)
     evidence = Evidence(
@@ -333,10 +333,10 @@ def analyse_jointly(
 ) -> Analysis:
     """Identify one model from several records of a process and, where all were completed, tune.
 
-    :param records: the experiments, at least one; the first stands for all in the result.
+    :param records: the experiments, at least one; the first represents all in the result.
     :param method: one of ``JOINT_METHODS``.
-    :param rule: the rule whose gains count.
-    :param known: what is known of the process beforehand.
+    :param rule: the rule of the recommended gains.
+    :param known: known values of the process.
     :param options: as for :func:`analyse`.
     :param rng: as for :func:`analyse`.
     :raises RelayAutotuneError: if method or rule are unknown.
@@ -360,7 +360,7 @@ def analyse_jointly(
 
 
 def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError) -> Analysis:
-    """Return the analysis of a record that tells no model."""
+    """Return the analysis of a record without a model."""
     reason = _with_outcome(record, str(error))
     return Analysis(record, cycles, reason=reason, judgement=Judgement(refused=reason))
 
@@ -374,7 +374,7 @@ def _judged(
     options: DesignOptions | None,
     rng: np.random.Generator | None,
 ) -> Analysis:
-    """Judge the model, add gains where nothing forbids them, and judge these."""
+    """Judge the model, add gains if they are allowed, and judge the gains."""
     refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")
     findings = judge(MODEL_CHECKS, evidence)
     judgement = Judgement(findings, refused=refused)
@@ -422,7 +422,7 @@ def _first(rule: str) -> tuple[str, ...]:
 def _simple(
     records: Sequence[Record], known: Known, chosen: Identification
 ) -> TransferFunction | None:
-    """Return the FOPDT that fits best, on which most rules are built; None if there is none."""
+    """Return the best FOPDT, which most rules need; None if there is none."""
     if chosen.structure == FOPDT.name:
         return chosen.model
     try:
@@ -433,7 +433,7 @@ def _simple(
 
 
 def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
-    """Add the gains of the rules that apply to the selected model; the first one has to."""
+    """Add the gains of the rules that apply to the selected model; the first rule must apply."""
     try:
         first = design(task, rules[0])
     except TuningError as error:
@@ -443,7 +443,7 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
         try:
             gains.append(design(task, name))
         except TuningError:
-            # A rule that does not apply has nothing to compare.
+            # Skip a rule that does not apply: it is only for comparison.
             continue
     delay = task.options.added_delay
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
@@ -466,7 +466,7 @@ def _task(
 
 
 def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
-    """Take noise, amplitude and sampling period from the record where they are not given."""
+    """Take noise, amplitude and sampling period from the record if they are not given."""
     record, chosen = found.record, found.models[0]
     # The controller will see single samples, not means of many.
     before = record.unthinned
@@ -475,7 +475,7 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
         measured = measured if before is None else before.noise
         options = replace(options, noise_std=measured)
     if math.isnan(options.amplitude):
-        # Of another's experiment, half of what the command moved.
+        # Without relay settings: half of the command's range.
         settings, half = record.settings, 0.5 * float(np.ptp(record.command))
         options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
     if options.sample_period == 0.0 and len(record) > 1:
@@ -485,7 +485,7 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
 
 
 def _describing_point(found: Analysis) -> UltimatePoint | None:
-    """Return what the describing function reads from the limit cycle; None: there is none."""
+    """Return the describing function's ultimate point of the limit cycle; None without cycle."""
     settings = found.record.settings
     if not found.cycles or settings is None:
         return None
@@ -508,7 +508,7 @@ def _guarded(record: Record, method: str, known: Known) -> Identification:
     except RelayAutotuneError:
         raise
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        # A search that meets a number that is not finite says so with a ValueError.
+        # A search raises ValueError when it meets a number that is not finite.
         raise IdentificationError(
             f"{method} broke down on this record, whose numbers it cannot work with: it holds no "
             f"usable response, or this is {defect(error)}"
@@ -518,9 +518,9 @@ def _guarded(record: Record, method: str, known: Known) -> Identification:
 def _others(
     record: Record, method: str, known: Known, chosen: Identification
 ) -> list[Identification]:
-    """Models of the other methods, for comparison; one that does not apply is left out.
+    """Return the models of the other methods that apply, for comparison.
 
-    The first is the FOPDT that fits best, on which most rules are built.
+    The first is the best FOPDT, which most rules need.
     """
     wanted = [(DEFAULT_METHOD, replace(known, structure=FOPDT.name))]
     wanted += [(name, known) for name in METHODS if name not in (method, DEFAULT_METHOD)]

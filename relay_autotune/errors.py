@@ -13,45 +13,45 @@ class RelayAutotuneError(Exception):
 
 
 class ModelError(RelayAutotuneError, ValueError):
-    """A transfer function that cannot be, or cannot do what was asked of it."""
+    """A transfer function is not valid, or does not support the request."""
 
 
 class RecordError(RelayAutotuneError, ValueError):
-    """Recorded data that contradict themselves or hold too little."""
+    """Recorded data are inconsistent or too few."""
 
 
 class ParameterError(RelayAutotuneError, ValueError):
-    """A parameter out of its range, or two that contradict each other."""
+    """A parameter is out of its range, or two contradict each other."""
 
 
 class IdentificationError(RelayAutotuneError, ValueError):
-    """A record from which the method cannot tell a model."""
+    """The method cannot identify a model from the record."""
 
 
 class TuningError(RelayAutotuneError, ValueError):
-    """A rule that does not apply to the model."""
+    """A rule does not apply to the model, or gains are not acceptable."""
 
 
 class BagError(RelayAutotuneError, ValueError):
-    """A recording that cannot be read or written."""
+    """A recording cannot be read or written."""
 
 
 class SelectionError(BagError):
-    """A choice of topics or columns that a recording does not offer, or offers twice."""
+    """A recording does not have the chosen topics or columns, or has them twice."""
 
 
 class MissingPackageError(RelayAutotuneError, ImportError):
-    """A Python package that is needed for this alone and is not installed."""
+    """An optional Python package is needed and not installed."""
 
 
 class LoopError(RelayAutotuneError, RuntimeError):
-    """The nodes of a running loop are not there, or do not answer."""
+    """The nodes of a running loop are missing, or do not answer."""
 
 
 def defect(error: BaseException) -> str:
-    """Return what a user is told of an error that is none of ours: where to look, and who should.
+    """Return the message for an unexpected error: a request to report it, with its place.
 
-    Its own words would mean nothing to a user, and may quote a hostile file.
+    The error's own text would not help a user, and may quote a hostile file.
 
     :param error: the error.
     """

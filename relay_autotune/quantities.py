@@ -35,7 +35,7 @@ class Quantity:
     :param lower: smallest value allowed.
     :param upper: largest value allowed.
     :param open_ended: True if ``lower`` and ``upper`` themselves are not allowed.
-    :param choices: the words it may be, for a text; (): any.
+    :param choices: the allowed words, for a text; (): any text.
     :param flag: its name on the command line; empty: ``name``.
     """
 
@@ -51,7 +51,7 @@ class Quantity:
 
     @property
     def is_number(self) -> bool:
-        """True if one number is the value."""
+        """True if the value is one number."""
         return isinstance(self.default, (int, float)) and not isinstance(self.default, bool)
 
     @property
@@ -81,7 +81,7 @@ class Quantity:
         return ", or NaN where it is not given" if self.default != self.default else ""
 
     def problem(self, value: Any) -> str | None:
-        """Return a sentence on what is wrong with a value, or None if it may be taken."""
+        """Return what is wrong with a value, or None if it is allowed."""
         if self.choices:
             fine = value in self.choices
         elif isinstance(self.default, tuple):

@@ -1,4 +1,4 @@
-"""Fits of one running experiment after another look at it, each no more work than it needs."""
+"""Repeated fits of a running experiment, with as little work as possible."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from relay_autotune.identification.known import NOTHING
 from relay_autotune.record.record import Record
 from relay_autotune.tuning import DEFAULT_RULE, DesignOptions
 
-# The structure is chosen anew at the latest when the record has grown by this share.
+# The structure is chosen again at the latest when the record has grown by this factor.
 _CHOSEN_ANEW = 1.1
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is asked of the fits.
+    """Settings of the fits.
 
-    :param method: the method whose model counts.
-    :param rule: the rule whose gains the predicted Ms is of.
-    :param known: what is known of the process beforehand.
-    :param options: what is asked of the controller.
+    :param method: the method of the selected model.
+    :param rule: the rule of the gains for the predicted Ms.
+    :param known: known values of the process.
+    :param options: design options of the controller.
     """
 
     method: str = DEFAULT_METHOD
@@ -32,11 +32,11 @@ class Task:
 
 
 class RunningFit:
-    """Fit the record of an experiment that still runs, again and again.
+    """Fit the record of a running experiment repeatedly.
 
-    Choosing among all structures takes ten times as long as fitting one. The structure of the
-    last choice is fitted first; where its interval alone is wider than what would end the
-    experiment, the spread between the structures cannot make it narrower, and the choice waits.
+    Choosing among all structures takes ten times as long as fitting one. So the last chosen
+    structure is fitted first. If its interval is already too wide to end the experiment, the
+    spread between the structures would only widen it, and the choice is skipped.
     """
 
     def __init__(self) -> None:
@@ -44,13 +44,13 @@ class RunningFit:
         self._duration = 0.0
 
     def fit(self, record: Record, task: Task, sought: str, wanted: float) -> Analysis:
-        """Return the model of the record so far, and of Ms where that is sought.
+        """Return the model of the record so far, with the predicted Ms if that is sought.
 
-        :param record: of the experiment so far.
-        :param task: what is asked.
-        :param sought: whose interval ends the experiment, one of
+        :param record: the record so far.
+        :param task: settings of the fit.
+        :param sought: the quantity whose interval ends the experiment, one of
             :data:`~relay_autotune.experiment.early_end.SOUGHT`.
-        :param wanted: half its width over the value.
+        :param wanted: half the interval's width over the value.
         :raises RelayAutotuneError: if method or rule are unknown.
         """
         facts = task.known

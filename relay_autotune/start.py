@@ -1,10 +1,9 @@
-"""The start of each executable: what is installed begins here, and loads the rest.
+"""The start of each installed executable; it loads the rest.
 
-Loading takes most of a second, in which there is nothing to tidy up: Ctrl-C ends the process then
-as it ends any program, without a traceback. Python's own way is an exception, which shows up
-wherever an import just was, and which some callbacks of the import system print and pass over.
-Commands ask for that exception once they are at work (`cli.arguments.guarded`), and nodes for
-handlers of their own (`nodes.lifetime.run`).
+Loading takes most of a second, with nothing to clean up. So Ctrl-C ends the process at once then,
+without a traceback. Python's KeyboardInterrupt would appear in the middle of an import, and some
+callbacks of the import system print and ignore it. Commands enable that exception later
+(`cli.arguments.guarded`), and nodes install their own handlers (`nodes.lifetime.run`).
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from importlib import import_module
 def start(module: str) -> int:
     """Load an executable's module and run it.
 
-    :param module: name of one with a function main.
+    :param module: name of a module with a function main.
     :return: the exit status.
     """
-    # The next file that is opened would take the number of an output that was closed, and with it
-    # all that is said there.
+    # If an output is closed, the next opened file would get its number and all its text. So
+    # occupy the numbers up to 2.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)
     sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
-    # One that was started with SIGINT ignored, as by nohup, goes on ignoring it.
+    # A process that was started with SIGINT ignored, as by nohup, keeps ignoring it.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # One that comes in between waits: noted for a handler that is gone, it would be lost.
+        # Block SIGINT during the change: a signal noted for the old handler would be lost.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -42,13 +41,13 @@ def start(module: str) -> int:
 
 
 def command(module: str) -> int:
-    """Start a command that takes no part in a ROS graph.
+    """Start a command that is not part of a ROS graph.
 
-    :param module: name of one with a function main.
+    :param module: name of a module with a function main.
     :return: the exit status.
     """
-    # As the interpreter ends, the collector would search all that was imported, for nothing, which
-    # takes 70 ms. Nodes leave it to do so: it gives back what rclpy holds.
+    # Without this, the garbage collector would search all imported objects at the end, for 70 ms.
+    # Nodes need that search, because it frees the objects of rclpy.
     atexit.register(gc.freeze)
     return start(module)
 

@@ -1,7 +1,7 @@
 """Pin the linear algebra to one thread; import this before numpy.
 
-The order in which several threads add depends on their number, and with it the last digits of
-a fit. Live and replay both import this first, so that they give the same numbers.
+The order of additions depends on the number of threads, and with it the last digits of a fit.
+Live nodes and replay both import this first, so that they give the same numbers.
 """
 
 import os

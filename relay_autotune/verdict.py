@@ -1,4 +1,4 @@
-"""What is said of an experiment: one finding for each check, and one verdict from all of them."""
+"""The judgement of an experiment: one finding for each check, and one verdict from all."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Verdict(enum.IntEnum):
     """Whether gains may be used; the values are those of TransferFunction.msg and PidGains.msg.
 
-    TRUSTED: every check passed. DOUBTFUL: there are gains, and something to look at first. NONE:
-    there are no gains. UNKNOWN: nobody has judged, as while an experiment runs.
+    TRUSTED: every check passed. DOUBTFUL: there are gains, but check a warning first. NONE: there
+    are no gains. UNKNOWN: not judged, as while an experiment runs.
     """
 
     UNKNOWN = 0
@@ -29,7 +29,7 @@ class Verdict(enum.IntEnum):
 
 
 class Result(enum.IntEnum):
-    """What came of one check, the better the smaller."""
+    """Result of one check; smaller is better."""
 
     PASSED = 0
     DOUBTFUL = 1
@@ -38,10 +38,10 @@ class Result(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Measured:
-    """What a check measured on one experiment.
+    """Measurement of a check on one experiment.
 
     :param value: in the check's unit; NaN counts as beyond every limit.
-    :param detail: what more the sentence has to say, such as names; it stands for ``{detail}``.
+    :param detail: further text for the sentence, such as names; it replaces ``{detail}``.
     """
 
     value: float
@@ -50,18 +50,18 @@ class Measured:
 
 @dataclass(frozen=True)
 class Check:
-    """One row of the table of checks. A larger number is always the worse one.
+    """One row of the table of checks. A larger number is always worse.
 
-    :param name: in documents and tests.
-    :param title: for people.
-    :param what: what is measured, for the guide.
-    :param unit: of the number; "" for a pure number.
+    :param name: name in documents and tests.
+    :param title: title for people.
+    :param what: the measured quantity, for the guide.
+    :param unit: unit of the number; "" for a pure number.
     :param doubtful: the result is doubtful above this number; inf: never.
     :param failed: there are no gains above this number; inf: never.
-    :param sentence: what is said of a result that did not pass; ``{value}``, ``{limit}`` and
+    :param sentence: text for a result that did not pass; ``{value}``, ``{limit}`` and
         ``{detail}`` are filled in.
     :param remedy: what to do then.
-    :param measure: measures it; None: it does not apply to this experiment.
+    :param measure: returns the number; None if the check does not apply to the experiment.
     """
 
     name: str
@@ -100,16 +100,16 @@ class Check:
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """Finding of one check.
 
-    :param name: of the check.
-    :param title: of the check, for people.
-    :param what: what was measured.
+    :param name: name of the check.
+    :param title: title of the check, for people.
+    :param what: the measured quantity.
     :param value: the measured number; NaN: it could not be computed.
     :param unit: of value and limit; "" for pure numbers.
-    :param limit: what the number may be at most; where the check failed, the limit of that.
-    :param result: what came of it.
-    :param sentence: what a result that did not pass means; empty: it passed.
+    :param limit: largest allowed number: that for failure if the check failed, else for doubt.
+    :param result: result of the check.
+    :param sentence: meaning of a result that did not pass; empty: it passed.
     :param remedy: what to do then.
     """
 
@@ -125,16 +125,16 @@ class Finding:
 
     @property
     def said(self) -> str:
-        """What was found and what to do, in one sentence."""
+        """Finding and remedy in one sentence."""
         return f"{self.sentence}: {self.remedy}"
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What all checks found, and whether the gains may be used.
+    """Findings of all checks, and whether the gains may be used.
 
-    :param findings: of the checks that apply, in the order of the table.
-    :param refused: why there are no gains whatever the checks say; empty: nothing forbids them.
+    :param findings: findings of the checks that apply, in the order of the table.
+    :param refused: why there are no gains, independent of the checks; empty: gains are allowed.
     :param judged: False: no check was made, as while an experiment runs.
     """
 
@@ -155,7 +155,7 @@ class Judgement:
 
     @property
     def verdict(self) -> Verdict:
-        """What all of it comes to."""
+        """The verdict from all findings."""
         if not self.judged:
             return Verdict.UNKNOWN
         if self.refused or self.contradicted:
@@ -164,7 +164,7 @@ class Judgement:
 
     @property
     def reason(self) -> str:
-        """Why the verdict is not better, what to look at, in one sentence; empty: trusted."""
+        """Why the verdict is not better and what to do, in one sentence; empty: trusted."""
         if self.refused:
             return self.refused
         worst = self.worst
@@ -175,18 +175,18 @@ NOT_JUDGED = Judgement(judged=False)
 
 
 def judge(checks: Sequence[Check], evidence: Evidence) -> tuple[Finding, ...]:
-    """Return what the checks of a table find, without those that do not apply.
+    """Return the findings of the checks that apply.
 
     :param checks: rows of the table.
-    :param evidence: the experiment with what was made of it.
+    :param evidence: the experiment with its analysis.
     """
     return tuple(found for check in checks if (found := check(evidence)) is not None)
 
 
 def verdict_named(name: str) -> Verdict:
-    """Return the verdict that a document names.
+    """Return the verdict with a name.
 
-    :raises ParameterError: if there is none of that name.
+    :raises ParameterError: if the name is unknown.
     """
     try:
         return Verdict[name.upper()]

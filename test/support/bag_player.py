@@ -1,8 +1,8 @@
 """Publish a bag's messages at their times, as `ros2 bag play` does: `bag_player.py BAG RATE`.
 
-It stands in for that command where only the wheels of rclpy are installed. Messages go out with
-the bytes that were recorded, on their topics, in the order and at the distances of their log
-times divided by the rate, once each topic has as many subscribers as the third argument says.
+It replaces that command where only the wheels of rclpy are installed. It publishes the recorded
+bytes on their topics, in order of their log times, with the intervals divided by the rate. It
+starts once each topic has as many subscribers as the third argument says.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
         time.sleep(max(0.0, begin + (stamp - first) / 1e9 / rate - time.monotonic()))
         publishers[channel].publish(message)
     while True:
-        # What is latched stays until the test has seen it.
+        # Stay alive, so that latched messages remain available to the test.
         rclpy.spin_once(node, timeout_sec=1.0)
 
 

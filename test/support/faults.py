@@ -1,4 +1,4 @@
-"""What can go wrong in a tune, each with the loop in which it is made and the reason expected."""
+"""The faults of a tune, each with the loop that makes it and the expected reason."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ OTHER_SIGNALS = (
 Undo = Callable[[], object]
 Cause = Callable[[Loop, Random], "Undo | None"]
 
-# An amplitude that finds itself.
+# Parameters with which the tune finds the amplitude itself.
 FINDS = {"amplitude": 0.0, "command_min": 0.0, "command_max": 10.0}
 
 
@@ -54,9 +54,9 @@ FINDS = {"amplitude": 0.0, "command_min": 0.0, "command_max": 10.0}
 class Fault:
     """A fault.
 
-    :param course: makes it once, sees that all is as it must be, and returns the time from the
-        cause to the arrival of the safe command [s]; raises AssertionError otherwise.
-    :param kind: of the loop that it needs.
+    :param course: causes the fault once, checks the end, and returns the time from the cause to
+        the arrival of the safe command [s]; raises AssertionError if a check fails.
+    :param kind: kind of the loop that it needs.
     """
 
     course: Callable[[Loop, Random], float]
@@ -68,11 +68,11 @@ def in_a_tune(
 ) -> Fault:
     """Return a fault that ends a tune with a reason.
 
-    :param cause: makes it; returns what undoes it, None: the loop's reset does.
-    :param said: what the reason has to contain.
-    :param kind: of the loop.
-    :param at_start: True: it is there from the start, False: from a random moment on.
-    :param parameters: of the relay, besides the usual ones.
+    :param cause: causes the fault; returns the function that undoes it, None: the loop's reset.
+    :param said: text that the reason must contain.
+    :param kind: kind of the loop.
+    :param at_start: True: the fault exists from the start; False: from a random moment on.
+    :param parameters: parameters of the relay, besides the usual ones.
     """
 
     def course(loop: Loop, random: Random) -> float:
@@ -98,9 +98,9 @@ def in_a_tune(
 def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
     """Return a fault with which the process of relay_node ends.
 
-    :param code: a Python text in the place of the executable; "": none.
+    :param code: Python code instead of the executable; "": the executable.
     :param number: signal that ends it; 0: it ends by itself.
-    :param said: what the reason has to contain.
+    :param said: text that the reason must contain.
     :param status: its exit status.
     """
 
@@ -122,7 +122,7 @@ def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
 
 
 def any_other_signal(loop: Loop, random: Random) -> float:
-    """Send a signal that would end a process that has not asked for it."""
+    """Send a signal that ends a process without a handler."""
     number = random.choice(OTHER_SIGNALS)
     name = f"SIGRTMIN+{number - signal.SIGRTMIN}"
     if number in set(signal.Signals):
@@ -131,10 +131,10 @@ def any_other_signal(loop: Loop, random: Random) -> float:
 
 
 def ended_by_itself(loop: Loop, began: float, said: str, status: int) -> float:
-    """See that relay_node ends its tune and itself; return the time since the cause [s].
+    """Check that relay_node ends its tune and itself; return the time since the cause [s].
 
-    :param began: when the cause was.
-    :param said: what the reason has to contain.
+    :param began: time of the cause.
+    :param said: text that the reason must contain.
     :param status: its exit status.
     """
     taken = until_safe(loop, began)
@@ -148,17 +148,17 @@ def ended_by_itself(loop: Loop, began: float, said: str, status: int) -> float:
     return taken
 
 
-# Where a node may write: what makes it, and returns the end for the node and the other end.
+# Outputs for a node: each function returns the node's end and the other end.
 
 
 def terminal() -> tuple[int, int]:
-    """Return a terminal for a node, and the window that shows it."""
+    """Return a terminal for a node, and its controlling end."""
     window, inside = pty.openpty()
     return inside, window
 
 
 def small_pipe() -> tuple[int, int]:
-    """Return a pipe that is soon full."""
+    """Return a pipe that fills up soon."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     return writer, reader
@@ -182,10 +182,10 @@ def output_not_taken(
     make: Callable[[], tuple[int, int]],
     stop: Callable[[int], object] = lambda _: None,
 ) -> float:
-    """Let nobody take what relay_node says: a tune goes on, and is ended as ever.
+    """Stop reading relay_node's output: the tune must go on and end as usual.
 
     :param make: makes the two ends of its output.
-    :param stop: stops the other end from taking more.
+    :param stop: stops the other end from reading.
     """
     output, other = make()
     replace_relay(loop, output=output)
@@ -194,7 +194,7 @@ def output_not_taken(
         loop.tune()
         wait_for_a_moment(loop, random)
         stop(other)
-        # Each refusal is a line of the log; all of them are more than a pipe holds.
+        # Each refusal is a line of the log; together they are more than a pipe holds.
         for _ in range(40):
             assert not loop.rig.ask_for_tune().accepted
         count = loop.switches
@@ -221,7 +221,7 @@ def have_relay(loop: Loop) -> None:
 
 
 def replace_relay(loop: Loop, code: str = "", output: int | None = None) -> None:
-    """Start a relay_node, or a Python text in its place, once there is none any more."""
+    """Start a relay_node, or Python code instead, after the previous one has gone."""
     if loop.process is not None:
         loop.process.end()
     node = loop.rig.node
@@ -239,7 +239,7 @@ def wait_for_a_moment(loop: Loop, random: Random) -> None:
 
 def until_safe(loop: Loop, began: float) -> float:
     """Wait for the safe command to end the tune; return the time since the cause [s]."""
-    # A command of before the start may be the same.
+    # A command from before the start may have the same value.
     loop.rig.until(
         lambda: loop.commands[-1] == SAFE and len(loop.commands) > 5, "the safe command"
     )
@@ -247,7 +247,7 @@ def until_safe(loop: Loop, began: float) -> float:
 
 
 def altered(change: Callable[[Loop, float], float | None]) -> Callable[[Loop, Random], None]:
-    """Return a cause that changes what the sensor says."""
+    """Return a cause that changes the sensor's values."""
 
     def cause(loop: Loop, _: Random) -> None:
         loop.alter = lambda y: change(loop, y)
@@ -272,7 +272,7 @@ def wrong_sign(loop: Loop, _: Random) -> None:
 
 
 def before_a_cycle(loop: Loop, random: Random) -> None:
-    """Let the sensor say no more once the process has followed the relay, before a whole cycle."""
+    """Silence the sensor after the process has followed the relay, before a whole cycle."""
     # Within the dead time no further switch can come.
     samples = random.randint(0, 9)
 
@@ -287,7 +287,7 @@ def before_a_cycle(loop: Loop, random: Random) -> None:
 
 
 def silent_in_a_cycle(loop: Loop, _: Random) -> None:
-    """Let the sensor say no more after a whole cycle, from which its silence is judged."""
+    """Silence the sensor after a whole cycle, from which on its silence is judged."""
     loop.rig.until(lambda: loop.cycles, "a whole cycle")
     loop.alter = lambda _: None
 
@@ -298,7 +298,7 @@ def sensor_leaves(loop: Loop, _: Random) -> Callable[[], None]:
 
 
 def growing(loop: Loop, random: Random) -> None:
-    """Let each swing be larger than the one before, by the same factor."""
+    """Make each swing larger than the one before, by the same factor."""
     factor, seen, scale = random.uniform(1.2, 1.4), len(loop.commands), 1.0
 
     def grown(y: float) -> float:
@@ -318,7 +318,7 @@ def clock_step(size: float) -> Callable[[Loop, Random], None]:
 
 
 def second_publisher(topic: str) -> Cause:
-    """Return a cause that is one more publisher of a topic."""
+    """Return a cause that adds a publisher to a topic."""
 
     def cause(loop: Loop, _: Random) -> Callable[[], None]:
         other = loop.rig.node.create_publisher(Float64, topic, 10)
@@ -328,7 +328,7 @@ def second_publisher(topic: str) -> Cause:
 
 
 def second_node(loop: Loop, _: Random) -> Callable[[], None]:
-    """Let there be a node more that is called as the relay is."""
+    """Add a second node with the relay's name."""
     other = Node("relay_node", context=loop.rig.context, start_parameter_services=False)
     return other.destroy_node
 
@@ -339,16 +339,16 @@ def clock_stands(loop: Loop, _: Random) -> None:
 
 def abort(loop: Loop, _: Random) -> None:
     answer = loop.rig.call(Trigger, "relay_node/abort", Trigger.Request())
-    # A busy listener may acknowledge later than relay_node waits for it; whether the command has
-    # arrived is seen at the end.
+    # A busy listener may acknowledge too late for relay_node; the end of the test checks whether
+    # the command has arrived.
     assert answer.success
     assert "the safe command" in answer.message
 
 
 def actuator(loop: Loop, random: Random) -> float:
-    """Tell the position of an actuator, which then stays where it is.
+    """Publish the position of an actuator, which then stops moving.
 
-    The amplitude is given or finds itself, and the position may first be told within the tune.
+    The amplitude is given or not, and the first position may come during the tune.
     """
     stuck, node = False, loop.rig.node
     ends: list[Any] = []
@@ -388,7 +388,7 @@ def actuator(loop: Loop, random: Random) -> float:
 
 
 def controller(loop: Loop, random: Random, *, in_tune: bool) -> float:
-    """Play a controller that falls silent, in a tune or while it is passed through."""
+    """Play a controller that becomes silent, in a tune or while it is passed through."""
     wanted, speaking = random.uniform(1.2, 1.3), True
     publisher = loop.rig.node.create_publisher(Float64, "controller_command", 10)
     timer = loop.rig.node.create_timer(
@@ -397,7 +397,7 @@ def controller(loop: Loop, random: Random, *, in_tune: bool) -> float:
     try:
         have_relay(loop)
         loop.set(**DEFAULTS)
-        # Idle, it is passed through untouched.
+        # Without a tune, its commands are passed through unchanged.
         loop.rig.until(lambda: loop.commands and loop.commands[-1] == wanted, "the controller")
         if in_tune:
             loop.tune()

@@ -1,8 +1,8 @@
-"""A loop about a relay_node that is played by its user, fast enough for a fault in half a second.
+"""A simulated loop around a relay_node, fast enough for a fault in half a second.
 
-The process is of first order with dead time, and goes on while the machine is busy. The relay is a
-process of its own. The loop's kinds differ in the message types, in what tells the time of a
-sample, and in when the sensor speaks.
+The process is of first order with dead time. The relay runs in another process of the machine. The
+kinds of loop differ in the message types, in the source of a sample's time, and in when the sensor
+publishes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ RELAY = {
     "min_cycles": 100,
     "process_gain_sign": 1,
 }
-# What a fault may change of the parameters, as it is without.
+# Default values of the parameters that a fault may change.
 DEFAULTS = {
     "amplitude": 0.5,
     "target_amplitude": 0.0,
@@ -53,7 +53,7 @@ DEFAULTS = {
     "max_deviation": 0.0,
     "max_duration": 0.0,
     "max_half_cycle": 0.0,
-    # In this order they never cross.
+    # Set in this order, min_cycles never exceeds max_cycles.
     "max_cycles": 100,
     "min_cycles": 100,
 }
@@ -66,7 +66,7 @@ KINDS: dict[str, dict[str, Any]] = {
         "command_type": "std_msgs/msg/Float64MultiArray",
     },
     "clock": {"use_sim_time": True, "command_type": "std_msgs/msg/Float32"},
-    # 20 repetitions are the silence for which a busy machine may keep this loop waiting.
+    # A busy machine may delay this loop for as long as 20 repetitions.
     "on change": {"repeat_period": 0.025},
 }
 _COMMANDS: dict[str, tuple[Any, Callable[[Any], float]]] = {
@@ -75,7 +75,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], float]]] = {
     "clock": (Float32, lambda message: message.data),
     "on change": (Float64, lambda message: message.data),
 }
-# A sensor that speaks on change has this resolution, and a process that much slower.
+# A sensor that publishes on change has this resolution, and a slower process by this factor.
 _RESOLUTION, _SLOWER = 0.01, 2.0
 _CLOCK_START = 100.0
 
@@ -88,9 +88,9 @@ _TYPES = {
 
 
 class Loop:
-    """The process on the topics, and what the relay does to it.
+    """The process on the topics, and a record of the relay's messages.
 
-    :param rig: where the relay runs.
+    :param rig: the rig that runs the relay.
     :param kind: one of `KINDS`.
     """
 
@@ -119,20 +119,20 @@ class Loop:
     # The process.
 
     def sensor_comes(self) -> None:
-        """Let there be a sensor."""
+        """Create the sensor's publisher."""
         kind = RelayCycle if self.kind == "stamped" else Float64
-        # What is said only once has to stay for a relay that comes later.
+        # A value published only on change must be latched for a relay that starts later.
         profile = LATCHED if self.speaks_on_change else 100
         self.publisher = self.rig.node.create_publisher(kind, "measurement", profile)
         self.said = math.nan
 
     def sensor_leaves(self) -> None:
-        """Let the sensor's end of the topic be gone."""
+        """Remove the sensor's publisher."""
         self.rig.node.destroy_publisher(self.publisher)
         self.publisher = None
 
     def reset(self) -> None:
-        """Bring the process to rest, and undo what a fault has changed of it."""
+        """Bring the process to rest, and undo the changes of a fault."""
         self.state, self.gain = 0.0, 2.0
         self.alter: Callable[[float], float | None] = lambda y: y
         self.clock_error = 0.0
@@ -148,7 +148,7 @@ class Loop:
         if self.stuck_at is not None:
             command = self.stuck_at
         if command == SAFE:
-            # The next tune begins at rest at the baseline.
+            # The next tune must begin at rest at the baseline.
             command = BASELINE
         self.on_the_way.append((self.now + DEAD_TIME * self.slower, command - BASELINE))
         while self.on_the_way[1][0] <= self.now:
@@ -167,7 +167,7 @@ class Loop:
         self.publish(float(y))
 
     def stick(self) -> None:
-        """Let the actuator stay where it is until :meth:`release`."""
+        """Keep the actuator at its position until :meth:`release`."""
         self.stuck_at = self.commands[-1]
 
     def release(self) -> None:
@@ -196,9 +196,9 @@ class Loop:
     # The relay.
 
     def start(self, code: str = "", output: int | None = None) -> Process:
-        """Start a relay_node, or a Python text in its place.
+        """Start a relay_node, or Python code instead.
 
-        :param output: where it writes, a pipe or a terminal; None: to its log.
+        :param output: its output, a pipe or a terminal; None: its log.
         """
         parameters = {**RELAY, **KINDS[self.kind]}
         if code:
@@ -210,7 +210,7 @@ class Loop:
         return self.process
 
     def set(self, **values: Any) -> None:
-        """Set parameters of the relay, where they are not so already."""
+        """Set the parameters of the relay that differ."""
         changed = {k: v for k, v in values.items() if self.values.get(k) != v}
         if not changed:
             return
@@ -226,10 +226,10 @@ class Loop:
         self.values.update(changed)
 
     def begin(self) -> None:
-        """Bring all to the state before a tune, and remember what came before it."""
+        """Restore the state before a tune, and clear the messages of the last one."""
         self.reset()
         del self.experiments[:], self.status[:], self.gains[:], self.cycles[:]
-        # The first tune begins like those that follow another one.
+        # The first tune must begin like the later ones.
         self.commands[:] = self.commands[-1:] or [SAFE]
 
     def tune(self) -> Any:
@@ -238,8 +238,8 @@ class Loop:
 
     @property
     def switches(self) -> int:
-        """Number of switches of the relay that have come; below zero before the kick."""
-        # To the baseline and to the kick's level before the first switch.
+        """Number of switches of the relay so far; below zero before the kick."""
+        # The changes to the baseline and to the kick's level are no switches.
         return sum(a != b for a, b in itertools.pairwise(self.commands)) - 2
 
     def until_it_oscillates(self, switches: int = 5) -> None:
@@ -254,7 +254,7 @@ class Loop:
         return any(text in s.message for m in self.status[-3:] for s in m.status)
 
     def check_the_end(self, said: str, safe: float = SAFE) -> Any:
-        """See that a tune ended with a reason, safely and for good; return its record."""
+        """Check that a tune ended safely and with a reason; return its record."""
         ended = self.ended()
         assert said in ended.reason, ended.reason
         assert ended.outcome in (RelayExperiment.ABORTED, RelayExperiment.FAILED)
@@ -264,7 +264,7 @@ class Loop:
         return ended
 
     def check_that_it_stays(self, safe: float = SAFE) -> None:
-        """See that each further measurement is answered with the safe command."""
+        """Check that each further measurement is answered with the safe command."""
         self.reset()
         count = len(self.commands)
         self.rig.until(lambda: len(self.commands) > count + 5, "commands after the tune")

@@ -1,4 +1,4 @@
-"""Work for other processes, which can import it from here."""
+"""Jobs for worker processes, in a module that they can import."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from relay_autotune.cli.replay_bag import Done, Job
 
 
 def mark(job: Job) -> Done:
-    """Leave a mark for each time a job is done."""
+    """Leave a mark at each run of a job."""
     with (Path(job.paths[0]) / job.name).open("a") as file:
         file.write("x")
     return Done(job.name, 0, (), "{}")
@@ -24,7 +24,7 @@ def die_of_bag_3(job: Job) -> Done:
 
 
 def die_once(job: Job, number: int) -> Done:
-    """Take a worker down in the middle of a job, the first time that it is done."""
+    """Kill the worker in the middle of a job, at its first run."""
     flag = Path(job.paths[0]) / "died"
     if job.name == f"bag{number}" and not flag.exists():
         flag.touch()
@@ -34,7 +34,7 @@ def die_once(job: Job, number: int) -> Done:
 
 
 def wait_for_ever(job: Job) -> Done:
-    """Do the first job, tell which process works on the next, and never come back."""
+    """Do the first job, report the process of the next one, and never return."""
     if job.name == "bag0":
         return mark(job)
     (Path(job.paths[0]) / f"{job.name}.pid").write_text(str(os.getpid()))

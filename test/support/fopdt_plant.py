@@ -1,7 +1,7 @@
-"""A first-order process with dead time by its closed form: a truth of the tests' own.
+"""A first-order process with dead time in closed form, as independent truth for the tests.
 
-Between changes of the delayed input, y(t) = K u + (y(t0) - K u) exp(-(t - t0)/tau). It shares
-nothing with the package.
+Between changes of the delayed input, y(t) = K u + (y(t0) - K u) exp(-(t - t0)/tau). It shares no
+code with the package.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def wang_limit_cycle(gain, time_constant, dead_time, amplitude, bias, hysteresis
 
 
 def run(experiment, plant, period, *, noise=None, offset=0.0, samples=200_000):
-    """Feed an experiment from a plant until it ends, or so many samples; return their number.
+    """Feed an experiment from a plant until it ends; return the number of samples.
 
-    :param noise: called for each sample, returns what to add to it.
+    :param noise: called for each sample, returns the noise to add.
     :param offset: measurement at rest.
     """
     command = experiment.safe_command

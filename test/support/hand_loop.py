@@ -1,4 +1,4 @@
-"""A controller_node in a loop that the test steps by hand, sample by sample, with its stamps."""
+"""A controller_node in a loop that the test steps sample by sample, with its own stamps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class HandLoop:
 
     :param rig: the rig.
     :param gain: static gain of the process [y/u].
-    :param parameters: further ones of controller_node.
+    :param parameters: further parameters of controller_node.
     """
 
     def __init__(self, rig: Rig, gain: float = 2.0, **parameters: Any) -> None:
@@ -72,7 +72,7 @@ class HandLoop:
         self.command = self.commands[-1].data
 
     def say(self, value: float, later: float = PERIOD) -> None:
-        """Publish a measurement, so much later than the last."""
+        """Publish a measurement, ``later`` seconds after the last one."""
         self.time += later
         message = Temperature(temperature=value)
         message.header.stamp.sec = int(self.time)
@@ -80,14 +80,14 @@ class HandLoop:
         self.sensor.publish(message)
 
     def answer_to(self, value: float, later: float = PERIOD) -> float:
-        """Return the command that answers a measurement."""
+        """Publish a measurement and return the command that answers it."""
         before = len(self.commands)
         self.say(value, later)
         self.rig.until(lambda: len(self.commands) > before, "a command")
         return float(self.commands[-1].data)
 
     def step(self, count: int = 1, later: float = PERIOD) -> None:
-        """Go on by samples, whose stamps may go otherwise than the process."""
+        """Advance by samples, whose stamps may differ from the process's time."""
         for _ in range(count):
             self.elapsed += PERIOD
             away = self.process.advance(self.elapsed, self.command - COMMAND)
@@ -105,7 +105,7 @@ class HandLoop:
         self.gains.publish(gains)
 
     def offer(self, kc: float, ti: float, name: str, gain: float = 2.0) -> None:
-        """Publish them and wait until they have come."""
+        """Publish them and wait until the node has received them."""
         self.publish(kc, ti, name, gain)
         self.rig.until(lambda: f"gains of {name}" in self.node.log, "the gains")
 

@@ -1,8 +1,8 @@
-"""Random histories of a relay experiment: what may happen to a loop, at any moment, for any time.
+"""Random histories of a relay experiment: events of any kind, at any time, of any length.
 
-A history has a process, parameters and one to four happenings. Each happening has its own moment
-and its own length, from a fraction of the process's period to hundreds of them. A history has to
-end within a bound that is known before it begins; see :func:`bound`.
+A history has a process, parameters and one to four events. Each event has its own begin and its
+own length, from a fraction of the process's period to hundreds of periods. A history must end
+within a bound that is known before it begins; see :func:`bound`.
 """
 
 from __future__ import annotations
@@ -26,22 +26,21 @@ HAPPENINGS = (
     *("stuck actuator", "weak actuator", "gap", "load", "clock ahead", "clock back"),
     *("repeated samples", "lost samples", "swapped samples", "silent sensor", "spike"),
 )
-# These last until the end in one of so many cases.
+# One in this many events lasts until the end.
 _FOR_GOOD = 8
-# The bound holds so many times an amplitude that finds itself may grow, and a sign that turns out
-# to be the other one.
+# Reserve of the bound for the growth of an amplitude that is not given, and for a reversed sign.
 _GROWTHS = 20
 # Samples at rest before the kick.
 SETTLING = 56
 
 
 class Lags:
-    """A process in discrete time: a dead time, equal lags, and an integrator or none.
+    """A process in discrete time: a dead time, lags, and possibly an integrator.
 
     :param gain: static gain [y/u], or per sample for an integrator.
     :param lags: their time constants [samples].
     :param dead_time: [samples].
-    :param integrates: True: the last of it sums up.
+    :param integrates: True: an integrator follows the lags.
     """
 
     def __init__(
@@ -113,13 +112,13 @@ LIMITS = {name: _limit_cycle(name) for name in PROCESSES}
 
 @dataclass
 class Happening:
-    """What happens to a loop from a sample on, for so many samples.
+    """An event in a loop, from a sample on, for a number of samples.
 
     :param kind: one of HAPPENINGS.
     :param begin: first sample.
-    :param length: how many; a step of a clock has none.
-    :param size: of a load [u], of a step of a clock [sample intervals], of a spike [y], of what is
-        lost or repeated, as a share of the samples.
+    :param length: number of samples; not used for a step of a clock.
+    :param size: size of a load [u], of a step of a clock [sample intervals], of a spike [y]; for
+        lost or repeated samples, their share.
     """
 
     kind: str
@@ -135,7 +134,7 @@ class Happening:
 class History:
     """One history, drawn from a seed and run to its end.
 
-    :param seed: of everything random in it.
+    :param seed: seed of all its random numbers.
     """
 
     seed: int
@@ -143,7 +142,7 @@ class History:
     given: dict[str, Any] = field(default_factory=dict)
     happenings: list[Happening] = field(default_factory=list)
     samples: int = 0
-    """How many the experiment was fed with after the last of its settling."""
+    """Number of samples given to the experiment after its settling."""
     tune: RelayExperiment = field(init=False)
 
     def __post_init__(self) -> None:
@@ -197,13 +196,13 @@ class History:
                 size = float(rng.normal()) * self.limit.swing * 10.0 ** rng.uniform(-1.0, 3.0)
                 length = int(rng.integers(1, 4))
         if kind in ("gap", "silent sensor"):
-            # The watchdog on a sensor that says nothing is the node's.
+            # The node, and not the experiment, watches for a silent sensor.
             length = min(length, 100 * period)
         return Happening(kind, begin, length, size)
 
     @property
     def bound(self) -> int:
-        """The most samples that it may take after the settling; see docs/safety.md.
+        """Largest number of samples after the settling; see docs/safety.md.
 
         With P the longest stay of the relay: no longer than the disturbances last together, and
         than half a period of a relay as unequal as this one. A cycle takes two of them, and one
@@ -223,14 +222,14 @@ class History:
         return int(turns * (2.0 * stay + max(OVERDUE * stay, OVERDUE_SAMPLES)) + patience + kick)
 
     def _lasts(self, happening: Happening) -> float:
-        """Return for how long a disturbance is felt [samples]; one for good is a new process."""
+        """Return the duration of a disturbance's effect [samples]; 0 for a permanent one."""
         if happening.kind in ("gap", "clock ahead"):
             longest = happening.size if happening.kind == "clock ahead" else happening.length
             return min(longest, GAP)
         return 0.0 if happening.length >= 10**9 else min(float(happening.length), 1e6)
 
     def run(self) -> RelayExperiment:
-        """Run it until it ends, or until the bound is passed."""
+        """Run the history until it ends, or exceeds the bound."""
         rng, tune, period = self._rng, self.tune, self.period
         command, last, ahead, held = 0.0, math.nan, 0.0, math.nan
         late: tuple[float, float] | None = None
@@ -261,7 +260,7 @@ class History:
             if repeated:
                 command = tune.repeat(at, last)
             elif "swapped samples" in kinds and late is None and rng.uniform() < 0.3:
-                # It comes after the next one.
+                # Deliver it after the next sample.
                 late = (at, y)
                 continue
             else:
@@ -280,7 +279,7 @@ class History:
 
     @property
     def problem(self) -> str:
-        """What is not as it must be, after :meth:`run`; empty: nothing."""
+        """The violated requirement after :meth:`run`; empty: all is right."""
         tune = self.tune
         if not tune.finished:
             return f"it goes on after {self.samples} samples, the bound is {self.bound}"

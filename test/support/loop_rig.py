@@ -1,4 +1,4 @@
-"""A loop of installed executables as processes over DDS, and a node that looks on."""
+"""A loop of installed executables as processes over DDS, and a node that observes it."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ LATCHED = QoSProfile(
 )
 RELIABLE = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
 
-# A machine that is busy with other things needs patience; a passing test does not wait for it.
+# Deadline for a busy machine; a passing test does not wait for it.
 PATIENCE = 30.0
 
 
 class Process:
-    """One executable, its log, and what it leaves behind."""
+    """One executable, its log, and its leftover shared memory."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class Process:
         self.name = name
         self.log_path = log
         self.segments: set[Path] = set()
-        # A terminal becomes its own.
+        # A terminal becomes the controlling terminal of the process.
         own = output is not None and os.isatty(output)
         with log.open("wb") as file:
             self._process = subprocess.Popen(
@@ -92,7 +92,7 @@ class Process:
 
 
 class Rig:
-    """Starts executables in a domain of its own, and ends all that it started."""
+    """Start executables in a domain of their own, and end all of them."""
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.domain = domain
@@ -120,10 +120,10 @@ class Rig:
     ) -> Process:
         """Start an installed executable with parameters and further ROS arguments.
 
-        :param output: what takes the place of its log, a pipe or a terminal; None: nothing does.
+        :param output: its output, a pipe or a terminal; None: its log.
         """
         if executable == "controller_node":
-            # What one test proves is not for the next one.
+            # Each test has its own folder: gains proven in one must not affect the next.
             parameters.setdefault("record_directory", str(self.records))
         return self._launch(executable, [_path(executable)], arguments, parameters, output)
 
@@ -132,7 +132,7 @@ class Rig:
         return self._begin(executable, [_path(executable), *words], output)
 
     def start_python(self, name: str, code: str, **parameters: Any) -> Process:
-        """Start a Python text in the place of an executable."""
+        """Start Python code instead of an executable."""
         return self._launch(name, [sys.executable, "-c", code], (), parameters)
 
     def _launch(
@@ -164,10 +164,10 @@ class Rig:
     def identifier(self, **parameters: Any) -> Process:
         return self.start("identifier_node", **parameters)
 
-    # Looking on.
+    # Observing.
 
     def listen(self, topic: str, kind: Any, qos: QoSProfile = LATCHED) -> list[Any]:
-        """Return a list into which the messages of a topic come."""
+        """Return a list that collects the messages of a topic."""
         messages: list[Any] = []
         self.node.create_subscription(kind, topic, messages.append, qos)
         return messages
@@ -185,7 +185,7 @@ class Rig:
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call a service and return its answer."""
-        # To find a service takes longer than to call it.
+        # Keep the client: discovery takes longer than the call.
         client = self.clients.get(name)
         if client is None:
             client = self.clients[name] = self.node.create_client(kind, name)
@@ -204,8 +204,8 @@ class Rig:
             answer = self.ask_for_tune(**request)
             if answer.accepted:
                 return answer
-            # Nothing else may keep a tune from starting here; who has left another test's topic
-            # may stay in the graph for a moment.
+            # Only these reasons may delay a start: an ended node of another test may stay in the
+            # graph for a moment.
             transient = (
                 "no measurement", "no command", "use_sim_time", "/command is also",
                 "/measurement is published by", "2 nodes have the name",
@@ -217,7 +217,7 @@ class Rig:
         return self.until(accepted, "start of a tune")
 
     def run_for(self, seconds: float) -> None:
-        """Take messages for a while, where the absence of something is to be seen."""
+        """Take messages for a time, to check that something does not happen."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             self.executor.spin_once(timeout_sec=0.02)
@@ -229,7 +229,7 @@ class Rig:
         return "\n".join(f"--- {p.log_path.name}\n{p.log[-4000:]}" for p in self.processes)
 
     def close(self) -> None:
-        """End every process, then the onlooker, and remove what killed ones left behind."""
+        """End every process, then the observer, and remove the leftovers of killed processes."""
         for process in self.processes:
             if process.running:
                 process.signal(signal.SIGTERM)

@@ -22,7 +22,7 @@ START = 1_790_000_000_000_000_000
 def definition(type_name: str, folder: Path) -> Definition:
     """Find a definition of our messages without an installed workspace.
 
-    :param folder: where to lay them out as if they were installed.
+    :param folder: folder in which they are laid out as if installed.
     """
     share = folder / "prefix" / "share"
     if not share.exists():

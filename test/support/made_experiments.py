@@ -1,4 +1,4 @@
-"""Experiments as relay_node tells them, of a process that is simulated exactly."""
+"""Experiments as relay_node publishes them, of an exactly simulated process."""
 
 from __future__ import annotations
 

@@ -22,12 +22,12 @@ _FENCE = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block, with the comment right above it, which readers do not see.
+    """A fenced block with the hidden comment right above it.
 
     :param page: path of its page from the repository's root.
-    :param language: what is written after the fence.
-    :param note: the comment; empty: none.
-    :param text: what the block holds.
+    :param language: the word after the fence.
+    :param note: the comment; empty: no comment.
+    :param text: the content of the block.
     """
 
     page: str
@@ -84,7 +84,7 @@ def every_command(*pages: Path) -> list[list[str]]:
 
 
 def parts_of(lines: list[list[str]]) -> list[list[str]]:
-    """Take lines apart as the shell does, without the variables that are set for one command."""
+    """Split lines like the shell, without variables that are set for one command."""
     parts: list[list[str]] = []
     for words in lines:
         parts.append([])
@@ -97,13 +97,13 @@ def parts_of(lines: list[list[str]]) -> list[list[str]]:
 
 
 def matches(shown: str, output: str) -> bool:
-    """Tell whether an output is the one shown, where `...` stands for anything."""
+    """Return whether an output matches the shown one, in which `...` stands for anything."""
     pieces = [re.escape(piece) for piece in shown.rstrip("\n").split("...")]
     return re.fullmatch(".*".join(pieces) + r"\s*", output, re.DOTALL) is not None
 
 
 def spans(page: Path) -> list[str]:
-    """Return what a page has in backticks within its text."""
+    """Return the texts in backticks of a page, outside of its blocks."""
     return re.findall(r"`([^`\n]+)`", _FENCE.sub("", page.read_text()))
 
 

@@ -1,4 +1,4 @@
-"""What a parameter file or a command may give to a node."""
+"""Checks of the values that a parameter file or a command gives to a node."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def check_value(entry: Any, value: Any) -> None:
-    """See that a node takes a value for one of its parameters."""
+    """Check that a node accepts a value for one of its parameters."""
     assert entry.problem(value) is None
     if isinstance(entry.default, float):
         assert isinstance(value, float), f"{entry.name}: {value} lacks its decimal point"
@@ -17,7 +17,7 @@ def check_value(entry: Any, value: Any) -> None:
 
 
 def check_parameter_file(content: dict[str, Any], tables: dict[str, Any]) -> None:
-    """See that every section of a parameter file names a node, and each node takes its values."""
+    """Check that every section of a parameter file names a node that accepts its values."""
     for address, section in content.items():
         node = address.rpartition("/")[2]
         known = {entry.name: entry for entry in tables[node]}

@@ -1,6 +1,6 @@
-"""A loop that a node of the test's own controls, whose gains controller_node looks after.
+"""A loop controlled by a node of the test, whose gains controller_node manages.
 
-That node shares nothing with the package.
+That node shares no code with the package.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ rclpy.spin(node)
 
 
 class Loop:
-    """The other node's loop, and a controller_node that looks after its gains."""
+    """The other node's loop, and a controller_node that manages its gains."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -68,7 +68,7 @@ class Loop:
         rig.plant(**PLANT)
         self.start()
         rig.until(lambda: len(self.commands) > 60, "a closed loop")
-        # The processes find each other one by one.
+        # Discovery of the processes takes time.
         rig.until(self.is_watched, "the controller_node")
 
     def start(self) -> None:
@@ -87,7 +87,7 @@ class Loop:
         return "no model has come" in reason
 
     def apply(self, p: float, i: float, gain: float) -> None:
-        """Let gains and a model come, and put them in force."""
+        """Publish gains and a model, and apply the gains."""
         model = TransferFunction(
             final=True, verdict=VERDICT, denominator=[0.3, 1.0], dead_time=0.1
         )
@@ -111,11 +111,11 @@ class Loop:
     def verify(
         self, during: Callable[[], None] | None = None, **request: float
     ) -> tuple[int, Any]:
-        """Ask for a proof of a loop at rest; once the set-point has moved, do something."""
+        """Verify a loop at rest; call ``during`` once the set-point has moved."""
 
         def at_rest() -> tuple[int, Any] | None:
             status, result = self.ask_for_proof(during, request)
-            # How long a loop takes to settle, a busy machine decides.
+            # The time to settle depends on the load of the machine.
             return None if "the loop is not at rest" in result.reason else (status, result)
 
         return self.rig.until(at_rest, "a loop at rest")

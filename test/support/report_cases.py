@@ -21,7 +21,7 @@ SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, 
 
 
 def only(monkeypatch: pytest.MonkeyPatch, *keys: str) -> None:
-    """Let reports have some of their figures, where a test is about something else."""
+    """Limit reports to some of their figures, for tests of something else."""
     chosen = tuple(plate for plate in figures.PLATES if plate.key in keys)
     for module in (figures, page):
         monkeypatch.setattr(module, "PLATES", chosen)
@@ -63,7 +63,7 @@ def aborted(reason: str = "the operator pressed the button") -> Analysis:
 
 
 def fruitless(reason: str = "found no response to the command") -> Analysis:
-    """Return an experiment that gave nothing."""
+    """Return an experiment without a model."""
     return Analysis(
         completed().record, completed().cycles, reason=reason, judgement=Judgement(refused=reason)
     )

@@ -1,4 +1,4 @@
-"""The shared memory that killed processes leave, and the domain that a test run takes."""
+"""Removal of the shared memory that killed processes leave in a test run's domain."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def mapped_segments(pid: int) -> set[Path]:
 
 
 def remove_leftovers(domain: int, segments: set[Path]) -> None:
-    """Remove what killed processes have left, once no process of the domain lives.
+    """Remove the leftovers of killed processes, once no process of the domain is alive.
 
-    :param domain: the domain that this run holds.
-    :param segments: what the killed processes had mapped, their own and those of their peers.
+    :param domain: the domain of this run.
+    :param segments: segments that the killed processes had mapped, their own and their peers'.
     """
     for path in segments:
-        # Segments belong to participants of the domain, which have ended; but the ports from 7000
-        # on are those of all domains, and a living process may use the one of a killed one.
+        # Segments belong to participants of the domain, which have all ended. But all domains
+        # share the ports from 7000 on, and a running process may use a killed one's port.
         port = "_port" in path.name
         if not (port and any(path in mapped_segments(pid) for pid in _processes())):
             _remove(path)
-    # A port's semaphore is mapped by nobody who merely sends.
+    # A process that only sends does not map the semaphore of a port.
     for path in SHARED_MEMORY.glob("*fastrtps_port*"):
         number = re.search(r"fastrtps_port(\d+)", path.name)
         if number and int(number.group(1)) in ports(domain):

@@ -17,12 +17,12 @@ def tuned(
     seed: int,
     **acting: float,
 ) -> RelayExperiment:
-    """Run an experiment about baseline 0 to its end, or for so many samples.
+    """Run an experiment about baseline 0 to its end, or to the largest number of samples.
 
     :param model: the process.
-    :param parameters: of the experiment.
-    :param period: of the samples [s].
-    :param seed: of the sensor's noise.
+    :param parameters: parameters of the experiment.
+    :param period: period of the samples [s].
+    :param seed: seed of the sensor's noise.
     :param acting: disturbances.
     """
     plant = VirtualProcess(model, disturbances=Disturbances(**acting), seed=seed)
