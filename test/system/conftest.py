@@ -1,4 +1,4 @@
-"""A rig for each test, in a ROS domain that nobody else uses."""
+"""A rig for each test, in a free ROS domain."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ LOOP = {
 
 
 class Goal:
-    """A client of the action and what it hears."""
+    """A client of the action, with the messages it receives."""
 
     def __init__(self, rig: Rig, **request: Any) -> None:
         self.rig = rig
@@ -62,7 +62,7 @@ def test_an_action_gives_feedback_model_gains_and_bag(rig: Rig) -> None:
     assert "relay between 0.65 and 1.65" in result.reason
     assert result.outcome == Tune.Result.UNKNOWN
     goal = Goal(rig)
-    # Another one meanwhile is refused with the reason, and disturbs nothing.
+    # A second goal is refused with the reason, and does not disturb the first.
     status, refused = Goal(rig).result()
     assert status == GoalStatus.STATUS_ABORTED
     assert "is running" in refused.reason

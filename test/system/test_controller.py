@@ -1,4 +1,4 @@
-"""The whole way over DDS: controller, tune, gains when told, proof, and back."""
+"""The whole way over DDS: controller, tune, apply, verify, revert."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
         "controller_node", **CONTROLLER, verify_load_max=0.1, verify_step_max=0.2
     )
     rig.identifier(use_sim_time=True)
-    # Passed through untouched, and the loop is closed.
+    # The commands are passed through unchanged, and the loop is closed.
     rig.until(lambda: len(wanted) > 300 and len(commands) > 300, "a closed loop")
     tail = len(wanted) - 5
     assert {m.data for m in wanted[tail - 50 : tail]} <= {m.data for m in commands}
-    # The samples may be heard later than the commands that answer them.
+    # The samples may arrive here later than the commands that answer them.
     rig.until(lambda: abs(sum(m.data for m in measured[-50:]) / 50 - 5.0) < 0.02, "the set-point")
     assert not trigger(rig, "apply").success
     answer = rig.tune()
@@ -96,11 +96,11 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     rig.until(lambda: gains, "gains")
     ended = experiments[-1]
     assert ended.outcome == RelayExperiment.COMPLETED, ended.reason
-    # Back at the controller without a bump: no step of the size of the relay's.
+    # The command returns to the controller without a bump: no step of the relay's size.
     before = len(commands)
     rig.until(lambda: len(commands) > before + 200, "the controller's commands")
     assert max(abs(m.data - 1.0) for m in commands[before:]) < 0.25
-    # Only when told.
+    # Gains are applied only on request.
     assert "wait: kc" in controller.log
     applied = trigger(rig, "apply")
     assert applied.success, applied.message
@@ -123,7 +123,7 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     assert parameters_of(rig) == [0.3, 0.8]
     # While the predictions were computed, each measurement was answered.
     assert "has been silent" not in relay.log
-    # By hand.
+    # Manual mode.
     answer = rig.call(SetBool, "controller_node/automatic", SetBool.Request(data=False))
     assert answer.success
     count = len(wanted)
@@ -134,7 +134,7 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
 
 
 def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
-    """The model that came says half the gain that the process has."""
+    """The published model has half the gain of the process."""
     commands = rig.listen("command", Float64, RELIABLE)
     rig.plant(**PLANT)
     rig.start(
@@ -174,7 +174,7 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     assert not result.passed
     assert "kc 0.3, ti 0.8 s, td 0 s in force again" in result.reason
     assert parameters_of(rig) == [0.3, 0.8]
-    # Without gains before these there is nothing left to go back to twice.
+    # Only one earlier set exists, so there is one revert at most.
     assert len(result.steps) <= 1
 
 
@@ -201,7 +201,7 @@ def test_doubtful_gains_are_never_applied_by_themselves(rig: Rig) -> None:
     assert not refused.success
     assert "the cycles differ: look at the valve" in refused.message
     assert "accept_doubtful" in refused.message
-    # Those that are trusted are applied, so that the ones before would have been, too.
+    # Trusted gains are applied; so only the verdict kept the doubtful ones back.
     publish("trusted", PidGains.VERDICT_TRUSTED, 0.6)
     rig.until(lambda: parameters_of(rig) == [0.6, 0.8], "the trusted gains")
     publish("again", PidGains.VERDICT_DOUBTFUL, 0.5)
@@ -311,11 +311,11 @@ def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
     rig.until(lambda: models and models[-1].final, "the model")
     (ended,) = experiments
     assert ended.outcome == RelayExperiment.COMPLETED, ended.reason
-    # The relay moved the set-point, within its amplitude and bias, and put it back.
+    # The relay moved the set-point, within its amplitude and bias, and restored it.
     levels = {round(m.data, 9) for m in setpoints}
     assert levels == {4.72, 5.0, 5.52}
     assert setpoints[-1].data == 5.0
-    # Meanwhile the controller's commands went through, and they are what was recorded.
+    # Meanwhile the controller's commands were passed through and recorded.
     assert set(ended.command) <= {m.data for m in wanted}
     assert ended.settings.setpoint == 5.0
     assert ended.settings.baseline == pytest.approx(1.0, abs=0.03)
@@ -335,7 +335,7 @@ def test_a_relay_on_the_set_point_ends_when_it_knows_enough(rig: Rig) -> None:
     (ended,) = experiments
     assert ended.outcome == RelayExperiment.COMPLETED, ended.reason
     assert "as narrow as asked, 0.05" in ended.reason
-    # What was judged while it ran was the process, by the commands of its controller.
+    # While it ran, the process was identified from the controller's commands.
     judged = next(m for m in reversed(models) if not m.final)
     assert 1.96 * judged.ultimate_gain_std <= 0.05 * judged.ultimate_gain
     assert judged.ultimate_gain == pytest.approx(models[-1].ultimate_gain, rel=0.1)
@@ -360,7 +360,7 @@ def test_its_end_leaves_no_load_of_a_verification(rig: Rig, given: float) -> Non
     rig.until(client.server_is_ready, "the action")
 
     def has_begun() -> bool:
-        """Ask until the loop rests well enough."""
+        """Ask until the loop is at rest."""
         sent = client.send_goal_async(Verify.Goal(load_step=0.6))
         rig.until(sent.done, "the goal")
         answer = sent.result().get_result_async()

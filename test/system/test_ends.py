@@ -1,4 +1,4 @@
-"""However a tune ends, the last command is the baseline and the record is kept."""
+"""After any end of a tune, the last command is the baseline and the record is kept."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_second_signal_changes_nothing(rig: Rig) -> None:
 
 
 def test_signals_to_the_very_end_change_nothing(rig: Rig) -> None:
-    """`ros2 launch` sends a SIGINT of its own beside the terminal's."""
+    """`ros2 launch` sends its own SIGINT besides the terminal's."""
     node = rig.identifier()
     rig.until(lambda: "ready" in node.log, "start of the node")
     while node.running:
@@ -96,7 +96,7 @@ def test_a_killed_node_leaves_all_but_the_last_half_second(rig: Rig) -> None:
     tune.relay.wait()
     recording = read_experiments(rig.bag(tune.answer))
     (record,) = recording.experiments
-    # At 50 samples a second; what was flushed last may be half a second and a little old.
+    # At 50 samples a second; the last flush may be a little more than half a second old.
     assert len(record) >= answered - 50 * 0.5 - 15
     assert record.outcome != Outcome.COMPLETED
     assert record.experiment_id == tune.answer.experiment_id
@@ -180,7 +180,7 @@ def test_nodes_that_command_nothing_end_in_order_too(rig: Rig, number: int) -> N
 
 
 def test_nohup_is_heeded(rig: Rig) -> None:
-    """Whoever starts a node with SIGHUP ignored wants it to go on without the terminal."""
+    """A node that was started with SIGHUP ignored must go on without the terminal."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         node = rig.identifier()
@@ -224,7 +224,7 @@ def test_samples_that_the_middleware_lost_are_counted(rig: Rig) -> None:
     rig.run_for(0.3)
     rig.node.destroy_timer(timer)
     relay.signal(signal.SIGSTOP)
-    # More than the relay's subscription keeps, while it cannot take any.
+    # More messages than the queue of the stopped relay keeps.
     for _ in range(400):
         publisher.publish(Float64())
     relay.signal(signal.SIGCONT)

@@ -21,13 +21,13 @@ from std_msgs.msg import Float64
 
 from relay_autotune_msgs.msg import RelayExperiment
 
-# Each fault at so many moments; `benchmarks/fault_table.py` takes two hundred.
+# Number of moments for each fault; `benchmarks/fault_table.py` uses two hundred.
 RUNS = 3
 
 
 @pytest.fixture(scope="module")
 def loop_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Loop]]:
-    """Return a loop of a kind, made once."""
+    """Return a loop of a kind, created once."""
     made: dict[str, Loop] = {}
     with ExitStack() as stack:
 
@@ -63,7 +63,7 @@ def test_a_fault_ends_in_the_safe_command(loop_of: Callable[[str], Loop], name: 
 def test_an_actuator_that_sticks_for_a_moment_is_no_end_of_all_cycles(
     loop: Loop, seed: int
 ) -> None:
-    # One stay of 0.8 s among stays of 0.06 s.
+    # One stay of 0.8 s between stays of 0.06 s.
     sticks = Random(seed).uniform(0.75, 0.85)
     loop.set(min_cycles=3, max_cycles=12)
     loop.tune()
@@ -119,7 +119,7 @@ def test_commands_stay_within_their_limits_and_rate(loop: Loop, seed: int) -> No
     random = Random(seed)
     top, rate = random.uniform(1.3, 1.5), random.uniform(20.0, 60.0)
     limits = {"command_min": 0.7, "command_max": top, "command_rate": rate}
-    # More than the limits allow.
+    # Beyond the limits.
     loop.set(amplitude=0.0, target_amplitude=10.0, **limits)
     loop.tune()
     loop.rig.until(lambda: loop.experiments or loop.commands.count(top) > 60, "the upper limit")
@@ -160,7 +160,7 @@ def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
     rig.until(lambda: controller.get_subscription_count() == 2, "the relay")
     rig.until(sensor.get_subscription_count, "the relay's ear")
     controller.publish(Float64(data=BASELINE))
-    # Before the tune only the controller is heard.
+    # Before the tune only the controller publishes the command.
     rig.run_for(0.4)
     assert {m.data for m in from_relay} <= {BASELINE}
 
@@ -178,7 +178,7 @@ def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
     controller.publish(Float64(data=0.123))
     ended = rig.until(lambda: experiments, "the record")[-1]
     assert "another node commanded 0.123 on /command" in ended.reason
-    # The controller has the loop again, so the node is silent.
+    # The controller commands the loop again, so the node is silent.
     rig.run_for(0.2)
     count = len(from_relay)
     rig.run_for(0.3)

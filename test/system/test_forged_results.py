@@ -1,4 +1,4 @@
-"""Results that anybody could publish end, apply and store nothing, and a fit holds up nobody."""
+"""Forged results have no effect, and a running fit does not block the node."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from relay_autotune_msgs.srv import Identify
 # That of the played loop.
 LOOP = Process.fopdt(2.0, 0.05, 0.025)
 PROCESS = Process.fopdt(2.0, 0.8, 0.4)
-# A fit that lasts until a file is there, and computes meanwhile as fits do.
+# A fit that computes until a file exists.
 SLOW = """
 import pathlib, sys
 from relay_autotune.nodes import identifier
@@ -100,7 +100,7 @@ def test_forged_results_end_no_tune_and_are_not_stored(rig: Rig) -> None:
         wrong = {"ultimate_gain": -point.gain * (k + 1.5)}
         models.publish(model_of(LOOP, name, **{**running, **wrong}))
         rig.run_for(0.01)
-    # What may be true is heard on the same way, and ends it as was asked.
+    # A plausible result on the same topic ends the tune as requested.
     models.publish(model_of(LOOP, name, **running))
     ended = loop.ended()
     assert ended.outcome == RelayExperiment.COMPLETED
@@ -186,7 +186,7 @@ def test_forged_records_are_refused_and_the_next_one_is_identified(rig: Rig) -> 
     ):
         end.publish(message)
         if end is progress:
-            # It is of an experiment that has ended.
+            # The message belongs to an experiment that has ended.
             message.experiment_id = "running"
             end.publish(message)
         rig.until(lambda said=said: said in identifier.log, said)
@@ -197,7 +197,7 @@ def test_forged_records_are_refused_and_the_next_one_is_identified(rig: Rig) -> 
 
 
 def begin_slow(rig: Rig, flag: Path) -> Any:
-    """Start an identifier_node whose fits last until a file is there, and let it begin one."""
+    """Start an identifier_node whose fits last until a file exists, and start a fit."""
     identifier = rig.start_python("identifier", SLOW.format(flag=str(flag)))
     experiments = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
     rig.until(experiments.get_subscription_count, "the identifier")
@@ -220,7 +220,7 @@ def test_services_are_answered_while_a_fit_runs_and_results_keep_their_order(
     client = rig.node.create_client(Identify, "identifier_node/identify")
     rig.until(client.service_is_ready, "the service")
     asked = client.call_async(Identify.Request(experiment=experiment_of(PROCESS, "asked")))
-    # The next experiment is heard while the fit of the first is computed.
+    # The next experiment is received during the fit of the first.
     rig.until(lambda: any(m.values[0].value == "second" for m in status), "the second record")
     assert not gains
     assert not asked.done()

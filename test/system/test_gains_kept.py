@@ -1,4 +1,4 @@
-"""Which gains controller_node has in force, whatever comes: in a loop stepped by hand."""
+"""The gains in force in controller_node after any event, in a loop stepped by the test."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def test_revert_leads_to_the_last_whole_set_or_is_refused(rig: Rig) -> None:
 
 
 def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
-    """Their model says a third of the gain that the process has."""
+    """Their model has a third of the gain of the process."""
     loop = HandLoop(rig)
     assert loop.gains_shown()[0] == 0.0
     loop.apply(*WILD, "wild", gain=0.7)
     result = loop.verify(setpoint_step=0.3)
     assert not result.passed
-    # The first gains ever: nothing was before them.
+    # The first gains ever: there are no earlier ones.
     assert "the command is held" in result.reason
     assert loop.gains_shown()[0] == 0.0
     assert loop.answer_to(SETPOINT) == loop.answer_to(SETPOINT + 0.4)
@@ -52,7 +52,7 @@ def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
     loop.start(auto_apply=True)
     rig.until(lambda: "gains of wild refused: these gains failed" in loop.node.log, "the gains")
     assert loop.gains_shown()[0] == 0.0
-    # Others are taken; a second fail does not bring the first failed set back.
+    # Other gains are accepted; their failure does not restore the first failed set.
     loop.offer(0.8, 0.3, "second", gain=0.7)
     rig.until(lambda: loop.gains_shown() == (0.8, 0.3), "auto_apply")
     assert not loop.verify(setpoint_step=0.3).passed
@@ -79,12 +79,12 @@ def test_after_a_kill_the_proven_gains_are_in_force(rig: Rig, moment: str) -> No
     else:
         loop.node.signal(signal.SIGKILL)
         loop.node.wait()
-    # What was being tried is not taken from the latched topic either.
+    # The gains of the interrupted trial are not taken from the latched topic either.
     loop.start(auto_apply=moment == "verifying")
     rig.until(lambda: "gains of wild wait" in loop.node.log, "the latched gains")
     assert loop.gains_shown() == GOOD
     assert "starts with kc 0.5" in loop.node.log, loop.node.log
-    # A configuration that was changed counts more.
+    # A changed configuration takes precedence.
     loop.node.signal(signal.SIGTERM)
     loop.node.wait()
     loop.start(kc=0.2, auto_apply=False)
@@ -156,7 +156,7 @@ def test_gains_out_of_bounds_are_left_alone(rig: Rig) -> None:
     rig.until(lambda: "gains of -1e+300_1 refused" in loop.node.log, "the refusal")
     loop.offer(*GOOD, "good")
     rig.until(lambda: loop.gains_shown() == GOOD, "those within the bounds")
-    # Nothing was in force between.
+    # No other gains were in force in between.
     assert loop.trigger("revert").success
     assert loop.gains_shown() == (0.3, 1.0)
     assert not loop.set(kc=-2.5).successful
@@ -175,7 +175,7 @@ def test_verify_is_bounded_and_ends_without_a_verdict_where_time_is_wrong(rig: R
         result = loop.verify(lambda later=later: loop.step(later=later), setpoint_step=0.3)
         assert not result.passed
         assert reason in result.reason
-        # Nothing was found out about them.
+        # The verification had no verdict.
         assert loop.gains_shown() == GOOD
     # Before the step as well.
     result = loop.verify(setpoint_step=0.3)
@@ -192,7 +192,7 @@ def test_a_set_point_of_the_operator_is_no_failure_of_the_gains(rig: Rig) -> Non
         setpoints.publish(Float64(data=SETPOINT))
         loop.step()
 
-    # One that says again what is in force changes nothing.
+    # A set-point equal to the present one changes nothing.
     assert loop.verify(same, setpoint_step=0.3).passed
 
     def other() -> None:
@@ -204,5 +204,5 @@ def test_a_set_point_of_the_operator_is_no_failure_of_the_gains(rig: Rig) -> Non
     assert "the set-point was changed to 5.6" in result.reason
     assert loop.gains_shown() == GOOD
     loop.step(120)
-    # It stays in force: a deviation of 0.6 takes 0.3 of command.
+    # It stays in force: a deviation of 0.6 needs 0.3 of command.
     assert loop.command == pytest.approx(1.3, abs=0.02)

@@ -1,4 +1,4 @@
-"""The live commands of README and guide, as they are written there."""
+"""The live commands of README and guide, exactly as written there."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from relay_autotune.tuning import RULES, DesignOptions, DesignTask
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 from tools.fill_docs import TABLES
 
-# What rclpy gives every node.
+# Topics and services of every rclpy node.
 COMMON_TOPICS = {"/rosout", "/parameter_events"}
 COMMON_SERVICE_TYPES = ("rcl_interfaces/", "type_description_interfaces/")
 COMMON_PARAMETERS = ("qos_overrides.", "use_sim_time", "start_type_description_service")
@@ -31,7 +31,7 @@ def start_as_shown(rig: Rig, page: str, note: str) -> dict[str, Any]:
         assert words[:3] == ["ros2", "run", "relay_autotune"]
         own: dict[str, Any] = {}
         if words[3] == "relay_node":
-            # Another test beside this one may keep the plant waiting for a second.
+            # A parallel test may delay the plant for a second.
             own = {"record_directory": str(rig.records), "measurement_timeout": 10.0}
         arguments = [word for word in words[4:] if word != "--ros-args"]
         rig.start(words[3], *arguments, **own)
@@ -51,7 +51,7 @@ def plant_shown(page: str, note: str) -> dict[str, Any]:
 
 
 def test_the_live_commands_of_the_readme_tune_a_loop(rig: Rig) -> None:
-    """In real time, where a busy machine disturbs the loop: not every number can be demanded."""
+    """A test in real time: a busy machine disturbs the loop, so not every number is checked."""
     experiments = rig.listen("relay_experiment", RelayExperiment)
     models = rig.listen("transfer_function", TransferFunction)
     answer = rig.tune(**start_as_shown(rig, "README.md", "tested: three processes, then the call"))
@@ -115,7 +115,7 @@ def test_the_nodes_have_the_names_that_the_guide_says(rig: Rig) -> None:
 
 
 def seen(rig: Rig, node: str) -> set[tuple[str, str, str]]:
-    """Return the ends of a node as the graph shows them, without what every node has."""
+    """Return the topics and services of a node in the graph, without those of every node."""
     try:
         found = {
             "publishes": rig.node.get_publisher_names_and_types_by_node(node, "/"),

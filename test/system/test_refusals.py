@@ -1,4 +1,4 @@
-"""Every bad input is a reason, not silence."""
+"""Every bad input is refused with a reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LATCHED_ONLY = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 @pytest.fixture(scope="module")
 def idle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """Keep a relay that is asked for tunes which it must refuse."""
+    """Start a relay that must refuse the requested tunes."""
     with free_domain() as domain:
         rig = Rig(domain, tmp_path_factory.mktemp("idle"))
         try:
@@ -36,7 +36,7 @@ def idle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 
 class Ends:
-    """The two ends of the loop, made by the onlooker."""
+    """Sensor and actuator of the loop, made by the test's node."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class Ends:
 
 
 def refused(rig: Rig, said: str, **request: Any) -> str:
-    """Ask until the answer is the expected one: the graph may not be known at once."""
+    """Ask until the answer is the expected one, because discovery takes time."""
 
     def reason() -> str:
         answer = rig.ask_for_tune(**request)
@@ -215,7 +215,7 @@ def test_a_bad_parameter_at_the_start_is_one_line(
 
 
 def test_a_misspelt_name_in_a_file_is_told(rig: Rig) -> None:
-    """It may be meant for another node, so that it is no reason to end."""
+    """The name may be meant for another node, so the node only warns."""
     file = rig.folder / "parameters.yaml"
     file.write_text("/**:\n  ros__parameters:\n    measurment_max: 50.0\n    amplitude: 1.0\n")
     process = rig.relay("--params-file", str(file))
@@ -300,7 +300,7 @@ def test_a_folder_that_cannot_be_written_is_said_and_the_tune_goes_on(rig: Rig) 
 
 
 def start_plant(rig: Rig) -> None:
-    """Start e^(-s)/(2 s + 1) in lockstep, for tests of what comes after a tune."""
+    """Start e^(-s)/(2 s + 1) in lockstep, for tests of the time after a tune."""
     rig.plant(
         sample_period=0.1,
         mode="lockstep",

@@ -1,4 +1,4 @@
-"""The gains of another node's controller: set by its parameters, proved by its set-point."""
+"""The gains of another node's controller: set through parameters, verified by its set-point."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert [m.data for m in loop.setpoints] == [5.0, 5.5, 5.0]
     assert loop.values() == [0.5, 1.6, 0.0]
 
-    # Somebody else's set-point ends a proof and stays; nothing was found out about the gains.
+    # A foreign set-point ends a verification and stays; the gains get no verdict.
     rig.run_for(2.0)
     other = [m.data for m in loop.setpoints]
     status, result = loop.verify(lambda: setpoint.publish(Float64(data=4.8)), setpoint_step=0.5)
@@ -42,7 +42,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert [m.data for m in loop.setpoints] == [*other, 5.5, 4.8]
     assert loop.values() == [0.5, 1.6, 0.0]
 
-    # Gains for a process with a third of the gain that it has.
+    # Gains for a process with a third of the true gain.
     loop.apply(0.8, 2.6, 0.6)
     status, result = loop.verify(setpoint_step=0.5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason

@@ -1,4 +1,4 @@
-"""Another node's gains, when that node hangs, or when controller_node ends in the midst."""
+"""Another node's gains, when that node hangs, or when controller_node ends during a change."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_gains_are_looked_at_before_they_are_sent(rig: Rig) -> None:
         "slow": {"kc": 1.0, "ti": 1e200},
     }.items():
         loop.gains.publish(PidGains(final=True, b=1.0, experiment_id=name, **numbers))
-    # The others have come before these.
+    # The messages above arrive before these gains.
     offer(loop, "good", kc=0.5, ti=0.3)
     for name in ("parallel", "large"):
         assert f"gains of {name} refused" in loop.controller.log
@@ -74,7 +74,7 @@ def test_gains_are_looked_at_before_they_are_sent(rig: Rig) -> None:
 
 
 def in_a_step(loop: Loop, then: Callable[[], None]) -> None:
-    """Verify, and do something while the set-point is stepped."""
+    """Verify, and call a function during the step of the set-point."""
     rig = loop.rig
     client = ActionClient(rig.node, Verify, "controller_node/verify")
     rig.until(client.server_is_ready, "the action")

@@ -1,4 +1,4 @@
-"""A recording gives the same in replay, by the service ~/identify, and played into the nodes."""
+"""A recording gives the same result in replay, by ~/identify, and played into the nodes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record a tune with the messages of today, whose bytes a player can publish."""
+    """Record a tune with the present messages, so that a player can publish the bytes."""
     bag = tmp_path_factory.mktemp("recorded") / "bag"
     record_tune(bag, plant={"noise_std": 0.02, "seed": 11}, relay={"bias_ratio": 0.0})
     return bag
@@ -99,11 +99,11 @@ def test_a_bag_played_into_the_nodes_gives_what_replay_gives(rig: Rig, recorded:
 
         rig.node.create_subscription(Float64, topic, note, RELIABLE)
     rig._launch("player", [sys.executable, str(PLAYER), str(recorded), str(RATE)], (), {})
-    # The record travels in one message, so that the time of its arrival does not matter.
+    # The record comes in one message, so the time of its arrival does not matter.
     rig.until(lambda: gains and models and models[-1].final, "model and gains", 60.0)
     assert_same(models[-1], gains[-1], replayed)
 
-    # The samples themselves carry the times at which they were played.
+    # The stamps of the samples are the times of the playback.
     both = Selection("/measurement", "/command", start=0.0)
     (again,) = read_experiments(recorded, both).experiments
     rig.until(lambda: sum(t == "measurement" for t, _, _ in heard) >= len(again), "all samples")
@@ -111,14 +111,14 @@ def test_a_bag_played_into_the_nodes_gives_what_replay_gives(rig: Rig, recorded:
     played = identify(played_record(heard), "waveform", fopdt)
     expected = identify(again, "waveform", fopdt)
     found, true = played.model, expected.model
-    # A sample may come a few milliseconds late, of which RATE makes some 0.1 s.
+    # A sample may be a few milliseconds late, which is some 0.1 s times RATE.
     assert found.gain == pytest.approx(true.gain, rel=0.03)
     assert found.dead_time == pytest.approx(true.dead_time, abs=0.4)
     assert played.ultimate_gain == pytest.approx(expected.ultimate_gain, rel=0.03)
 
 
 def played_record(heard: list[tuple[str, int, float]]) -> Record:
-    """Join what was heard, in the time of the bag."""
+    """Join the received samples, in the time of the bag."""
     times = {
         topic: np.array([stamp for name, stamp, _ in heard if name == topic]) for topic in TOPICS
     }

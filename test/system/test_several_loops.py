@@ -1,4 +1,4 @@
-"""Two loops tune at once, each in its namespace; one of them no longer than it must."""
+"""Two loops tune at once, each in its namespace; one of them ends early."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def test_two_loops_tune_at_once(rig: Rig) -> None:
         ids = {m.experiment_id for m in (*loop.experiments, *loop.models, *loop.gains)}
         assert ids == {loop.answer.experiment_id}
         assert loop.models[-1].final
-        # A busy machine steps the plant late, which is part of what is measured.
+        # A busy machine delays the plant's steps, and the delay is part of the measured loop.
         assert loop.models[-1].ultimate_gain == pytest.approx(loop.truth, rel=0.25)
     confident = loops[0].experiments[0]
     assert "interval of K_u is within" in confident.reason
     assert len(confident.cycle_start) < 40
-    # Relay and identifier have agreed on it by topic: the last model before the end was enough.
+    # Relay and identifier communicate by topic: the last model before the end was accurate enough.
     early = [m for m in loops[0].models if not m.final][-1]
     assert 1.96 * early.ultimate_gain_std / early.ultimate_gain <= 0.05

@@ -1,4 +1,4 @@
-"""A sensor that publishes only when its value changes, over DDS."""
+"""A sensor that publishes only on change, over DDS."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     commands = rig.listen("command", Float64, RELIABLE)
     values = rig.listen("measurement", Float64)
     plant = rig.plant(**PLANT)
-    # It has said all that it says at rest before the relay is there.
+    # The sensor has published its only value at rest before the relay starts.
     rig.until(lambda: values, "the measurement at rest")
     relay = rig.relay(amplitude=0.5, initial_command=1.0, repeat_period=0.02)
     rig.identifier()
@@ -47,7 +47,7 @@ def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     assert model.structure == "fopdt"
     assert model.gain == pytest.approx(2.0, rel=0.15)
     assert model.dead_time == pytest.approx(0.2, abs=0.03)
-    # At rest nothing came, and the node stood by the last value every 20 ms.
+    # At rest nothing came, and the node repeated the last value every 20 ms.
     time, measurement = np.array(experiment.time), np.array(experiment.measurement)
     assert np.all(measurement[:20] == measurement[0])
     assert np.median(np.diff(time[:20])) == pytest.approx(0.02, rel=0.2)
@@ -61,7 +61,7 @@ def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     again = shown["models"][shown["selected"]]
     assert (again["gain"], again["dead_time"]) == (model.gain, model.dead_time)
 
-    # Silence is no fault, but a sensor whose process has ended is.
+    # Silence is no fault, but the end of the sensor's process is.
     said = len(values)
     assert rig.tune().accepted
     rig.until(lambda: len(values) > said + 50, "the oscillation")
@@ -106,7 +106,7 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
         TransferFunction(final=True, numerator=[2.0], denominator=[0.4, 1.0], dead_time=0.2)
     )
     rig.until(lambda: len(commands) > 60, "a closed loop")
-    # All that the sensor has said at rest.
+    # The sensor's only message at rest.
     assert len(values) < 10
     client = ActionClient(rig.node, Verify, "controller_node/verify")
     rig.until(client.server_is_ready, "the action")
@@ -119,6 +119,6 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
     assert result.passed, result.reason
     (step,) = result.steps
     assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
-    # Without a gap, though the sensor has nothing to say once the loop has settled.
+    # No gap, although the sensor is silent once the loop has settled.
     assert np.median(np.diff(step.time)[-20:]) == pytest.approx(0.04, abs=0.021)
     assert np.count_nonzero(np.diff(step.measurement)[-20:]) < 10

@@ -1,4 +1,4 @@
-"""tune_loop, as a person or a script runs it, over real DDS."""
+"""tune_loop over real DDS, started like by a user or by a script."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run(rig: Rig, *arguments: str) -> tuple[int, str, str]:
 
 
 def ready(rig: Rig) -> None:
-    """Wait until a tune could start, by asking as a person would."""
+    """Wait until a tune could start, by repeated requests."""
     deadline = time.monotonic() + 90.0
     while run(rig, "--namespace", "/tank", "--dry-run")[0]:
         assert time.monotonic() < deadline, rig.logs()
@@ -90,7 +90,7 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
 class Watched:
     """A tune by tune_loop of a slow process, whose relay has made its first step.
 
-    :param rig: where it runs.
+    :param rig: the rig.
     :param output: a terminal for tune_loop; None: two pipes.
     """
 
@@ -119,7 +119,7 @@ class Watched:
         self.rig.until(lambda: self.commands[-1].data == 1.0, "the safe command")
 
     def end(self) -> tuple[str, str]:
-        """Return what tune_loop has said once it has ended."""
+        """Return the output of tune_loop after its end."""
         output, said = self.process.communicate(timeout=15.0)
         assert self.process.returncode == 1
         assert "Traceback" not in said
@@ -162,7 +162,7 @@ def test_the_end_of_relay_node_is_told_with_its_reason(rig: Rig) -> None:
 
 
 def test_a_relay_node_that_is_killed_is_missed_soon(rig: Rig) -> None:
-    """Its entries in the graph stay for 20 s; nobody shall wait that long."""
+    """Its entries stay in the graph for 20 s, but tune_loop must notice earlier."""
     tune = Watched(rig)
     tune.relay.signal(signal.SIGKILL)
     output, said = tune.end()
@@ -188,7 +188,7 @@ def test_without_a_relay_node_it_says_so_in_one_line(rig: Rig) -> None:
 
 def test_ctrl_c_ends_the_search_for_nodes_at_once(rig: Rig) -> None:
     process = command(rig, "--namespace", "nowhere", "--wait", "600")
-    # Its node is in the graph once it looks for the others.
+    # The node appears in the graph when it begins to look for the others.
     rig.until(lambda: "tune_loop" in rig.node.get_node_names(), "tune_loop")
     process.send_signal(signal.SIGINT)
     output, said = process.communicate(timeout=30.0)

@@ -25,7 +25,7 @@ GAIN_FIELDS = (
 
 
 class Results:
-    """What one tune published."""
+    """The messages of one tune."""
 
     def __init__(self, rig: Rig) -> None:
         self.cycles = rig.listen("relay_cycle", RelayCycle)
@@ -81,7 +81,7 @@ def test_lockstep_finds_the_process_and_replays_to_the_same_digits(rig: Rig) -> 
     assert experiment.lost_samples == 0
     ids = {m.experiment_id for m in (*results.cycles, experiment, model, gains)}
     assert ids == {bag.name}
-    # Every sample has its place in the lockstep.
+    # No sample is missing in lockstep.
     assert list(experiment.time) == [k * PERIOD for k in range(len(experiment.time))]
     assert [c.index for c in results.cycles] == list(range(len(experiment.cycle_start) - 1))
 
@@ -129,7 +129,7 @@ def test_cycles_that_came_late_join_to_the_record(rig: Rig) -> None:
 
 def test_simulated_time_from_end_to_end(rig: Rig) -> None:
     results = Results(rig)
-    # 4 simulated seconds in a second, 80 samples in a second.
+    # 4 simulated seconds and 80 samples per second.
     rig.plant(
         mode="clock",
         speed=4.0,
@@ -148,7 +148,7 @@ def test_simulated_time_from_end_to_end(rig: Rig) -> None:
     steps = np.diff(np.array(experiment.time)) / 0.05
     assert np.allclose(steps, np.round(steps), atol=1e-6)
     assert experiment.header.stamp.sec < 1000
-    # A measurement may be handled before the time at which it was taken has come.
+    # A measurement may be handled before the /clock message of its own time.
     assert model.gain == pytest.approx(2.0, rel=0.05)
     assert model.time_constants[0] == pytest.approx(1.0, rel=0.1)
     assert model.dead_time == pytest.approx(0.5, abs=0.06)
@@ -182,8 +182,8 @@ def test_real_time(rig: Rig) -> None:
     assert np.all(received >= taken)
     assert np.all(answered >= received)
     assert np.median(answered - taken) < 0.01
-    # A busy machine steps the plant late, which is part of what is measured here; how exact the
-    # numbers can be is for lockstep to show.
+    # A busy machine delays the plant's steps, and the delay is part of the measured loop. The test
+    # in lockstep checks the accuracy.
     assert model.structure == "fopdt"
     assert model.gain == pytest.approx(2.0, rel=0.15)
     assert model.time_constants[0] == pytest.approx(0.4, rel=0.2)
