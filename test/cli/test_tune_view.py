@@ -68,6 +68,8 @@ def model() -> Any:
         denominator=[4.0, 1.0],
         dead_time=1.5,
         parameters=["gain", "time_constant"],
+        std=[0.05, 0.5],
+        covariance=[0.0025, 0.0, 0.0, 0.25],
         ci95_low=[1.9, 3.0],
         ci95_high=[2.1, 5.0],
         undetermined=["time_constant"],
