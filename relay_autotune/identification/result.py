@@ -94,6 +94,8 @@ class Identification:
     :param combinations: where a parameter is not determined, what the data determine all the
         same.
     :param advice: then, what test would determine it, each a sentence.
+    :param parts: models on which gains have to hold, too: of the halves of the record where they
+        differ by more than chance, and plain ones that simulate it nearly as well.
     """
 
     method: str
@@ -115,6 +117,7 @@ class Identification:
     support: float = 1.0
     combinations: tuple[Combination, ...] = ()
     advice: tuple[str, ...] = ()
+    parts: tuple[TransferFunction, ...] = ()
 
     @property
     def model(self) -> TransferFunction:

@@ -58,9 +58,9 @@ class Stretch:
 def find_experiments(record: Record) -> tuple[Stretch, ...]:
     """Return the stretches of a record in which the process is excited, in order.
 
-    A stretch includes the rest before and after it, which shows the operating point; each rest is
-    at most as long as the experiment itself. A saturated measurement or a break ends an
-    experiment.
+    A stretch includes the rest before and after it, which shows the operating point and the noise.
+    Each rest is at most as long as the experiment itself, of steps and pulses ten times as long.
+    A saturated measurement or a break ends an experiment.
 
     :param record: a record of any origin.
     :returns: the stretches; empty if the command does not move the measurement.
@@ -146,6 +146,10 @@ def _switching_parts(
     relay = _relay_runs(changes)
     around = [_with_kick(changes, run, relay) for run in relay]
     found = [_relay(record, changes, *runs) for runs in zip(relay, around, strict=True)]
+    follows = sum(b - a for (a, b), part in zip(relay, found, strict=True) if part[2] == "relay")
+    if 2 * follows < changes.times.size:
+        # A sequence by the clock does now and then, by chance, what a relay would do.
+        found = [(begin, end, "pulses", reason) for begin, end, _, reason in found]
     taken = {k for run in around for k in range(*run)}
     settled = _settled(record, last, changes)
     group: list[int] = []
@@ -159,7 +163,31 @@ def _switching_parts(
             group = []
         group.append(k)
     found += _steps(changes, settled, group)
-    return sorted(found)
+    return _merged(changes, sorted(found))
+
+
+def _merged(
+    changes: _Changes, found: Sequence[tuple[float, float, str, str]]
+) -> list[tuple[float, float, str, str]]:
+    """Make one of parts without a relay between which the process does not rest for long."""
+    merged: list[tuple[float, float, str, str]] = []
+    for part in found:
+        last = merged[-1] if merged else None
+        if (
+            last is None
+            or "relay" in (last[2], part[2])
+            or part[0] - last[1] > _REST * (last[1] - last[0])
+        ):
+            merged.append(part)
+            continue
+        inside = (changes.times >= last[0]) & (changes.times <= part[1])
+        levels = changes.levels[1:][inside]
+        reason = (
+            f"{levels.size} changes of the command between {levels.min():g} and "
+            f"{levels.max():g} whatever the measurement does"
+        )
+        merged[-1] = (last[0], max(last[1], part[1]), "pulses", reason)
+    return merged
 
 
 def _relay_runs(changes: _Changes) -> list[tuple[int, int]]:
@@ -326,7 +354,8 @@ def _with_rest(
     stretches = []
     noise = roughness(record.measurement[first : last + 1])
     for k, (begin, end, kind, reason) in enumerate(found):
-        length = max(end - begin, 0.0)
+        # Rest tells the noise and the offset. Beside a controller, its command follows the noise.
+        length = max(end - begin, 0.0) * (_REST if kind in ("steps", "pulses") else 1.0)
         earliest = found[k - 1][1] if k else float(record.time[first])
         latest = found[k + 1][0] if k + 1 < len(found) else float(record.time[last])
         low = int(np.searchsorted(record.time, max(begin - length, earliest), side="left"))

@@ -15,6 +15,9 @@ _LEVEL_TOLERANCE = 1e-6
 # room for the levels before and after the experiment and a few manual steps.
 _MAX_LEVELS = 12
 
+# With fewer switches, the first one is no less part of the oscillation than the others.
+_ENOUGH_TO_TELL = 5
+
 # A stay at a level shorter than this fraction of the usual stay is noise at a switch.
 _SHORT_STAY = 0.1
 
@@ -59,7 +62,8 @@ def infer_settings(record: Record) -> RelaySettings | None:
     """Estimate the settings of a relay from a record that carries none.
 
     The levels are those of the command. The baseline is the level before the oscillation if that
-    is a third level; otherwise the middle of the levels, with no bias. The switching levels of the
+    is a third level; otherwise the mean of the command over whole cycles, which holds the process
+    where it oscillates. The switching levels of the
     measurement lie between the samples before and at the switches. So set-point and hysteresis are
     accurate to about half of the measurement's change in a sample interval, and less accurate if
     the relay acted on another signal than the recorded one. The relay is direct-acting if the
@@ -78,7 +82,7 @@ def infer_settings(record: Record) -> RelaySettings | None:
     upper = _crossed_level(y, rising)
     lower = -_crossed_level(-y, falling)
     middle = 0.5 * (stretch.high + stretch.low)
-    baseline = float(record.command[0]) if stretch.first > 0 else middle
+    baseline = float(record.command[0]) if stretch.first > 0 else _mean_command(record, stretch)
     return RelaySettings(
         setpoint=0.5 * (upper + lower),
         baseline=baseline,
@@ -97,6 +101,14 @@ def settings_of(record: Record) -> RelaySettings | None:
     :returns: as :func:`infer_settings`.
     """
     return record.settings or infer_settings(record)
+
+
+def _mean_command(record: Record, stretch: RelayStretch) -> float:
+    first, last = int(stretch.up[0]), int(stretch.up[-1])
+    held = np.diff(record.time[first : last + 1])
+    if not np.sum(held) > 0.0:
+        return 0.5 * (stretch.high + stretch.low)
+    return float(np.average(record.command[first:last], weights=held))
 
 
 def _crossed_level(measurement: FloatArray, at: IntArray) -> float:
@@ -172,6 +184,7 @@ def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | N
             continue
         at_high = bool(is_high[k])
         (up if at_high else down).append(int(starts[k]))
+    _drop_the_way_there(record.measurement, up, down)
     if len(up) < 2:
         return None
     return RelayStretch(
@@ -182,6 +195,19 @@ def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | N
         up=np.array(up, dtype=np.int64),
         down=np.array(down, dtype=np.int64),
     )
+
+
+def _drop_the_way_there(y: FloatArray, up: list[int], down: list[int]) -> None:
+    """Leave out a first switch where the process was nowhere near the oscillation yet.
+
+    A heater that is switched on from cold begins a stay, but not at the relay's lower level.
+    """
+    if len(up) + len(down) < _ENOUGH_TO_TELL:
+        return
+    first, *rest = sorted((*up, *down))
+    swing = y[rest[0] : rest[-1] + 1]
+    if not float(swing.min()) <= float(y[first]) <= float(swing.max()):
+        (up if first in up else down).remove(first)
 
 
 def _usual_stay(stay: FloatArray) -> float:

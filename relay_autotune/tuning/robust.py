@@ -56,6 +56,11 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
         derivative = options.controller == "pid"
         found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
         controller, reason = found.optimum.controller, _promise(found, search)
+    if controller.i == 0.0 or not math.isfinite(controller.i):
+        raise TuningError(
+            "no controller with a gain above zero keeps the bounds on the model and those around "
+            "it: it is not known well enough; record a longer or larger test"
+        )
     return with_setpoint_weight(controller, model, search.frequency), reason
 
 
@@ -73,7 +78,10 @@ def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
         other = None
     if other is None:
         return pi.optimum.controller, _promise(pi, search)
-    share = other.optimum.iae / pi.optimum.iae
+    share = other.optimum.iae / pi.optimum.iae if pi.optimum.iae > 0.0 else math.inf
+    if not math.isfinite(share):
+        # On so uncertain a model the cost of one of them is beyond numbers.
+        return pi.optimum.controller, _promise(pi, search)
     if share > WORTH:
         reason = f"PID would still have {100.0 * share:.0f} % of its IAE"
     elif search.noise is None:

@@ -358,8 +358,16 @@ class Search:
             bounds, kp[usable], td[usable], tf[usable], 1.0 / (share * iae)
         )
         chosen = upper * share
+        # Beyond, the integral action alone would close the loop where no frequency was looked at.
+        chosen[chosen > self._largest_ki] = -math.inf
         ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)
         return Candidates(kp, ki, td, tf)
+
+    @cached_property
+    def _largest_ki(self) -> float:
+        """Integral gain that closes the loop at the highest frequency of the grid [u/(y s)]."""
+        highest = float(self.responses.grid[-1])
+        return highest / float(np.abs(self.model(1j * highest)))
 
     def _limits(
         self,

@@ -91,9 +91,11 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
             inflation=inflation,
         )
         if parameter.logarithmic:
-            near, far = (math.exp(min(e, 700.0)) if math.isfinite(e) else _limit(e) for e in ends)
+            near, far = (_limit(e) if math.isinf(e) else math.exp(min(e, 700.0)) for e in ends)
             ends = (near, far) if value > 0.0 else (-far, -near)
-        low[i], high[i] = min(ends[0], value), max(ends[1], value)
+        # An end that could not be found stays the linear one.
+        low[i] = low[i] if math.isnan(ends[0]) else min(ends[0], value)
+        high[i] = high[i] if math.isnan(ends[1]) else max(ends[1], value)
     undetermined = tuple(
         name
         for i, name in enumerate(found.parameters)

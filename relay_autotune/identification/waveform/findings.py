@@ -29,9 +29,12 @@ from relay_autotune.identification.waveform.fit_covariance import (
     noise_of,
     raw_residual,
 )
+from relay_autotune.identification.waveform.halves import Halves, halves_of
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.selection import Candidate, support
 from relay_autotune.identification.waveform.separable import Problem, State, evaluate, refine
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -44,6 +47,9 @@ _WORTH_COUNTING = 1e-2
 _MOST_COUNTED = 6
 _OPEN = 0.01
 _PREDICTED = 1e-6
+# Plain structures are beside a richer one where they leave so much more of the spread at most.
+_PLAIN = ("fopdt", "sopdt")
+_AS_WELL = 0.02
 
 
 def report(records: Sequence[Record], fit: Fit) -> Identification:
@@ -58,9 +64,17 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     residual = raw_residual(problem, state)
     rms = scale * math.sqrt(float(residual @ residual) / n)
     exact = rms <= scale * NEGLIGIBLE
+    # Of what is left once the colour that was estimated is taken out.
     whiteness = math.nan if exact else ljung_box(state.residual)
     noise = noise_of(records, rms, not math.isnan(whiteness) and whiteness < _WHITE)
+    if problem.colour is not None:
+        # It knows that rounding errors stay alike from sample to sample.
+        noise = replace(noise, inflation=1.0)
     estimate = estimate_of(problem, state, fit, noise)
+    halves = None if problem.colour is None or estimate is None else _halves(fit, estimate.model)
+    if halves is not None and not halves.agree:
+        noise = replace(noise, inflation=noise.inflation * halves.apart)
+        estimate = estimate_of(problem, state, fit, noise)
     if estimate is None:
         raise IdentificationError(
             f"the fit of a {problem.structure.name} model left its structure; name another "
@@ -74,7 +88,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         residual_rms=rms,
         noise_std=_measured_noise(records),
         fit=1.0 - rms / spread if spread > 0.0 else math.nan,
-        whiteness_p=whiteness,
+        whiteness_p=whiteness if exact or problem.colour is None else ljung_box(residual),
         prediction=scale * _prediction(records, problem, state),
     )
     quantile = float(stdtrit(max(n - state.parameters, 1), 0.975))
@@ -85,17 +99,69 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         quantile,
         fit=quality,
         warnings=warnings,
-        fitted=_fitted(records[0], problem, residual, scale),
+        fitted=_fitted(records, fit, residual),
     )
     gain_std = found.ultimate_gain_std / abs(found.ultimate_gain)
     notes = [note for r in records for note in _checks(r, found, gain_std)]
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(notes)))
     found = _beside_rivals(found, fit, noise)
+    if halves is not None and not halves.agree:
+        told = (
+            f"two halves of the record give models that differ {math.sqrt(halves.apart):.2g} "
+            "times as much as their noise explains: the process, its load or its operating point "
+            "changed; intervals are widened to hold both, and gains have to hold on both"
+        )
+        found = replace(found, parts=halves.models, warnings=(*found.warnings, told))
+    if problem.colour is not None:
+        found = replace(found, parts=(*found.parts, *_plain(fit, rms, spread)))
     return with_what_is_determined(found, records, fit, quantile)
 
 
-def _fitted(record: Record, problem: Problem, residual: FloatArray, scale: float) -> FloatArray:
+def _plain(fit: Fit, rms: float, spread: float) -> list[TransferFunction]:
+    """Return the plain models that simulate the record best, where that is nearly as good.
+
+    :param fit: in colour.
+    :param rms: of what the fit leaves [y].
+    :param spread: of the measurement [y].
+    """
+    found = []
+    for candidate in fit.candidates:
+        if candidate.structure.name not in _PLAIN:
+            continue
+        problem = replace(candidate.problem, colour=None)
+        state = refine(problem, candidate.state.theta, tolerance=_PREDICTED)
+        left = fit.scale * math.sqrt(state.cost / state.residual.size)
+        model = problem.structure.model_at(state.theta, fit.scale * state.coefficients)
+        if model is not None and left <= rms + _AS_WELL * spread:
+            found.append(model)
+    return found
+
+
+def _halves(fit: Fit, model: TransferFunction) -> Halves | None:
+    """Return what the halves of a record say of each other about the frequency of the loop."""
+    point = ultimate_point(model)
+    slow = model.dead_time + sum(abs(t) for t in model.time_constants)
+    if point is None and not slow > 0.0:
+        return None
+    return halves_of(fit, 1.0 / slow if point is None else point.frequency)
+
+
+def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatArray:
+    """Return what the fit makes of the samples of the first record, and NaN where it cannot."""
+    record, problem, scale = records[0], fit.problem, fit.scale
     fitted = np.full(len(record), math.nan)
+    if problem.colour is not None and len(records) == 1:
+        # It was fitted to some of the samples, which tell as much as all of them.
+        every = replace(
+            problem,
+            time=record.time,
+            y=np.zeros(len(record)),
+            index=np.arange(len(record)),
+            weight=None,
+            colour=None,
+        )
+        columns, _ = every.columns(fit.state.theta)
+        return np.asarray(record.measurement[0] + scale * (fit.state.coefficients @ columns))
     own = problem.index < len(record)
     used = problem.index[own]
     fitted[used] = record.measurement[used] - scale * residual[own]
@@ -190,7 +256,13 @@ def _warnings(
     records: Sequence[Record], quality: FitReport, noise: Noise, fit: Fit, residual: FloatArray
 ) -> list[str]:
     found = []
-    if noise.coloured:
+    if fit.problem.colour is not None:
+        found.append(
+            "what the model leaves is not white: its colour was estimated with the model (an "
+            f"autoregression of order {fit.problem.colour.order}), and intervals and the choice "
+            "of a structure allow for it"
+        )
+    elif noise.coloured:
         found.append(
             f"the residual is not white (p = {quality.whiteness_p:.2g}): something is not in the "
             "model, such as a second input, another structure or a disturbance; the intervals "

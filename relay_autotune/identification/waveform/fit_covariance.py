@@ -67,7 +67,7 @@ class Noise:
 
 def raw_residual(problem: Problem, state: State) -> FloatArray:
     """Return what a fit leaves of each sample, whatever it counts, shape (n,)."""
-    if problem.weight is None:
+    if problem.weight is None and problem.colour is None:
         return state.residual
     columns, _ = problem.columns(state.theta)
     return np.asarray(problem.y - state.coefficients @ columns)

@@ -21,6 +21,11 @@ from numpy.typing import NDArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.coloured import (
+    in_colour,
+    is_clearly_coloured,
+    is_coloured,
+)
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit, raw_residual
 from relay_autotune.identification.waveform.residuals import scale_of, weights
@@ -56,6 +61,8 @@ _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
 # Noise of two records that differs by less is alike.
 _ALIKE = 1.2
+# Among all dead times and structures one fits noise alone by so much of the criterion.
+_SEARCHED = 10.0
 _MOST_ROUNDS = 20
 _SETTLED = 1e-6
 _STEADY = 0.02
@@ -101,9 +108,9 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     )
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
-    fit = _fit(problem, known, sign, scale)
-    fit = _by_noise(problem, fit, known, sign)
-    fit = _spared_of_outliers(problem, fit, known, sign)
+    fit = _explained(
+        problem, known, sign, scale, held=any(r.settings is not None for r in records)
+    )
     _require_response(fit.problem, fit.state)
     if problem.time.size < samples:
         told = (
@@ -112,6 +119,23 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         )
         fit = replace(fit, warnings=(*fit.warnings, told))
     return report(records, fit)
+
+
+def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
+    """Fit by least squares, or in the colour of the noise where that is not white."""
+    clear = known.loss == LOSSES[0] and is_clearly_coloured(problem, sign)
+    if clear:
+        coloured = in_colour(problem, scale, known, sign, held=held)
+        if coloured is not None:
+            return coloured
+    fit = _fit(problem, known, sign, scale)
+    fit = _by_noise(problem, fit, known, sign)
+    fit = _spared_of_outliers(problem, fit, known, sign)
+    if clear or not is_coloured(fit):
+        return fit
+    rest = replace(fit.problem, structure=FOPDT)
+    coloured = in_colour(rest, scale, known, sign, held=held)
+    return fit if coloured is None else replace(coloured, warnings=fit.warnings)
 
 
 def _measured(records: Sequence[Record]) -> list[FloatArray]:
@@ -148,6 +172,7 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
             structure=nuisances.structure,
             drift=nuisances.drift,
             relaxation=nuisances.relaxation,
+            past=nuisances.past,
         )
         whole = after_the_unknown(whole, chosen.state)
         state = refine(whole, chosen.state.theta)
@@ -303,18 +328,23 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
         )
 
 
-def _responds(problem: Problem, state: State) -> bool:
-    """Return whether a fit explains more than its parameters cost, beside drift and the like."""
+def _responds(problem: Problem, state: State, evidence: float = 0.0) -> bool:
+    """Return whether a fit explains more than its parameters cost, beside drift and the like.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    :param evidence: by how much more, in units of the criterion.
+    """
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
     nuisance = state.columns[len(problem.structure.powers) :]
-    y = problem.y if problem.weight is None else problem.y * problem.weight
+    y = problem.seen(problem.y)
     left = y - np.linalg.lstsq(nuisance.T, y, rcond=None)[0] @ nuisance
     without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
-    return information_criterion(state.cost, n, state.parameters, floor) < without
+    return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
 
 
 def _require_response(problem: Problem, state: State) -> None:
-    if not _responds(problem, state):
+    if not _responds(problem, state, _SEARCHED):
         raise IdentificationError(
             "the measurement shows no response to the command beyond its noise: raise the "
             "amplitude, or check that both topics belong to one loop"

@@ -59,7 +59,8 @@ def profile_ends(
     :param least: a lower bound of the parameter.
     :param farthest: beyond this distance from the estimate no end is looked for.
     :param inflation: how many times larger the variance is than that of white noise.
-    :return: lower and upper end; infinite where the sum of squares never rises so far.
+    :return: lower and upper end; infinite where the sum of squares never rises so far, NaN where
+        it could not be followed.
     """
     unit = inflation * state.cost / max(state.residual.size - state.parameters, 1)
     centre = parameter(state.theta, state.coefficients)
@@ -121,7 +122,8 @@ def _end(problem: Problem, state: State, parameter: Parameter, search: _Search) 
             share = (search.quantile - inside[0]) / (outside[0] - inside[0])
             share = min(share, 0.9) if share > _SMALL else 0.5
             reach = inside[1] + share * (outside[1] - inside[1])
-    return search.centre + search.side * reach
+    # Where no fit could be held apart from the estimate, its end is not known.
+    return search.centre + search.side * reach if inside[1] > 0.0 else math.nan
 
 
 def _hold(
@@ -154,10 +156,8 @@ def _hold(
     for _ in range(_MOST_TRIALS):
         theta, coefficients = unpacked(point)
         columns, derivatives = problem.columns(theta)
-        y = problem.y
-        if problem.weight is not None:
-            y, columns, derivatives = (x * problem.weight for x in (y, columns, derivatives))
         by_theta = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
+        y, columns, by_theta = (problem.seen(x) for x in (problem.y, columns, by_theta))
         residual = y - coefficients @ columns
         slopes = np.concatenate((columns, by_theta))
         slopes[0] = coefficients[:own] @ columns[:own]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -160,25 +161,27 @@ class Ground:
         return Candidate(problem, state, model, criterion)
 
     def with_nuisances(self, found: Candidate) -> Candidate:
-        """Add drift and a free initial state to a fit where the data ask for them.
+        """Add drift, a free initial state and a command before where the data ask for them.
 
         :param found: a fit with or without them.
         """
         best = found
-        for drift in (False, True):
-            for relaxation in (False, True):
-                if (drift, relaxation) == (found.problem.drift, found.problem.relaxation):
-                    continue
-                if relaxation and not found.structure.factors:
-                    # The free state of an integrator is the offset.
-                    continue
-                problem = replace(found.problem, drift=drift, relaxation=relaxation)
-                state = refine(problem, found.state.theta, tolerance=_TRIAL)
-                other = self.candidate(problem, state)
-                if other is None or other.criterion > found.criterion - _EVIDENCE:
-                    continue
-                if other.criterion < best.criterion:
-                    best = other
+        now = found.problem
+        for drift, relaxation, past in itertools.product((False, True), repeat=3):
+            if (drift, relaxation, past) == nuisances_of(now):
+                continue
+            if relaxation and not found.structure.factors:
+                # The free state of an integrator is the offset.
+                continue
+            if past and not now.past_is_open:
+                continue
+            problem = replace(now, drift=drift, relaxation=relaxation, past=past)
+            state = refine(problem, found.state.theta, tolerance=_TRIAL)
+            other = self.candidate(problem, state)
+            if other is None or other.criterion > found.criterion - _EVIDENCE:
+                continue
+            if other.criterion < best.criterion:
+                best = other
         return best
 
     def beside(self, nuisances: Problem) -> Ground:
@@ -301,11 +304,11 @@ def fit_all(ground: Ground) -> list[Candidate]:
             decided = min(decided, other, key=lambda c: c.criterion)
     base = decided.problem
     found = _sorted(ground.beside(base), simple)
-    if found and (base.drift or base.relaxation):
+    if found and any(nuisances_of(base)):
         # What these two leave unexplained may pass for a drift: the best one is asked again.
         plain = ground.refit(found[0])
         again = base if plain is None else ground.with_nuisances(plain).problem
-        if (again.drift, again.relaxation) != (base.drift, base.relaxation):
+        if nuisances_of(again) != nuisances_of(base):
             return _sorted(ground.beside(again), simple) or found
     return found
 
@@ -330,9 +333,14 @@ def _sorted(ground: Ground, ready: Sequence[Candidate]) -> list[Candidate]:
     return sorted(map(weighed, found), key=lambda c: c.criterion)
 
 
-def _terms(problem: Problem) -> tuple[bool, bool, int]:
+def _terms(problem: Problem) -> tuple[tuple[bool, bool, bool], int]:
     """Return what two problems of one record may differ in, beside the structure."""
-    return problem.drift, problem.relaxation, problem.time.size
+    return nuisances_of(problem), problem.time.size
+
+
+def nuisances_of(problem: Problem) -> tuple[bool, bool, bool]:
+    """Return whether drift, initial state and the command before are estimated."""
+    return problem.drift, problem.relaxation, problem.past
 
 
 def _followed(problem: Problem, begun: list[State], least: float) -> State | None:
@@ -399,12 +407,12 @@ def after_the_unknown(problem: Problem, state: State) -> Problem:
     """Return the samples whose input is known; all of them where the process was at rest.
 
     What was fed to a process that was not at rest before the record is not known, and acts for
-    one dead time.
+    one dead time, unless it is estimated.
 
     :param problem: the problem.
     :param state: a fit, for its dead time.
     """
-    if not problem.relaxation:
+    if not problem.relaxation or problem.past:
         return problem
     some = problem.part(problem.time >= problem.starts + float(state.theta[-1]))
     least = min(part.stop - part.start for part in some.experiments)

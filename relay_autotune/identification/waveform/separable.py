@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.identification.waveform.colour import Colour
 from relay_autotune.identification.waveform.rational import free_motion
 from relay_autotune.identification.waveform.theta import columns_of, stepped, unit_steps
 from relay_autotune.process.structures import Structure
-from relay_autotune.record.record import Input
+from relay_autotune.record.record import Input, PiecewiseConstant
 
 FloatArray = NDArray[np.float64]
 
@@ -52,6 +53,9 @@ class Problem:
     :param drift: True: a straight line is estimated, not only an offset.
     :param relaxation: True: a free initial state is estimated.
     :param weight: square root of what each sample counts, shape (n,); None: all count alike.
+    :param past: True: the command before each experiment is estimated: the process rested, or
+        moved freely, under another level than its first one.
+    :param colour: of the noise; None: it is white.
     """
 
     time: FloatArray
@@ -63,6 +67,16 @@ class Problem:
     drift: bool = False
     relaxation: bool = False
     weight: FloatArray | None = None
+    past: bool = False
+    colour: Colour | None = None
+
+    @property
+    def past_is_open(self) -> bool:
+        """True if no command is known from before an experiment begins."""
+        return all(
+            not (u.times.size and u.times[0] <= self.time[part][0])
+            for part, u in zip(self.experiments, self.inputs, strict=True)
+        )
 
     @property
     def experiments(self) -> list[slice]:
@@ -120,10 +134,28 @@ class Problem:
             own, own_by_theta = free_motion(
                 self.structure.denominator, theta, time, growing_only=not self.relaxation
             )
+        if self.past:
+            # The level before is that of a step at the first sample, with the same response.
+            step = PiecewiseConstant(time[:1], np.ones(1), 0.0)
+            before, before_by_theta = columns_of(self.structure, theta, time, step)
+            own = np.concatenate((own, before))
+            own_by_theta = np.concatenate((own_by_theta, before_by_theta), axis=1)
         rest = np.ones((1 + self.drift, time.size))
         if self.drift:
             rest[1] = (time - time.mean()) / np.ptp(time)
         return common, by_theta, own, own_by_theta, rest
+
+    def seen(self, rows: FloatArray) -> FloatArray:
+        """Return rows as they count: by the samples' weights, and without the noise's colour.
+
+        :param rows: shape (..., n).
+        """
+        if self.weight is not None:
+            rows = rows * self.weight
+        if self.colour is None:
+            return rows
+        parts = [self.colour.whitened(rows[..., part]) for part in self.experiments]
+        return np.concatenate(parts, axis=-1)
 
     def part(self, chosen: NDArray[np.bool_] | slice) -> Problem:
         """Return the problem of some of the samples, of each experiment at least a few."""
@@ -207,15 +239,15 @@ def evaluate(problem: Problem, theta: FloatArray) -> State:
     :param theta: shape (m,).
     """
     columns, derivatives = problem.columns(theta)
-    y = problem.y
-    if problem.weight is not None:
-        y, columns, derivatives = (x * problem.weight for x in (y, columns, derivatives))
+    y, columns = problem.seen(problem.y), problem.seen(columns)
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((columns / size[:, None]).T)
     coefficients = _backward(r.tolist(), (q.T @ y).tolist()) / size
     residual = y - coefficients @ columns
-    derivative = np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
+    derivative = problem.seen(
+        np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
+    )
     cost = float(residual @ residual)
     return State(theta, coefficients, residual, cost, q, derivative, columns)
 

@@ -202,22 +202,37 @@ def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> F
     wrong one explains nothing here.
     """
     theta = np.array((math.log(tau), 0.0))
-    along, power, total = np.zeros(dead_times.size), np.zeros(dead_times.size), 0.0
+    along, power, total = (np.zeros(dead_times.size) for _ in range(3))
     for part, u in zip(problem.experiments, problem.inputs, strict=True):
         # A dead time only moves the response, so that one pass over moved samples gives all.
         moved = (problem.time[part] - dead_times[:, None]).ravel()
-        order = np.argsort(moved, kind="stable")
-        columns, _ = columns_of(problem.structure, theta, moved[order], u)
-        r = np.empty(moved.size)
-        r[order] = columns[0]
-        table = r.reshape(dead_times.size, -1)
-        table = table - table.mean(axis=1, keepdims=True)
-        y = problem.y[part] - problem.y[part].mean()
+        table = _table(problem, theta, moved, dead_times.size, u)
+        y = np.tile(problem.y[part] - problem.y[part].mean(), (dead_times.size, 1))
+        if problem.past:
+            step = PiecewiseConstant(problem.time[part][:1], np.ones(1), 0.0)
+            before = _table(problem, theta, moved, dead_times.size, step)
+            own = np.einsum("dn,dn->d", before, before)
+            own[own == 0.0] = 1.0
+            before /= np.sqrt(own)[:, None]
+            table = table - np.einsum("dn,dn->d", table, before)[:, None] * before
+            y = y - np.einsum("dn,dn->d", y, before)[:, None] * before
         power += np.einsum("dn,dn->d", table, table)
-        along += table @ y
-        total += float(y @ y)
+        along += np.einsum("dn,dn->d", table, y)
+        total += np.einsum("dn,dn->d", y, y)
     power[power == 0.0] = 1.0
     return np.asarray(total - np.where(sign * along < 0.0, 0.0, along**2 / power))
+
+
+def _table(
+    problem: Problem, theta: FloatArray, moved: FloatArray, rows: int, u: Input
+) -> FloatArray:
+    """Return a lag's responses at moved times about their means, one row for each dead time."""
+    order = np.argsort(moved, kind="stable")
+    columns, _ = columns_of(problem.structure, theta, moved[order], u)
+    r = np.empty(moved.size)
+    r[order] = columns[0]
+    table = r.reshape(rows, -1)
+    return np.asarray(table - table.mean(axis=1, keepdims=True))
 
 
 class Starts:

@@ -1,0 +1,237 @@
+"""The fit where what is left is no white noise: generalised least squares in the noise's colour.
+
+A criterion that takes correlated samples for independent ones prefers what bends to the noise.
+Here all structures are fitted to all samples by generalised least squares (Aitken 1935), in the
+colour of what the best of them leaves (Cochrane and Orcutt 1949, iterated), and compared by what
+their samples are worth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.known import LOSSES, Known
+from relay_autotune.identification.waveform.colour import Colour, colour_of, slow_colour
+from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit
+from relay_autotune.identification.waveform.residuals import ljung_box, worth
+from relay_autotune.identification.waveform.selection import Candidate, Ground, nuisances_of
+from relay_autotune.identification.waveform.separable import Problem, State, refine
+from relay_autotune.identification.waveform.starts import (
+    Starts,
+    changes_within,
+    refine_best,
+    start_fopdt,
+)
+from relay_autotune.identification.waveform.theta import unit_steps
+
+FloatArray = NDArray[np.float64]
+
+# Less probable than this as white noise, a residual has a colour.
+_WHITE = 1e-3
+# Samples that are compared: of correlated ones more tell little, unless the process is fast; but
+# samples much denser than its response would weigh what is faster than the process most.
+_FEW, _MOST = 1200, 6000
+_A_RESPONSE = 5.0
+_MOST_TIMES = 4
+# Of a slow disturbance that is tried as a beginning, times that the record lasts its correlation.
+_SLOWEST = 10.0
+_ALIKE = 0.01
+_TRIAL = 1e-6
+_STEPS = 15
+# What is looked at first: initial state, command before.
+_PASTS = ((False, False), (False, True), (True, True))
+_FIRST = ("fopdt", "sopdt", "sopdt_zero")
+# Of equal lags, every other number: beside a colour, they differ by no more than chance.
+_OTHERS = (("lag_n", 3), ("lag_n", 5), ("lag_n", 8), ("three_lags", 0))
+_INTEGRATING = (("ipdt", 0), ("integrator_lag", 0), ("integrator_inverse", 0))
+_UNSTABLE = (("unstable_fopdt", 0), ("unstable_sopdt", 0))
+# Samples of a rest that shows the past, in which the measurement moves by no more than this share.
+_ENOUGH_REST = 15
+_STILL = 0.05
+# Of the record's length: a response that comes later leaves too little to tell it from a drift.
+_LONGEST = 0.25
+# An integrator or a growing mode bends to any drift: what it explains better has to be clear.
+_EARNED = 10.0
+# Before all structures are tried: a flexible one that leaves this much colour is enough to know.
+_CLEAR = 1e-12
+_LITTLE_WORTH = 0.5
+
+
+def is_coloured(fit: Fit) -> bool:
+    """Return whether what a fit leaves is no white noise."""
+    state = fit.state
+    if fit.loss != LOSSES[0] or state.cost <= state.residual.size * NEGLIGIBLE**2:
+        return False
+    p = ljung_box(state.residual)
+    return not math.isnan(p) and p < _WHITE
+
+
+def is_clearly_coloured(problem: Problem, sign: int) -> bool:
+    """Return whether even a flexible structure with an unknown past leaves no white noise.
+
+    It saves the choice among structures as if noise were white, which takes longest on such data.
+
+    :param problem: samples and input, with a FOPDT structure.
+    :param sign: direction of the relay; 0: not known.
+    """
+    few = replace(problem.thinned(_FEW), past=problem.past_is_open)
+    found = Ground.of(few, few.time.size * NEGLIGIBLE**2, sign)
+    if found.problem.time.size < few.time.size:
+        # What no past explains comes first.
+        return False
+    flexible = next(iter(found.fit(("sopdt_zero",))), None)
+    if flexible is None or flexible.state.cost <= few.time.size * NEGLIGIBLE**2:
+        return False
+    left = flexible.state.residual
+    p = ljung_box(left)
+    return not math.isnan(p) and p < _CLEAR and worth(left) < _LITTLE_WORTH
+
+
+def in_colour(
+    problem: Problem, scale: float, known: Known, sign: int, *, held: bool
+) -> Fit | None:
+    """Return the fit of all structures in the colour of their noise.
+
+    :param problem: samples and input, with a FOPDT structure.
+    :param scale: range of the measurement [y].
+    :param known: the structure, if it is known.
+    :param sign: direction of the relay; 0: not known.
+    :param held: True: a relay held the process, so that it may be unstable.
+    :return: None: no structure can be read, or the noise is white.
+    """
+    whole = replace(problem, drift=False, relaxation=False, past=False)
+    names = (known.structure,) if known.structure else ()
+    found = _compared(_dense_enough(whole, sign), sign, names, known.order, held=held)
+    if not found or found[0].problem.colour is None:
+        return None
+    chosen = found[0]
+    return Fit(chosen.problem, refine(chosen.problem, chosen.state.theta), tuple(found), scale)
+
+
+def _dense_enough(problem: Problem, sign: int) -> Problem:
+    """Return evenly spaced samples, a few for each response of the process."""
+    few = problem.thinned(_FEW)
+    if few.time.size == problem.time.size:
+        return problem
+    log_tau, dead_time = _ground(few, sign).fopdt.theta
+    response = math.exp(log_tau) + dead_time
+    asked = _A_RESPONSE * float(np.ptp(problem.time)) / response
+    return problem.thinned(int(min(max(asked, _FEW), _MOST)))
+
+
+def _colour(problem: Problem, state: State) -> Colour | None:
+    """Return the colour of what a fit leaves, each sample as it counts."""
+    columns, _ = problem.columns(state.theta)
+    left = problem.y - state.coefficients @ columns
+    if problem.weight is not None:
+        left = left * problem.weight
+    return colour_of([left[part] for part in problem.experiments])
+
+
+def _compared(
+    problem: Problem, sign: int, names: tuple[str, ...], order: int, *, held: bool
+) -> list[Candidate]:
+    """Return all structures in one colour, the one that counts first.
+
+    The noise is estimated in turn with the models, from two beginnings: what the best simulation
+    leaves, and a slow disturbance, which a simulation would bend to. The likelier end counts.
+    """
+    grounds = [
+        _ground(replace(problem, relaxation=relaxation, past=past), sign)
+        for relaxation, past in (_PASTS[:1] if _rests(problem) else _PASTS)
+        if problem.past_is_open or not past
+    ]
+    first = [c for g in grounds for name in names or _FIRST for c in g.fit((name,), order)]
+    if not first:
+        return []
+    best = min(first, key=lambda c: c.criterion)
+    in_one = _in(_colour(best.problem, best.state), first, grounds[0])
+    if not in_one:
+        return []
+    past = nuisances_of(in_one[0].problem)
+    asked = next(g for g in grounds if nuisances_of(g.problem) == past)
+    # Of what was looked at first, that with the past which the best one asks for.
+    simulated = [c for c in first if nuisances_of(c.problem) == past]
+    if not names:
+        tried = (*_OTHERS, *_INTEGRATING, *(_UNSTABLE if held else ()))
+        simulated += [c for name, n in tried for c in asked.fit((name,), n)]
+    best = min(simulated, key=lambda c: c.criterion)
+    once = _in(_colour(best.problem, best.state), simulated, asked)
+    slow = slow_colour(1.0 - _SLOWEST / problem.time.size)
+    ends = [_converged(once, asked), _converged(_in(slow, simulated, asked), asked)]
+    return _ordered(min(ends, key=_joint))
+
+
+def _ground(problem: Problem, sign: int) -> Ground:
+    """Return where fits to all samples begin, whatever past they have."""
+    fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
+    floor = problem.time.size * NEGLIGIBLE**2
+    return Ground(problem, fopdt, Starts(problem, fopdt), floor, sign)
+
+
+def _rests(problem: Problem) -> bool:
+    """Return whether each experiment begins with a rest, which shows what came before."""
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        time, y = problem.time[part], problem.y[part]
+        changes = changes_within(u, time)
+        before = time < (changes[0] if changes.size else time[0])
+        if np.count_nonzero(before) < _ENOUGH_REST:
+            return False
+        moved = np.polyfit(time[before], y[before], 1)[0] * np.ptp(time[before])
+        if abs(float(moved)) > _STILL * float(np.ptp(y)):
+            return False
+    return True
+
+
+def _converged(found: list[Candidate], ground: Ground) -> list[Candidate]:
+    """Return candidates in the colour of what the best of them leaves."""
+    for _ in range(_MOST_TIMES):
+        if not found:
+            return []
+        best = found[0]
+        found = _in(_colour(best.problem, best.state), found, ground)
+        if found and found[0].structure == best.structure:
+            scale = unit_steps(best.structure, best.state.theta)
+            change = np.abs(found[0].state.theta - best.state.theta) / scale
+            if float(change.max()) <= _ALIKE:
+                break
+    return found
+
+
+def _joint(found: list[Candidate]) -> float:
+    """Return the criterion of the best candidate together with its colour."""
+    if not found:
+        return math.inf
+    colour, n = found[0].problem.colour, found[0].problem.time.size
+    if colour is None:
+        return found[0].criterion
+    return found[0].criterion + colour.log_determinant + colour.order * math.log(n)
+
+
+def _in(colour: Colour | None, found: list[Candidate], ground: Ground) -> list[Candidate]:
+    """Return candidates fitted in one colour, the best first."""
+    again, longest = [], _LONGEST * float(np.ptp(ground.problem.time))
+    for c in found:
+        problem = replace(c.problem, colour=colour)
+        state = refine(problem, c.state.theta, tolerance=_TRIAL, most=_STEPS)
+        candidate = ground.candidate(problem, state)
+        # A past that is not known explains all that a dead time as long as the record leaves over.
+        if candidate is not None and candidate.model.dead_time <= longest:
+            again.append(candidate)
+    return sorted(again, key=lambda c: c.criterion)
+
+
+def _ordered(found: list[Candidate]) -> list[Candidate]:
+    """Return candidates with what an unstable or integrating one has to earn counted."""
+    earned = [
+        c if c.model.is_stable else replace(c, criterion=c.criterion + _EARNED) for c in found
+    ]
+    found = sorted(earned, key=lambda c: c.criterion)
+    best = found[0].criterion
+    rivals = [c for c in found if c.criterion <= best + 2.0]
+    chosen = min(rivals, key=lambda c: (c.state.parameters, c.structure.order, c.criterion))
+    return [chosen, *(c for c in found if c is not chosen)]

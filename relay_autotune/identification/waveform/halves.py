@@ -1,0 +1,105 @@
+"""Whether both halves of a record tell one model, and what they tell where they do not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
+from relay_autotune.identification.waveform.separable import refine
+from relay_autotune.process.transfer_function import TransferFunction
+
+FloatArray = NDArray[np.float64]
+
+_TRIAL = 1e-6
+_STEPS = 15
+# Beyond this mean square of two deviations, 99 % of equal halves lie nearer.
+_BY_CHANCE = 4.6
+# A half tells a model where it leaves no more of the logarithm of its response.
+_TOLD = 0.5
+_STEP = 1e-5
+_FEWEST = 24
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What the halves of a record say of each other.
+
+    :param apart: mean square of the difference of their responses, relative to its covariance.
+    :param models: of those halves that tell one.
+    """
+
+    apart: float
+    models: tuple[TransferFunction, ...]
+
+    @property
+    def agree(self) -> bool:
+        """True if they differ by no more than chance."""
+        return self.apart <= _BY_CHANCE
+
+
+def halves_of(fit: Fit, frequency: float) -> Halves | None:
+    """Fit the chosen structure to either half of a record, and compare the responses.
+
+    The halves tell equally much: the record is parted where half of the information on the
+    model has come. With z the logarithm of the response at one frequency, its real and imaginary
+    part, the difference d and its covariance C, the mean square is ``d' C^-1 d/2``, which is 1 on
+    average for one process under noise of the colour that was found.
+
+    :param fit: in colour, of one experiment.
+    :param frequency: at which the responses are compared [rad/s].
+    :return: None: it cannot be parted.
+    """
+    problem, state = fit.problem, fit.state
+    if len(problem.bounds) > 1:
+        return None
+    jacobian = np.concatenate((state.columns[: len(problem.structure.powers)], state.derivative))
+    size = np.einsum("pn,pn->p", jacobian, jacobian)
+    size[size == 0.0] = 1.0
+    told = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
+    middle = int(np.searchsorted(told, 0.5 * told[-1]))
+    if min(middle, problem.time.size - middle) < max(_FEWEST, 4 * state.parameters):
+        return None
+    found: list[tuple[Estimate, complex, FloatArray]] = []
+    for part in (slice(None, middle), slice(middle, None)):
+        half = problem.part(part)
+        own = refine(half, state.theta, tolerance=_TRIAL, most=_STEPS)
+        estimate = estimate_of(half, own, fit, Noise(False))
+        if estimate is None or not estimate.known:
+            return None
+        found.append((estimate, *_response(estimate, frequency)))
+    (first, at_first, of_first), (second, at_second, of_second) = found
+    difference = np.log(at_first / at_second)
+    apart = np.array([difference.real, difference.imag])
+    covariance = of_first + of_second
+    if not bool(np.all(np.isfinite(covariance))):
+        return None
+    square = 0.5 * float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart)
+    models = tuple(
+        estimate.model
+        for estimate, own in ((first, of_first), (second, of_second))
+        if math.sqrt(float(np.trace(own))) <= _TOLD
+    )
+    return Halves(square, models)
+
+
+def _response(estimate: Estimate, frequency: float) -> tuple[complex, FloatArray]:
+    """Return the response at a frequency, and the covariance of its logarithm, shape (2, 2)."""
+    s, build = 1j * frequency, estimate.structure.build
+    at = complex(estimate.model(s))
+    slopes = np.zeros((2, estimate.values.size))
+    for i, value in enumerate(estimate.values):
+        moved = estimate.values.copy()
+        step = _STEP * (abs(value) or 1.0 / frequency)
+        moved[i] += step
+        change = complex(np.log(build(moved)(s) / at)) / step
+        slopes[:, i] = change.real, change.imag
+    root = estimate.root
+    spread = slopes @ estimate.covariance @ slopes.T
+    if root is not None:
+        spread = (slopes @ root) @ (slopes @ root).T
+    return at, np.asarray(spread)
