@@ -56,6 +56,8 @@ _STILL = 0.05
 _LONGEST = 0.25
 # An integrator or a growing mode bends to any drift: what it explains better has to be clear.
 _EARNED = 10.0
+# Lengths of the record up to which a lag is one.
+_LASTING = 2.0
 # Before all structures are tried: a flexible one that leaves this much colour is enough to know.
 _CLEAR = 1e-12
 _LITTLE_WORTH = 0.5
@@ -214,23 +216,31 @@ def _joint(found: list[Candidate]) -> float:
 
 def _in(colour: Colour | None, found: list[Candidate], ground: Ground) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again, longest = [], _LONGEST * float(np.ptp(ground.problem.time))
+    again, length = [], float(np.ptp(ground.problem.time))
     for c in found:
         problem = replace(c.problem, colour=colour)
         state = refine(problem, c.state.theta, tolerance=_TRIAL, most=_STEPS)
         candidate = ground.candidate(problem, state)
         # A past that is not known explains all that a dead time as long as the record leaves over.
-        if candidate is not None and candidate.model.dead_time <= longest:
-            again.append(candidate)
+        if candidate is not None and candidate.model.dead_time <= _LONGEST * length:
+            again.append(_earned(candidate, length))
     return sorted(again, key=lambda c: c.criterion)
 
 
+def _earned(candidate: Candidate, length: float) -> Candidate:
+    """Return a candidate with what an integrator, or a lag that looks like one, has to earn.
+
+    :param length: of the record [s].
+    """
+    model = candidate.model
+    if model.is_stable and all(abs(t) <= _LASTING * length for t in model.time_constants):
+        return candidate
+    return replace(candidate, criterion=candidate.criterion + _EARNED)
+
+
 def _ordered(found: list[Candidate]) -> list[Candidate]:
-    """Return candidates with what an unstable or integrating one has to earn counted."""
-    earned = [
-        c if c.model.is_stable else replace(c, criterion=c.criterion + _EARNED) for c in found
-    ]
-    found = sorted(earned, key=lambda c: c.criterion)
+    """Return the candidates, the simplest that the criterion cannot tell from the best first."""
+    found = sorted(found, key=lambda c: c.criterion)
     best = found[0].criterion
     rivals = [c for c in found if c.criterion <= best + 2.0]
     chosen = min(rivals, key=lambda c: (c.state.parameters, c.structure.order, c.criterion))
