@@ -9,18 +9,24 @@ descriptors, command-line flags with their help, and the tables of the guide fol
 
         def __post_init__(self) -> None:
             check(self, TuningError)
+
+A result declares its fields by :func:`told`; messages, documents and their way back, checks and
+the columns of tables follow from there.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
 from relay_autotune.errors import RelayAutotuneError
 
 _DECLARED = "quantity"
+_TOLD = "told"
+_Getter = TypeVar("_Getter", bound=Callable[..., float])
 
 
 @dataclass(frozen=True)
@@ -146,3 +152,137 @@ def check(values: object, error: type[RelayAutotuneError]) -> None:
         problem = each.problem(getattr(values, each.name))
         if problem is not None:
             raise error(problem)
+
+
+@dataclass(frozen=True)
+class Told:
+    """A field of a result: what it means, and how documents and messages carry it.
+
+    :param name: of the field.
+    :param kind: its type.
+    :param unit: of the number; "" for a pure number, a word or several values.
+    :param meaning: one sentence for people.
+    :param default: what stands where it is not told; MISSING: it has to be told.
+    :param lower: smallest number allowed.
+    :param upper: largest number allowed.
+    :param nan: True if NaN is allowed, which means that it was not estimated.
+    :param null: the number for which documents have null.
+    :param document: its name in documents; two fields of one name are a list there, the lower end
+        first; None: documents do not have it.
+    :param message: its whole name in messages; "": its own name behind the prefix of the field
+        that holds it; None: messages do not have it.
+    :param prefix: of the names that the fields of this field have in messages.
+    :param after: the field that it follows in documents; "": it is the first; None: in the order
+        of the class.
+    :param column: place among the columns of tables of many bags, those of equal place in the
+        order of documents; 0: it is no column.
+    :param word: True: a name of letters, digits and underscores.
+    :param derived: True: a property, which is checked when it is read instead of set.
+    """
+
+    name: str
+    kind: Any
+    unit: str
+    meaning: str
+    default: Any = MISSING
+    lower: float = -math.inf
+    upper: float = math.inf
+    nan: bool = False
+    null: float = math.nan
+    document: str | None = ""
+    message: str | None = ""
+    prefix: str = ""
+    after: str | None = None
+    column: int = 0
+    word: bool = False
+    derived: bool = False
+
+    def problem(self, values: Any) -> str | None:
+        """Return a sentence on what is wrong with a number or an array, None if nothing is.
+
+        :param values: of the field.
+        """
+        if self.lower == -math.inf and self.upper == math.inf and self.nan:
+            return None
+        for value in values if isinstance(values, Iterable) else (values,):
+            fine = self.nan if math.isnan(value) else self.lower <= value <= self.upper
+            if not fine:
+                return f"is {value:g}, expected {self.range_text}"
+        return None
+
+    @property
+    def range_text(self) -> str:
+        """The range in words, such as "a number >= 0"."""
+        if math.isinf(self.upper):
+            text = "a number" if math.isinf(self.lower) else f"a number >= {self.lower:g}"
+        else:
+            text = f"a number from {self.lower:g} to {self.upper:g}"
+        return f"{text} or NaN" if self.nan else text
+
+
+def told(
+    unit: str, meaning: str, default: Any = MISSING, *, nan: bool | None = None, **carried: Any
+) -> Any:
+    """Declare the field of a dataclass as one of a result; the arguments are :class:`Told`'s.
+
+    :param nan: None: NaN is allowed where it is the default.
+    """
+    if nan is None:
+        nan = isinstance(default, float) and math.isnan(default)
+    words = {"unit": unit, "meaning": meaning, "default": default, "nan": nan, **carried}
+    return field(default=default, metadata={_TOLD: words})
+
+
+def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _Getter]:
+    """Declare a property of a result that documents and messages carry beside its fields.
+
+    Its docstring is the meaning.
+
+    :param unit: of the number.
+    :param after: the field that it follows.
+    :param column: as for :class:`Told`.
+    """
+
+    def declare(getter: _Getter) -> _Getter:
+        meaning = (getter.__doc__ or "").partition("\n")[0]
+        words = {"unit": unit, "meaning": meaning, "after": after, "column": column}
+        setattr(getter, _TOLD, words | {"derived": True})
+        return getter
+
+    return declare
+
+
+@cache
+def told_fields(kind: Any) -> tuple[Told, ...]:
+    """Return what a result declares, in the order of documents."""
+    types = get_type_hints(kind)
+    found = [
+        Told(own.name, types[own.name], **own.metadata[_TOLD])
+        for own in fields(kind)
+        if _TOLD in own.metadata
+    ]
+    for base in reversed(kind.__mro__):
+        for name, member in vars(base).items():
+            words = getattr(getattr(member, "fget", None), _TOLD, None)
+            if words is not None:
+                found.append(Told(name, float, default=MISSING, **words))
+    ordered = [each for each in found if each.after is None]
+    for each in (each for each in found if each.after is not None):
+        names = [before.name for before in ordered]
+        ordered.insert(names.index(each.after) + 1 if each.after else 0, each)
+    return tuple(ordered)
+
+
+def check_told(values: object, error: type[RelayAutotuneError], of: str) -> None:
+    """Refuse a result with a number outside of its declared range.
+
+    :param values: the result.
+    :param error: what to raise.
+    :param of: what the fields belong to, as in "of the gains".
+    :raises RelayAutotuneError: of that kind; the message names the field, the value and the range.
+    """
+    for each in told_fields(type(values)):  # type: ignore[arg-type]
+        if each.kind is float and not each.derived:
+            problem = each.problem(getattr(values, each.name))
+            if problem is not None:
+                raise error(f"{each.name} {of} {problem}")

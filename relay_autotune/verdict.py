@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
+from relay_autotune.quantities import told
 from relay_autotune.text import digits
 
 if TYPE_CHECKING:
@@ -100,28 +101,22 @@ class Check:
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding of one check.
+    """What one check found."""
 
-    :param name: name of the check.
-    :param title: title of the check, for people.
-    :param what: the measured quantity.
-    :param value: the measured number; NaN: it could not be computed.
-    :param unit: of value and limit; "" for pure numbers.
-    :param limit: largest allowed number: that for failure if the check failed, else for doubt.
-    :param result: result of the check.
-    :param sentence: meaning of a result that did not pass; empty: it passed.
-    :param remedy: what to do then.
-    """
-
-    name: str
-    title: str
-    what: str
-    value: float
-    unit: str
-    limit: float
-    result: Result
-    sentence: str = ""
-    remedy: str = ""
+    name: str = told("", "Of the check.")
+    title: str = told("", "Of the check, for people.")
+    what: str = told("", "What was measured.")
+    value: float = told("", "The measured number; NaN: not computed.", nan=True, null=math.inf)
+    unit: str = told("", "Of value and limit.")
+    limit: float = told(
+        "",
+        "What the number may be at most; where the check failed, the limit of that.",
+        nan=True,
+        null=math.inf,
+    )
+    result: Result = told("", "What came of it.")
+    sentence: str = told("", "What a result that did not pass means; empty: it passed.", "")
+    remedy: str = told("", "What to do then.", "")
 
     @property
     def said(self) -> str:

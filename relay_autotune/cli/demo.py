@@ -18,7 +18,8 @@ from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.exchange.document import document, model_fields, to_json
+from relay_autotune.exchange.document import document, to_json
+from relay_autotune.exchange.models import model_fields
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

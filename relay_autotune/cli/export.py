@@ -15,27 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from relay_autotune.errors import SelectionError
-from relay_autotune.loop.gains import NUMBERS, Gains
+from relay_autotune.loop.gains import Gains
+from relay_autotune.quantities import told_fields
 
 _DIGITS = 10
 _NAME = re.compile(r"[A-Za-z_]\w*\Z")
 _NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
-_UNITS = {
-    "kc": "u/y",
-    "ti": "s",
-    "td": "s",
-    "tf": "s",
-    "p": "u/y",
-    "i": "u/(y s)",
-    "d": "u s/y",
-    "phase_margin": "rad",
-    "delay_margin": "s",
-    "iae_load": "y s/u",
-    "iae_setpoint": "s",
-    "settling_time": "s",
-    "effort_setpoint": "u/y",
-    "noise_gain": "u/y",
-}
 
 
 @dataclass(frozen=True)
@@ -121,10 +106,10 @@ def pid_controller(gains: Gains, target: Target) -> str:
 def plain(gains: Gains) -> str:
     """Return gains as lines of `key: value`, which is YAML."""
     lines = [*_comments(gains, ()), f"rule: {gains.rule}", f"form: {gains.form}"]
-    for name in NUMBERS:
-        value = getattr(gains, name)
-        unit = f"  # {_UNITS[name]}" if name in _UNITS else ""
-        lines.append(f"{name}: {number(value) if math.isfinite(value) else 'null'}{unit}")
+    for each in (f for f in told_fields(Gains) if f.kind is float):
+        value = getattr(gains, each.name)
+        unit = f"  # {each.unit}" if each.unit else ""
+        lines.append(f"{each.name}: {number(value) if math.isfinite(value) else 'null'}{unit}")
     lines.append(f"reason: {json.dumps(gains.reason, ensure_ascii=False)}")
     return "\n".join(lines) + "\n"
 

@@ -77,7 +77,8 @@ def _run(options: argparse.Namespace) -> int:
     from relay_autotune.cli.chart import NUMBERS, identify_chart
     from relay_autotune.cli.table import identification_lines
     from relay_autotune.errors import ParameterError, SelectionError
-    from relay_autotune.exchange.document import identification_fields, to_json
+    from relay_autotune.exchange.document import to_json
+    from relay_autotune.exchange.fields import to_document
     from relay_autotune.identification.known import Known
 
     numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
@@ -87,7 +88,7 @@ def _run(options: argparse.Namespace) -> int:
         raise SelectionError(str(error)) from error
     found = identify_chart(options.method, numbers, known)
     if options.json:
-        print(to_json(identification_fields(found)), flush=True)
+        print(to_json(to_document(found)), flush=True)
     else:
         print("\n".join(identification_lines(found)))
     return DONE

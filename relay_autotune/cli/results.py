@@ -14,31 +14,31 @@ from typing import Any, Self
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, worst
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.escape import cell
+from relay_autotune.exchange.fields import columns
+from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
+from relay_autotune.identification import FitReport, Identification
+from relay_autotune.loop.gains import Gains
+from relay_autotune.quantities import told_fields
 
 ENDINGS = (".jsonl", ".csv", ".parquet")
 
 _OF_EXPERIMENT = (
     *("start", "duration", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
 )
-_OF_MODEL = (
-    *("method", "structure", "gain", "zeros", "time_constants", "dead_time"),
-    *("ultimate_gain", "ultimate_gain_std", "ultimate_frequency", "ultimate_frequency_std"),
-)
-_OF_GAINS = (
-    *("rule", "kc", "ti", "td", "tf", "b", "p", "i", "d", "ms", "ms_95", "mt"),
-    *("gain_margin", "phase_margin", "delay_margin", "iae_load"),
-)
-_TEXTS = {
-    *("bag", "error", "outcome", "reason", "experiment_id", "method", "structure", "rule"),
-    *("zeros", "time_constants", "verdict", "verdict_reason"),
-}
+# Of the model that counts and its fit, and of the gains.
+_METHOD, *_ACCURACY = columns(Identification)
+_OF_MODEL = (_METHOD, *OF_PROCESS, *_ACCURACY)
+_OF_FIT = columns(FitReport)
+_OF_GAINS = columns(Gains)
 COLUMNS = (
     *("bag", "experiment", "error"),
-    *_OF_EXPERIMENT,
-    *_OF_MODEL,
-    *("fit", "residual_rms"),
-    *_OF_GAINS,
+    *(*_OF_EXPERIMENT, *_OF_MODEL, *_OF_FIT, *_OF_GAINS),
 )
+_TEXTS = {
+    *("bag", "error", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
+    *("structure", "zeros", "time_constants"),
+    *(f.name for kind in (Identification, Gains) for f in told_fields(kind) if f.kind is str),
+}
 
 
 class Results:
@@ -175,7 +175,7 @@ def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
         if experiment["selected"] is not None:
             model = experiment["models"][experiment["selected"]]
             row |= {name: _cell(model[name]) for name in _OF_MODEL}
-            row |= {name: model["fit"][name] for name in ("fit", "residual_rms")}
+            row |= {name: model["fit"][name] for name in _OF_FIT}
         if experiment["recommended"] is not None:
             gains = experiment["gains"][experiment["recommended"]]
             row |= {name: gains[name] for name in _OF_GAINS}

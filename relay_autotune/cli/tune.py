@@ -223,12 +223,14 @@ def _print_document(
     form: str,
     inside: Sequence[tuple[Compensator, Performance]] = (),
 ) -> None:
-    from relay_autotune.exchange.document import gains_fields, model_fields, number_fields, to_json
+    from relay_autotune.exchange.document import to_json
+    from relay_autotune.exchange.fields import to_document
+    from relay_autotune.exchange.models import model_fields
     from relay_autotune.tuning.forms import series_form
 
     found = []
     for each in gains:
-        fields = gains_fields(each)
+        fields = to_document(each)
         if form == "series":
             try:
                 series = series_form(each)
@@ -242,7 +244,7 @@ def _print_document(
         {
             "name": each.name,
             "closed_loop_time": each.closed_loop_time,
-            **number_fields(performance),
+            **to_document(performance),
             "reason": each.reason,
         }
         for each, performance in inside

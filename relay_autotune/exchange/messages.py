@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from relay_autotune.errors import ModelError, RecordError, RelayAutotuneError, TuningError
+from relay_autotune.errors import (
+    ModelError,
+    ParameterError,
+    RecordError,
+    RelayAutotuneError,
+    TuningError,
+)
 from relay_autotune.escape import visible
+from relay_autotune.exchange.fields import float64_array, of_message, to_message
 from relay_autotune.experiment.early_end import Finding
-from relay_autotune.record.record import LARGEST, Cycle, FloatArray, Outcome, Record, RelaySettings
+from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 if TYPE_CHECKING:
@@ -26,33 +32,6 @@ if TYPE_CHECKING:
     from relay_autotune.tuning import Gains
 
 NANOSECONDS = 1_000_000_000
-_PREDICTED = ("ms", "ms_low", "ms_high")
-# The numbers of a relay's settings; an experiment that ends while it settles lacks some.
-_OF_EITHER_SIGN = ("setpoint", "baseline", "bias")
-_NOT_NEGATIVE = ("amplitude", "hysteresis", "extra_delay", "sample_period")
-_KNOWN_LATER = ("setpoint", "hysteresis")
-# Arrays of a model, by the one whose length they have.
-_SHAPES = {
-    "parameters": ("std", "covariance", "ci95_low", "ci95_high"),
-    "point_frequency": ("point_real", "point_imaginary", "point_std"),
-    "combinations": (
-        "combination_units",
-        *(f"combination_{name}" for name in ("value", "std", "ci95_low", "ci95_high")),
-    ),
-}
-# The roots of more take long, and no structure has as many.
-_MOST_COEFFICIENTS = 50
-# How far p, i and d may be from what kc, ti and td make, by rounding.
-_SAME = 1e-9
-
-
-def float64_array(values: ArrayLike) -> array.array[float]:
-    """Copy numbers into the array type that rclpy takes without looking at each of them.
-
-    :param values: any shape; flattened row by row.
-    """
-    flat = np.ascontiguousarray(values, dtype=np.float64)
-    return array.array("d", flat.tobytes())
 
 
 def set_stamp(stamp: Any, nanoseconds: int) -> None:
@@ -96,15 +75,8 @@ def fill_settings(message: Any, settings: RelaySettings | None) -> None:
     """
     if settings is None:
         message.amplitude = 0.0
-        return
-    message.setpoint = float(settings.setpoint)
-    message.baseline = float(settings.baseline)
-    message.amplitude = float(settings.amplitude)
-    message.bias = float(settings.bias)
-    message.hysteresis = float(settings.hysteresis)
-    message.extra_delay = float(settings.extra_delay)
-    message.sample_period = float(settings.sample_period)
-    message.reverse_acting = bool(settings.reverse_acting)
+    else:
+        to_message(message, settings)
 
 
 def settings_from_message(message: Any) -> RelaySettings | None:
@@ -114,24 +86,8 @@ def settings_from_message(message: Any) -> RelaySettings | None:
     """
     if float(message.amplitude) == 0.0:
         return None
-    for name in (*_OF_EITHER_SIGN, *_NOT_NEGATIVE):
-        value = float(getattr(message, name))
-        unknown = math.isnan(value) and name in _KNOWN_LATER
-        if not unknown and not (-LARGEST if name in _OF_EITHER_SIGN else 0.0) <= value <= LARGEST:
-            least = f"{-LARGEST:g}" if name in _OF_EITHER_SIGN else "0"
-            raise RecordError(
-                f"the relay's {name} is {value:g}, expected a number from {least} to {LARGEST:g}"
-            )
-    return RelaySettings(
-        setpoint=float(message.setpoint),
-        baseline=float(message.baseline),
-        amplitude=float(message.amplitude),
-        bias=float(message.bias),
-        hysteresis=float(message.hysteresis),
-        extra_delay=float(message.extra_delay),
-        sample_period=float(message.sample_period),
-        reverse_acting=bool(message.reverse_acting),
-    )
+    found: RelaySettings = of_message(RelaySettings, message, RecordError, "of the relay")
+    return found
 
 
 def fill_experiment(message: Any, record: Record, *, arrays: bool = True) -> None:
@@ -216,21 +172,12 @@ def fill_cycle(
     first = float(time[0])
     set_stamp(message.header.stamp, start_ns + round(first * 1e9))
     message.experiment_id = experiment_id
-    message.index = int(cycle.index)
     message.lead_in = int(lead_in)
     fill_settings(message.settings, settings)
     message.time = float64_array(time - first)
     message.measurement = float64_array(measurement)
     message.command = float64_array(command)
-    message.period = float(cycle.period)
-    message.period_high = float(cycle.period_high)
-    message.period_low = float(cycle.period_low)
-    message.peak_max = float(cycle.peak_max)
-    message.peak_min = float(cycle.peak_min)
-    message.time_to_peak_max = float(cycle.time_to_peak_max)
-    message.time_to_peak_min = float(cycle.time_to_peak_min)
-    message.converged = bool(cycle.converged)
-    message.disturbed = bool(cycle.disturbed)
+    to_message(message, cycle)
 
 
 def record_from_cycles(messages: Iterable[Any]) -> Record:
@@ -311,65 +258,22 @@ def fill_transfer_function(
     :param finding: of a running experiment, with the predicted Ms; None: it is not predicted.
     :param judgement: of the experiment; None: it was not judged.
     """
-    from relay_autotune.identification.judgement.validation import DIFFERENCES
+    # A relay_node, which has no models, need not load what they need.
+    from relay_autotune.exchange import models  # noqa: F401  (it says how they are written)
 
-    model = identification.model
+    _fill_envelope(message, experiment_id, final, stamp_ns, judgement)
+    # K_u stands in both; that of the model counts.
+    to_message(message, finding or Finding())
+    to_message(message, identification)
+
+
+def _fill_envelope(
+    message: Any, experiment_id: str, final: bool, stamp_ns: int, judgement: Judgement | None
+) -> None:
+    judgement = judgement or NOT_JUDGED
     set_stamp(message.header.stamp, stamp_ns)
     message.experiment_id = experiment_id
-    message.method = identification.method
-    message.structure = identification.structure
     message.final = bool(final)
-    message.gain = float(model.gain)
-    message.zeros = _real_time_constants(model.zeros)
-    message.time_constants = _real_time_constants(model.time_constants)
-    message.numerator = float64_array(model.numerator)
-    message.denominator = float64_array(model.denominator)
-    message.dead_time = float(model.dead_time)
-    message.order = int(model.order)
-    message.parameters = [str(name) for name in identification.parameters]
-    message.std = float64_array(identification.std)
-    message.covariance = float64_array(identification.covariance)
-    message.ci95_low = float64_array(identification.ci95_low)
-    message.ci95_high = float64_array(identification.ci95_high)
-    message.ultimate_gain = float(identification.ultimate_gain)
-    message.ultimate_gain_std = float(identification.ultimate_gain_std)
-    message.ultimate_frequency = float(identification.ultimate_frequency)
-    message.ultimate_frequency_std = float(identification.ultimate_frequency_std)
-    message.residual_rms = float(identification.fit.residual_rms)
-    message.noise_std = float(identification.fit.noise_std)
-    message.fit = float(identification.fit.fit)
-    message.whiteness_p = float(identification.fit.whiteness_p)
-    message.prediction = float(identification.fit.prediction)
-    message.noise_to_signal = float(identification.fit.noise_to_signal)
-    message.noise_to_signal_power = float(identification.fit.noise_to_signal_power)
-    validation = identification.validation
-    for name in DIFFERENCES:
-        value = math.nan if validation is None else getattr(validation, name)
-        setattr(message, f"validation_{name}", float(value))
-    message.validation_reason = "" if validation is None else validation.reason
-    message.integrated_error = float(identification.integrated_error)
-    points = identification.points
-    message.point_frequency = float64_array([p.frequency for p in points])
-    message.point_real = float64_array([p.value.real for p in points])
-    message.point_imaginary = float64_array([p.value.imag for p in points])
-    message.point_std = float64_array([p.std for p in points])
-    message.warnings = [str(text) for text in identification.warnings]
-    message.undetermined = [str(name) for name in identification.undetermined]
-    combinations = identification.combinations
-    message.combinations = [c.name for c in combinations]
-    message.combination_units = [c.unit for c in combinations]
-    for name in ("value", "std", "ci95_low", "ci95_high"):
-        numbers = float64_array([getattr(c, name) for c in combinations])
-        setattr(message, f"combination_{name}", numbers)
-    message.advice = [str(text) for text in identification.advice]
-    message.support = float(identification.support)
-    for name in _PREDICTED:
-        setattr(message, name, math.nan if finding is None else float(getattr(finding, name)))
-    _fill_verdict(message, judgement)
-
-
-def _fill_verdict(message: Any, judgement: Judgement | None) -> None:
-    judgement = judgement or NOT_JUDGED
     message.verdict = int(judgement.verdict)
     message.verdict_reason = judgement.reason
 
@@ -380,11 +284,22 @@ def finding_from_message(message: Any) -> Finding:
     :param message: the message.
     :raises ParameterError: if its numbers cannot be.
     """
-    return Finding(
-        float(message.ultimate_gain),
-        float(message.ultimate_gain_std),
-        **{name: float(getattr(message, name)) for name in _PREDICTED},
-    )
+    found: Finding = of_message(Finding, message, ParameterError, "of the experiment")
+    return found
+
+
+def identification_from_message(message: Any) -> Identification:
+    """Read the model with its accuracy in a `TransferFunction` message.
+
+    :param message: the message, of rclpy or decoded from a bag.
+    :raises ModelError: if its coefficients are no transfer function, its parameters make another
+        one, or the numbers that tell how sure it is cannot be.
+    """
+    from relay_autotune.exchange import models  # noqa: F401  (it says how they are read)
+    from relay_autotune.identification import Identification
+
+    found: Identification = of_message(Identification, message, ModelError, "of the model")
+    return found
 
 
 def transfer_function_from_message(message: Any) -> TransferFunction:
@@ -394,32 +309,11 @@ def transfer_function_from_message(message: Any) -> TransferFunction:
     :raises ModelError: if its coefficients are no transfer function, or the arrays that tell how
         sure it is do not go with its parameters.
     """
-    from relay_autotune.process.transfer_function import TransferFunction
+    from relay_autotune.exchange.models import model_of_message
 
-    for of, names in _SHAPES.items():
-        count = len(getattr(message, of))
-        for name in names:
-            found = len(getattr(message, name))
-            expected = count * count if name == "covariance" else count
-            if found != expected:
-                raise ModelError(
-                    f"{name} of the model has {found} numbers, expected {expected}: one for each "
-                    f"of {of}"
-                )
-    for name in ("std", "point_std", "combination_std"):
-        if any(value < 0.0 for value in getattr(message, name)):
-            raise ModelError(f"{name} of the model has a negative number, expected >= 0 or NaN")
-    if max(len(message.numerator), len(message.denominator)) > _MOST_COEFFICIENTS:
-        raise ModelError(
-            f"the model has {len(message.numerator)} and {len(message.denominator)} "
-            f"coefficients, expected {_MOST_COEFFICIENTS} at most"
-        )
-    return TransferFunction.from_polynomials(
-        tuple(float(c) for c in message.numerator),
-        tuple(float(c) for c in message.denominator),
-        dead_time=float(message.dead_time),
-        structure=str(message.structure) or "general",
-    )
+    model = model_of_message(message)
+    identification_from_message(message)
+    return model
 
 
 def gains_from_message(message: Any) -> Gains:
@@ -428,26 +322,10 @@ def gains_from_message(message: Any) -> Gains:
     :param message: the message, of rclpy or decoded from a bag.
     :raises TuningError: if they cannot be, or its two forms contradict each other.
     """
-    from relay_autotune.loop.gains import NUMBERS, Gains
+    from relay_autotune.loop.gains import Gains
 
-    parallel = ("p", "i", "d")
-    numbers = {name: float(getattr(message, name)) for name in NUMBERS}
-    gains = Gains(
-        **{name: value for name, value in numbers.items() if name not in parallel},
-        rule=str(message.rule),
-        form=str(message.form),
-        reason=str(message.reason),
-        warnings=tuple(str(text) for text in message.warnings),
-    )
-    for name in parallel:
-        told, follows = numbers[name], getattr(gains, name)
-        # Who writes gains by hand may leave the other form out.
-        if any(numbers[n] for n in parallel) and not abs(told - follows) <= _SAME * abs(follows):
-            raise TuningError(
-                f"{name} of the gains is {told:g}, but kc, ti and td make it {follows:g}: the two "
-                f"forms contradict each other"
-            )
-    return gains
+    found: Gains = of_message(Gains, message, TuningError, "of the gains")
+    return found
 
 
 def fill_gains(
@@ -468,19 +346,8 @@ def fill_gains(
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
     :param judgement: of the experiment; None: it was not judged.
     """
-    # A relay_node, which has no gains, need not load what computes them.
-    from relay_autotune.loop.gains import NUMBERS
-
-    set_stamp(message.header.stamp, stamp_ns)
-    message.experiment_id = experiment_id
-    message.rule = gains.rule
-    message.form = gains.form
-    message.reason = gains.reason
-    message.final = bool(final)
-    message.warnings = [str(text) for text in gains.warnings]
-    for name in NUMBERS:
-        setattr(message, name, float(getattr(gains, name)))
-    _fill_verdict(message, judgement)
+    _fill_envelope(message, experiment_id, final, stamp_ns, judgement)
+    to_message(message, gains)
 
 
 def without_impossible(message: Any) -> list[str]:
@@ -507,10 +374,3 @@ def without_impossible(message: Any) -> list[str]:
 
 def _column(values: Any) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
-
-
-def _real_time_constants(values: Sequence[complex]) -> array.array[float]:
-    # The fields hold real numbers; a complex pair is told by numerator and denominator alone.
-    if any(complex(value).imag != 0.0 for value in values):
-        return array.array("d")
-    return array.array("d", (complex(value).real for value in values))

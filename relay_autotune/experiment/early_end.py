@@ -8,6 +8,7 @@ from typing import Protocol
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import ParameterError
+from relay_autotune.quantities import told
 
 ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)
@@ -50,19 +51,14 @@ class Running(Protocol):
 class Finding:
     """Result of the newest fit of a running experiment; NaN: not estimated.
 
-    :param ultimate_gain: K_u [u/y].
-    :param ultimate_gain_std: its standard deviation [u/y].
-    :param ms: Ms that the gains designed on the model would have.
-    :param ms_low: lower end of its 95 % interval.
-    :param ms_high: upper end; inf: some of the loops would be unstable.
     :raises ParameterError: if a number is outside its possible range.
     """
 
-    ultimate_gain: float = math.nan
-    ultimate_gain_std: float = math.nan
-    ms: float = math.nan
-    ms_low: float = math.nan
-    ms_high: float = math.nan
+    ultimate_gain: float = told("u/y", "K_u.", math.nan)
+    ultimate_gain_std: float = told("u/y", "Its standard deviation.", math.nan)
+    ms: float = told("", "Ms that the gains designed on the model would have.", math.nan)
+    ms_low: float = told("", "Lower end of its 95 % interval.", math.nan)
+    ms_high: float = told("", "Upper end; inf: some of the loops would be unstable.", math.nan)
 
     def __post_init__(self) -> None:
         problem = ""

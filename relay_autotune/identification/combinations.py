@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from relay_autotune.identification.estimate import Estimate, Uncertain
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.quantities import told
 
 # Half an interval at most so many times the value.
 DETERMINED = 0.2
@@ -16,22 +17,14 @@ DETERMINED = 0.2
 
 @dataclass(frozen=True)
 class Combination:
-    """A combination of parameters with its uncertainty.
+    """A combination of parameters with its uncertainty; NaN: not estimated."""
 
-    :param name: in terms of the parameters.
-    :param unit: of the value.
-    :param value: its value.
-    :param std: its standard deviation; NaN: not estimated.
-    :param ci95_low: lower end of its 95 % interval; NaN: not estimated.
-    :param ci95_high: upper end; NaN: not estimated.
-    """
-
-    name: str
-    unit: str
-    value: float
-    std: float = math.nan
-    ci95_low: float = math.nan
-    ci95_high: float = math.nan
+    name: str = told("", "In terms of the parameters.", message="combinations")
+    unit: str = told("", "Unit of the value.", message="combination_units")
+    value: float = told("", "Its value.", nan=True)
+    std: float = told("", "Its standard deviation.", math.nan, lower=0.0)
+    ci95_low: float = told("", "Lower end of its 95 % interval.", math.nan, document="ci95")
+    ci95_high: float = told("", "Upper end.", math.nan, document="ci95")
 
     @property
     def determined(self) -> bool:

@@ -100,8 +100,9 @@ class Estimate:
 
     @property
     def known(self) -> bool:
-        """True if a covariance was estimated."""
-        return self.values.size > 0 and bool(np.all(np.isfinite(self.covariance)))
+        """True if a covariance was estimated, and models can be made of other values."""
+        given = isinstance(self.structure, GivenModel) or not self.values.size
+        return not given and bool(np.all(np.isfinite(self.covariance)))
 
     @property
     def std(self) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,51 +12,57 @@ from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
 from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.judgement.validation import Validation
+from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-
-if TYPE_CHECKING:
-    from relay_autotune.identification.judgement.validation import Validation
-    from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.quantities import told
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well a model reproduces the record.
+    """How well a model reproduces the record; NaN: not estimated.
 
-    :param residual_rms: root mean square of measurement minus model [y].
-    :param noise_std: noise measured before the test [y]; NaN: not estimated.
-    :param fit: 1 - rms(residual)/rms(measurement about its mean).
-    :param whiteness_p: probability of a residual this correlated if it were white (Ljung and
-        Box); NaN: not estimated.
-    :param prediction: root mean square error over the last cycle, predicted from those
-        before [y]; NaN: not estimated.
-    :param noise_to_signal: mean|residual|/mean|model about the operating point|, N2 of Wang et
-        al. 1997; NaN: not estimated.
-    :param noise_to_signal_power: the same of mean squares, their N1; NaN: not estimated.
+    ``noise_to_signal`` is N2 of Wang et al. 1997, and ``noise_to_signal_power`` their N1.
     """
 
-    residual_rms: float = math.nan
-    noise_std: float = math.nan
-    fit: float = math.nan
-    whiteness_p: float = math.nan
-    prediction: float = math.nan
-    noise_to_signal: float = math.nan
-    noise_to_signal_power: float = math.nan
+    residual_rms: float = told(
+        "y", "Root mean square of measurement minus model.", math.nan, lower=0.0, column=2
+    )
+    noise_std: float = told("y", "Noise measured before the test.", math.nan, lower=0.0)
+    fit: float = told(
+        "", "1 - rms(residual)/rms(measurement about its mean).", math.nan, upper=1.0, column=1
+    )
+    whiteness_p: float = told(
+        "",
+        "Probability of a residual this correlated if it were white (Ljung and Box).",
+        math.nan,
+        lower=0.0,
+        upper=1.0,
+    )
+    prediction: float = told(
+        "y",
+        "Root mean square error over the last cycle, predicted from those before.",
+        math.nan,
+        lower=0.0,
+    )
+    noise_to_signal: float = told(
+        "", "mean|residual|/mean|model about the operating point|.", math.nan, lower=0.0
+    )
+    noise_to_signal_power: float = told("", "The same of mean squares.", math.nan, lower=0.0)
 
 
 @dataclass(frozen=True)
 class Rival:
     """Another structure that the data do not rule out.
 
-    :param estimate: its best fit, with a covariance where its support is worth it.
-    :param support: its weight among all structures tried, 0 to 1.
+    The estimate has a covariance where the support is worth it.
     """
 
-    estimate: Estimate
-    support: float
+    estimate: Estimate = told("", "The structure's best fit; documents have its model alone.")
+    support: float = told("", "Its weight among all structures tried.", lower=0.0, upper=1.0)
 
     @property
     def model(self) -> TransferFunction:
@@ -69,54 +74,74 @@ class Rival:
 class Identification:
     """A model identified by one method, with what is known of its accuracy.
 
-    :param method: name in the registry.
-    :param estimate: the parameters of the model and their covariance.
-    :param ci95_low: lower ends of the 95 % intervals, shape (p,); NaN: not estimated.
-    :param ci95_high: upper ends, shape (p,); NaN: not estimated.
-    :param ultimate_gain: K_u [u/y], with the sign of the process; NaN: the model has none.
-    :param ultimate_gain_std: its standard deviation [u/y]; NaN: not estimated.
-    :param ultimate_frequency: w_u [rad/s]; NaN: the model has none.
-    :param ultimate_frequency_std: its standard deviation [rad/s]; NaN: not estimated.
-    :param fit: quality of the fit.
-    :param warnings: sentences that the user must read.
-    :param undetermined: parameters whose 95 % interval is wider than 20 % of the value.
-    :param fitted: the model's measurement at the record's samples, with all that was estimated
-        beside the model [y], shape (n,); NaN: not part of the fit; empty: not computed.
-    :param rivals: other structures with some support, the best first.
-    :param validation: how the limit cycle of the model differs from the record's; None: not
-        compared.
-    :param points: measured points of the frequency response, by rising frequency; empty: the
-        method has none.
-    :param integrated_error: ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the
-        model that counts (Thyagarajan and Yu 2003, eqs 29 and 30) [rad/s]; NaN: of that model
-        itself, or not computed.
-    :param support: weight of this structure among all that were tried, 0 to 1; 1: no other was.
-    :param combinations: where a parameter is not determined, what the data determine all the
-        same.
-    :param advice: then, what test would determine it, each a sentence.
-    :param parts: models on which gains have to hold, too: of the halves of the record where they
-        differ by more than chance, and plain ones that simulate it nearly as well.
+    The integrated error is ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the model
+    that counts (Thyagarajan and Yu 2003, eqs 29 and 30).
     """
 
-    method: str
-    estimate: Estimate
-    ci95_low: FloatArray
-    ci95_high: FloatArray
-    ultimate_gain: float = math.nan
-    ultimate_gain_std: float = math.nan
-    ultimate_frequency: float = math.nan
-    ultimate_frequency_std: float = math.nan
-    fit: FitReport = field(default_factory=FitReport)
-    warnings: tuple[str, ...] = ()
-    undetermined: tuple[str, ...] = ()
+    method: str = told("", "Name in the registry.", word=True, column=1)
+    estimate: Estimate = told("", "The parameters of the model and their covariance.")
+    ci95_low: FloatArray = told(
+        "", "Lower ends of the 95 % intervals, shape (p,).", nan=True, document="ci95"
+    )
+    ci95_high: FloatArray = told("", "Upper ends, shape (p,).", nan=True, document="ci95")
+    fit: FitReport = told("", "Quality of the fit.", FitReport())
+    validation: Validation | None = told(
+        "",
+        "How the limit cycle of the model differs from the record's; None: not compared.",
+        None,
+        prefix="validation_",
+    )
+    integrated_error: float = told(
+        "rad/s",
+        "Difference from the model that counts; NaN: it is that model, or not computed.",
+        math.nan,
+        lower=0.0,
+    )
+    points: tuple[FrequencyPoint, ...] = told(
+        "",
+        "Measured points of the frequency response, by rising frequency.",
+        (),
+        prefix="point_",
+    )
+    ultimate_gain: float = told(
+        "u/y", "K_u with the sign of the process; NaN: the model has none.", math.nan, column=1
+    )
+    ultimate_gain_std: float = told(
+        "u/y", "Its standard deviation; NaN: not estimated.", math.nan, lower=0.0, column=1
+    )
+    ultimate_frequency: float = told(
+        "rad/s", "w_u; NaN: the model has none.", math.nan, lower=0.0, column=1
+    )
+    ultimate_frequency_std: float = told(
+        "rad/s", "Its standard deviation; NaN: not estimated.", math.nan, lower=0.0, column=1
+    )
+    warnings: tuple[str, ...] = told("", "Sentences that the user must read.", ())
+    undetermined: tuple[str, ...] = told(
+        "", "Parameters whose 95 % interval is wider than 20 % of the value.", ()
+    )
+    combinations: tuple[Combination, ...] = told(
+        "",
+        "Where a parameter is not determined, what the data determine all the same.",
+        (),
+        prefix="combination_",
+    )
+    advice: tuple[str, ...] = told("", "Then, what test would determine it, each a sentence.", ())
+    support: float = told(
+        "",
+        "Weight of this structure among all that were tried; 1: no other was.",
+        1.0,
+        lower=0.0,
+        upper=1.0,
+    )
+    rivals: tuple[Rival, ...] = told(
+        "", "Other structures with some support, the best first.", (), message=None
+    )
+    # The model's measurement at the record's samples, with all that was estimated beside the
+    # model [y], shape (n,); NaN: not part of the fit; empty: not computed. As long as the record,
+    # it is left to those who have both.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
-    rivals: tuple[Rival, ...] = ()
-    validation: Validation | None = None
-    points: tuple[FrequencyPoint, ...] = ()
-    integrated_error: float = math.nan
-    support: float = 1.0
-    combinations: tuple[Combination, ...] = ()
-    advice: tuple[str, ...] = ()
+    # Models on which gains have to hold, too: of the halves of the record where they differ by
+    # more than chance, and plain ones that simulate it nearly as well.
     parts: tuple[TransferFunction, ...] = ()
 
     @property

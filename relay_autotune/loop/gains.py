@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.quantities import check_told, derived, told
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
@@ -23,19 +24,14 @@ class Controller:
     ``u = kc (b r - yf + (1/ti) int (r - yf) dt - td dyf/dt)``, with
     ``yf = y/(1 + tf s + (tf s)^2/2)``; error = set-point - measurement.
 
-    :param kc: proportional gain, with the sign of the process [u/y].
-    :param ti: integral time [s]; 0: no integral action.
-    :param td: derivative time [s].
-    :param tf: time constant of the filter [s]; 0: none.
-    :param b: set-point weight.
     :raises TuningError: if a value is not finite, kc is zero or a time is negative.
     """
 
-    kc: float
-    ti: float
-    td: float = 0.0
-    tf: float = 0.0
-    b: float = 1.0
+    kc: float = told("u/y", "Proportional gain, with the sign of the process.", column=1)
+    ti: float = told("s", "Integral time; 0: no integral action.", lower=0.0, column=1)
+    td: float = told("s", "Derivative time.", 0.0, lower=0.0, column=1)
+    tf: float = told("s", "Time constant of the filter; 0: none.", 0.0, lower=0.0, column=1)
+    b: float = told("", "Set-point weight.", 1.0, column=1)
 
     def __post_init__(self) -> None:
         numbers = (self.kc, self.ti, self.td, self.tf, self.b)
@@ -50,16 +46,19 @@ class Controller:
         return f"kc = {self.kc:.4g}, ti = {self.ti:.4g} s{more}"
 
     @property
+    @derived("u/y", after="b", column=1)
     def p(self) -> float:
         """Proportional gain of the parallel form [u/y]."""
         return self.kc
 
     @property
+    @derived("u/(y s)", after="p", column=1)
     def i(self) -> float:
         """Integral gain of the parallel form, kc/ti [u/(y s)]."""
         return self.kc / self.ti if self.ti > 0.0 else 0.0
 
     @property
+    @derived("u s/y", after="i", column=1)
     def d(self) -> float:
         """Derivative gain of the parallel form, kc td [u s/y]."""
         return self.kc * self.td
@@ -129,78 +128,91 @@ class Controller:
 class Performance:
     """Performance of a controller on a model.
 
-    :param ms: largest magnitude of the sensitivity function.
-    :param mt: largest magnitude of the complementary sensitivity function.
-    :param gain_margin: factor by which the loop's gain may grow.
-    :param phase_margin: rad.
-    :param delay_margin: dead time that may be added [s].
-    :param iae_load: integral of the absolute error after a unit step of the load at the
-        process input [y s/u]; infinite without integral action.
-    :param gain_margin_low: factor to which the loop's gain may fall; 0: any. NaN: not computed,
-        here and below.
-    :param iae_setpoint: integral of the absolute error after a unit step of the set-point [s].
-    :param overshoot: after a step of the set-point, relative to it.
-    :param settling_time: until the measurement stays within 2 % of a new set-point [s].
-    :param effort_setpoint: total variation of the command after a unit step of the set-point
-        [u/y].
-    :param effort_load: total variation of the command after a unit step of the load.
-    :param noise_gain: standard deviation of the command per standard deviation of white noise on
-        the samples; without a sampling period the largest gain at any frequency [u/y].
-    :raises TuningError: if a number is negative, or a number that must be known is NaN.
+    :raises TuningError: if a number is negative, or one that is always computed is NaN.
     """
 
-    ms: float
-    mt: float
-    gain_margin: float
-    phase_margin: float
-    delay_margin: float
-    iae_load: float
-    gain_margin_low: float = math.nan
-    iae_setpoint: float = math.nan
-    overshoot: float = math.nan
-    settling_time: float = math.nan
-    effort_setpoint: float = math.nan
-    effort_load: float = math.nan
-    noise_gain: float = math.nan
+    ms: float = told("", "Largest magnitude of the sensitivity function.", lower=0.0, column=1)
+    mt: float = told(
+        "", "Largest magnitude of the complementary sensitivity function.", lower=0.0, column=1
+    )
+    gain_margin: float = told(
+        "",
+        "Factor by which the loop's gain may grow; inf: any.",
+        lower=0.0,
+        null=math.inf,
+        column=1,
+    )
+    phase_margin: float = told(
+        "rad", "Phase that the loop may lose.", lower=0.0, null=math.inf, column=1
+    )
+    delay_margin: float = told(
+        "s", "Dead time that may be added; inf: any.", lower=0.0, null=math.inf, column=1
+    )
+    iae_load: float = told(
+        "y s/u",
+        "Integral of the absolute error after a unit step of the load at the process input; inf: "
+        "without integral action.",
+        lower=0.0,
+        null=math.inf,
+        column=1,
+    )
+    gain_margin_low: float = told(
+        "",
+        "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below.",
+        math.nan,
+        lower=0.0,
+    )
+    iae_setpoint: float = told(
+        "s",
+        "Integral of the absolute error after a unit step of the set-point.",
+        math.nan,
+        lower=0.0,
+    )
+    overshoot: float = told(
+        "", "After a step of the set-point, relative to it.", math.nan, lower=0.0
+    )
+    settling_time: float = told(
+        "s",
+        "Until the measurement stays within 2 % of a new set-point.",
+        math.nan,
+        lower=0.0,
+    )
+    effort_setpoint: float = told(
+        "u/y",
+        "Total variation of the command after a unit step of the set-point.",
+        math.nan,
+        lower=0.0,
+    )
+    effort_load: float = told(
+        "", "Total variation of the command after a unit step of the load.", math.nan, lower=0.0
+    )
+    noise_gain: float = told(
+        "u/y",
+        "Standard deviation of the command over that of white noise in the samples of the "
+        "measurement; without a sampling period the largest gain at any frequency.",
+        math.nan,
+        lower=0.0,
+    )
 
     def __post_init__(self) -> None:
-        for name in _PREDICTED:
-            value = getattr(self, name)
-            if value < 0.0 or (math.isnan(value) and name in _ALWAYS):
-                raise TuningError(f"{name} of the gains is {value:g}, expected a number >= 0")
-
-
-_ALWAYS = ("ms", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load")
-_PREDICTED = (
-    *(*_ALWAYS, "gain_margin_low", "iae_setpoint", "overshoot", "settling_time"),
-    *("effort_setpoint", "effort_load", "noise_gain"),
-)
-# Names of the numbers of gains in messages, documents and files.
-NUMBERS = (
-    *("kc", "ti", "td", "tf", "b", "p", "i", "d"),
-    *("ms", "ms_95", "mt", "gain_margin", "phase_margin", "delay_margin", "iae_load"),
-    *("gain_margin_low", "iae_setpoint", "overshoot", "settling_time"),
-    *("effort_setpoint", "effort_load", "noise_gain"),
-)
+        check_told(self, TuningError, "of the gains")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gains(Controller, Performance):
-    """The controller of one rule, with its performance on the identified model.
+class Gains(Performance, Controller):
+    """The controller that one rule gives, with what it does on the identified model."""
 
-    The fields are those of :class:`Controller` and :class:`Performance`, and
-
-    :param rule: name in the registry.
-    :param ms_95: value of Ms not exceeded by 95 % of the models within the uncertainty.
-    :param reason: why this rule and these gains, a sentence for people.
-    :param warnings: what the user must know before using them.
-    """
-
-    rule: str
-    ms_95: float
-    reason: str
-    form: str = "isa"
-    warnings: tuple[str, ...] = ()
+    rule: str = told("", "Name in the registry.", after="", word=True, column=1)
+    form: str = told("", "Form in which the rule is stated.", "isa", after="rule")
+    ms_95: float = told(
+        "",
+        "Ms that 95 % of the models within the uncertainty stay below; NaN: not estimated.",
+        nan=True,
+        after="ms",
+        column=1,
+    )
+    reason: str = told("", "Why this rule and these gains, a sentence for people.")
+    warnings: tuple[str, ...] = told("", "What the user must know before using them.", ())
 
     def __post_init__(self) -> None:
         Controller.__post_init__(self)

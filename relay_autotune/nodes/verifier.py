@@ -18,7 +18,8 @@ from rclpy.clock_type import ClockType
 
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.exchange.messages import float64_array, set_stamp
+from relay_autotune.exchange.fields import float64_array
+from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.goals import conclude

@@ -65,6 +65,10 @@ class Lag:
         """
         return (positive(values[0]),) * self.multiplicity
 
+    def values_of(self, constants: Sequence[complex]) -> tuple[float, ...]:
+        """Return tau [s] of the time constants that :meth:`poles` returns."""
+        return (constants[0].real,)
+
 
 @dataclass(frozen=True)
 class UnstableLag:
@@ -102,6 +106,10 @@ class UnstableLag:
         :raises ModelError: unless it is positive.
         """
         return (-positive(values[0]),)
+
+    def values_of(self, constants: Sequence[complex]) -> tuple[float, ...]:
+        """Return tau [s] of the time constant that :meth:`poles` returns."""
+        return (-constants[0].real,)
 
 
 @dataclass(frozen=True)
@@ -156,6 +164,14 @@ class Quadratic:
         :raises ModelError: if the natural frequency is not positive.
         """
         return oscillating_pair(*values) if self.parameters == PAIR else tuple(values)
+
+    def values_of(self, constants: Sequence[complex]) -> tuple[float, ...]:
+        """Return the parameters of the two time constants that :meth:`poles` returns."""
+        if self.parameters != PAIR:
+            return tuple(c.real for c in constants)
+        first, second = constants
+        frequency = 1.0 / math.sqrt((first * second).real)
+        return frequency, 0.5 * frequency * (first + second).real
 
 
 Factor = Lag | UnstableLag | Quadratic

@@ -167,6 +167,25 @@ class Structure:
             gain, zeros, tuple(constants), self.integrators, dead_time, self.name
         )
 
+    def values_of(self, model: TransferFunction) -> FloatArray:
+        """Return the values of a model, the way back from :meth:`build`.
+
+        :param model: of this structure.
+        :raises ModelError: if it is not of this structure.
+        """
+        given = {GAIN: -model.gain if self.unstable else model.gain, DEAD_TIME: model.dead_time}
+        # A pair comes last among the parameters.
+        constants = sorted(model.time_constants, key=lambda c: c.imag != 0.0)
+        exactly(self.order - self.integrators, constants)
+        for factor in sorted(self.factors, key=lambda f: PARAMETERS.index(f.parameters[0])):
+            count = factor.multiplicity * len(factor.parameters)
+            own, constants = constants[:count], constants[count:]
+            given.update(zip(factor.parameters, factor.values_of(own), strict=True))
+        if self.zero is not None:
+            zero = model.zeros[0].real if model.zeros else 0.0
+            given[self.zero] = -zero if self.zero.turned else zero
+        return np.array([given[p] for p in self.parameters])
+
     def read(
         self, theta: FloatArray, coefficients: FloatArray, like: FloatArray | None = None
     ) -> tuple[Structure, FloatArray] | None:
@@ -298,7 +317,7 @@ class GivenModel(Structure):
         :param names: names of the parameters whose values are reported with it.
         """
         by_name = {p.name: p for p in PARAMETERS}
-        given = tuple(by_name[name] for name in names)
+        given = tuple(by_name.get(name) or Parameter(name, "") for name in names)
         return cls(model.structure, (), model.integrators, given=given, model=model)
 
     @cached_property
@@ -313,6 +332,11 @@ class GivenModel(Structure):
         """
         assert len(values) == len(self.given)
         return self.model
+
+    def values_of(self, model: TransferFunction) -> FloatArray:
+        """Return NaN for each value: only who identified the model knows them."""
+        del model
+        return np.full(len(self.given), math.nan)
 
 
 _ONE, _TWO, _THREE = (TIME_CONSTANT_1,), (TIME_CONSTANT_2,), (TIME_CONSTANT_3,)

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from relay_autotune.errors import RecordError
+from relay_autotune.quantities import told
 from relay_autotune.record.foreign import find_cycles, settings_of
 from relay_autotune.record.record import (
     Cycle,
@@ -249,16 +250,12 @@ def _bounds(record: Record) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class LimitCycle(CycleFeatures):
-    """Averages over the cycles that agree, or else over the last cycles.
+    """Averages over the cycles that agree, or over the last ones if none do."""
 
-    :param std: standard deviation of each feature between the cycles, by name; 0 for one cycle.
-    :param cycles: indices of the averaged cycles.
-    :param converged: True if they agree.
-    """
-
+    # Standard deviation of each of the features between the cycles, by name; 0 for one cycle.
     std: dict[str, float] = field(default_factory=dict)
-    cycles: tuple[int, ...] = ()
-    converged: bool = False
+    cycles: tuple[int, ...] = told("", "Indices of the cycles averaged.", ())
+    converged: bool = told("", "True if they agree.", False)
 
 
 _AVERAGED = tuple(f.name for f in fields(CycleFeatures))

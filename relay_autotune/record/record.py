@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import RecordError
+from relay_autotune.quantities import told
 
 FloatArray = NDArray[np.float64]
 # Slopes that differ by less than this part of the steepest one are equal.
@@ -73,25 +74,28 @@ class RelaySettings:
     The command is ``baseline + bias + amplitude`` (high) or ``baseline + bias - amplitude``
     (low); a direct-acting relay goes low when the measurement rises to
     ``setpoint + hysteresis`` and high when it falls to ``setpoint - hysteresis``.
-
-    :param setpoint: measurement about which the relay switches [y].
-    :param baseline: command of the operating point [u].
-    :param amplitude: half the distance of the two levels, mu [u], > 0.
-    :param bias: offset of their middle from the baseline, mu0 [u].
-    :param hysteresis: half width of the switching band, epsilon [y], >= 0.
-    :param extra_delay: dead time that the relay added to its command [s].
-    :param sample_period: nominal period of the samples [s]; 0: by their stamps.
-    :param reverse_acting: True if a higher command lowers the measurement.
     """
 
-    setpoint: float
-    baseline: float
-    amplitude: float
-    bias: float = 0.0
-    hysteresis: float = 0.0
-    extra_delay: float = 0.0
-    sample_period: float = 0.0
-    reverse_acting: bool = False
+    setpoint: float = told(
+        "y", "Measurement about which the relay switches.", nan=True, lower=-LARGEST, upper=LARGEST
+    )
+    baseline: float = told("u", "Command of the operating point.", lower=-LARGEST, upper=LARGEST)
+    amplitude: float = told(
+        "u", "Half the distance of the two levels, mu.", lower=0.0, upper=LARGEST
+    )
+    bias: float = told(
+        "u", "Offset of their middle from the baseline, mu0.", 0.0, lower=-LARGEST, upper=LARGEST
+    )
+    hysteresis: float = told(
+        "y", "Half width of the switching band, epsilon.", 0.0, nan=True, lower=0.0, upper=LARGEST
+    )
+    extra_delay: float = told(
+        "s", "Dead time that the relay added.", 0.0, lower=0.0, upper=LARGEST
+    )
+    sample_period: float = told(
+        "s", "Nominal period of the samples; 0: by their stamps.", 0.0, lower=0.0, upper=LARGEST
+    )
+    reverse_acting: bool = told("", "True if a higher command lowers the measurement.", False)
 
     @property
     def high(self) -> float:
@@ -108,42 +112,34 @@ class RelaySettings:
 class CycleFeatures:
     """Features of a cycle, or their averages over several cycles.
 
-    :param period: whole period [s].
-    :param period_high: time with the command high, T_u1 of Wang et al. [s].
-    :param period_low: time with the command low, T_u2 of Wang et al. [s].
-    :param peak_max: highest measurement [y], absolute.
-    :param peak_min: lowest measurement [y], absolute.
-    :param time_to_peak_max: from the switch that turns the measurement down to the maximum [s].
-    :param time_to_peak_min: from the switch that turns the measurement up to the minimum [s].
-    :param mean_measurement: time average of the measurement [y].
-    :param mean_command: time average of the command [u].
+    The times with the command high and low are T_u1 and T_u2 of Wang et al.
     """
 
-    period: float
-    period_high: float
-    period_low: float
-    peak_max: float
-    peak_min: float
-    time_to_peak_max: float
-    time_to_peak_min: float
-    mean_measurement: float
-    mean_command: float
+    period: float = told("s", "Whole period.", nan=True)
+    period_high: float = told("s", "Time with the command high.", nan=True)
+    period_low: float = told("s", "Time with the command low.", nan=True)
+    peak_max: float = told("y", "Highest measurement, absolute.", nan=True)
+    peak_min: float = told("y", "Lowest measurement, absolute.", nan=True)
+    time_to_peak_max: float = told(
+        "s", "From the switch that turns the measurement down to the maximum.", nan=True
+    )
+    time_to_peak_min: float = told(
+        "s", "From the switch that turns the measurement up to the minimum.", nan=True
+    )
+    mean_measurement: float = told("y", "Time average of the measurement.", nan=True, message=None)
+    mean_command: float = told("u", "Time average of the command.", nan=True, message=None)
 
 
 @dataclass(frozen=True)
 class Cycle(CycleFeatures):
-    """One whole cycle, from a switch to the high level to the next such switch.
+    """One whole cycle, from a switch to the high level to the next such switch."""
 
-    :param index: number of the cycle in its experiment, from 0.
-    :param start: time of the switch that begins it [s, on the record's time axis].
-    :param converged: True if it agrees with the cycles before it.
-    :param disturbed: True if it should be left out of averages.
-    """
-
-    index: int
-    start: float
-    converged: bool = False
-    disturbed: bool = False
+    index: int = told("", "Number of the cycle in its experiment, from 0.")
+    start: float = told(
+        "s", "Time of the switch that begins it, on the record's time axis.", message=None
+    )
+    converged: bool = told("", "True if it agrees with the cycles before it.", False)
+    disturbed: bool = told("", "True if it should be left out of averages.", False)
 
 
 @dataclass(frozen=True)

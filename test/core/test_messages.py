@@ -26,11 +26,13 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
     without_impossible,
 )
+from relay_autotune.identification import Estimate, Identification
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.judgement.validation import Validation
 from relay_autotune.identification.result import FitReport
 from relay_autotune.identification.shown.fourier import FrequencyPoint
-from relay_autotune.loop.gains import NUMBERS, Gains
+from relay_autotune.loop.gains import Gains
+from relay_autotune.process.structures import GivenModel
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
@@ -169,14 +171,14 @@ def test_no_cycle_is_refused() -> None:
         record_from_cycles([])
 
 
-def identification(model: TransferFunction) -> Any:
-    return SimpleNamespace(
-        model=model,
+def identification(model: TransferFunction) -> Identification:
+    return Identification(
         method="waveform",
-        structure=model.structure,
-        parameters=("gain", "time_constant"),
-        std=np.array([0.1, 0.2]),
-        covariance=np.array([[0.01, 0.0], [0.0, 0.04]]),
+        estimate=Estimate(
+            GivenModel.of(model, ("gain", "time_constant")),
+            np.array([2.0, 3.0]),
+            np.array([[0.01, 0.0], [0.0, 0.04]]),
+        ),
         ci95_low=np.array([1.0, 2.0]),
         ci95_high=np.array([3.0, 4.0]),
         ultimate_gain=3.0,
@@ -188,7 +190,6 @@ def identification(model: TransferFunction) -> Any:
         integrated_error=0.3,
         points=(FrequencyPoint(1.5, 2.0 - 3.0j, 0.1),),
         warnings=("mind",),
-        undetermined=(),
         combinations=(Combination("gain/time_constant", "y/(u s)", 0.5, 0.01, 0.48, 0.52),),
         advice=("step longer",),
         support=0.8,
@@ -225,17 +226,6 @@ def test_a_complex_pair_is_left_to_the_polynomials() -> None:
     fill_transfer_function(message, identification(model))
     assert list(message.time_constants) == []
     assert list(message.denominator) == pytest.approx([4.0, 0.8, 1.0])
-
-
-def test_gains_are_written_field_by_field() -> None:
-    numbers = {name: float(k) for k, name in enumerate(NUMBERS)}
-    message = SimpleNamespace(header=header())
-    gains: Any = SimpleNamespace(
-        rule="itae", form="isa", reason="why", warnings=("mind",), **numbers
-    )
-    fill_gains(message, gains, experiment_id="one")
-    assert {name: getattr(message, name) for name in numbers} == numbers
-    assert (message.rule, message.form, message.final) == ("itae", "isa", True)
 
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -320,7 +310,7 @@ def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
     message = empty_message()
     fill_experiment(message, record())
     setattr(message.settings, name, value)
-    with pytest.raises(RecordError, match=f"the relay's {name} is"):
+    with pytest.raises(RecordError, match=f"{name} of the relay is"):
         record_from_message(message)
 
 

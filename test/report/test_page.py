@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from report_cases import MODEL, aborted, completed, fruitless, only
 
-from relay_autotune.exchange.document import document, model_fields, to_json
+from relay_autotune.exchange.document import document, to_json
+from relay_autotune.exchange.models import model_fields
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Rival, identified

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.quantities import told
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 FloatArray = NDArray[np.float64]
@@ -19,17 +20,16 @@ _SMALL_ANGLE = 0.2
 
 @dataclass(frozen=True)
 class FrequencyPoint:
-    """The process at one frequency.
+    """The process at one frequency."""
 
-    :param frequency: w [rad/s].
-    :param value: G(j w) [y/u].
-    :param std: standard deviation of its real and of its imaginary part [y/u]; NaN: not
-        estimated.
-    """
-
-    frequency: float
-    value: complex
-    std: float = math.nan
+    frequency: float = told("rad/s", "w.", nan=True)
+    value: complex = told("y/u", "G(j w).", nan=True)
+    std: float = told(
+        "y/u",
+        "Standard deviation of its real and of its imaginary part; NaN: not estimated.",
+        math.nan,
+        lower=0.0,
+    )
 
 
 def fourier_integral_held(u: PiecewiseConstant, start: float, end: float, w: float) -> complex:

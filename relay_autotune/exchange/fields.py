@@ -1,0 +1,367 @@
+"""Results as documents and as messages, and back, by what their fields declare.
+
+A field is declared once, by :func:`relay_autotune.quantities.told`; what its type means in a
+document and in a message is said here, once for all results.
+"""
+
+from __future__ import annotations
+
+import array
+import enum
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import MISSING, dataclass, is_dataclass
+from functools import cache
+from types import UnionType
+from typing import Any, get_args, get_origin
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.quantities import Told, told_fields
+
+# How far a number that follows from others may be from what they make it, by rounding.
+_SAME = 1e-9
+
+
+def float64_array(values: ArrayLike) -> array.array[float]:
+    """Copy numbers into the array type that rclpy takes without looking at each of them.
+
+    :param values: any shape; flattened row by row.
+    """
+    flat = np.ascontiguousarray(values, dtype=np.float64)
+    return array.array("d", flat.tobytes())
+
+
+@cache
+def _part_of(kind: Any) -> tuple[Any, bool]:
+    """Return the class of the results that a field holds, or None, and whether it holds many."""
+    if isinstance(kind, UnionType):
+        kind = next(each for each in get_args(kind) if each is not type(None))
+    many = get_origin(kind) is tuple
+    if many:
+        kind = get_args(kind)[0]
+    return (kind if is_dataclass(kind) else None), many
+
+
+@dataclass(frozen=True)
+class Special:
+    """How a class is written and read that does it otherwise than by its fields.
+
+    :param to_document: its fields in documents; those of the result that holds it lie beside
+        them.
+    :param of_document: the way back.
+    :param to_message: writes it into a message.
+    :param of_message: the way back; as :func:`of_message`.
+    """
+
+    to_document: Callable[[Any], dict[str, Any]]
+    of_document: Callable[[Any], Any]
+    to_message: Callable[[Any, Any], None] | None = None
+    of_message: Callable[[Any, type[RelayAutotuneError], str], Any] | None = None
+
+
+_SPECIAL: dict[type, Special] = {}
+
+
+def register(kind: type, special: Special) -> None:
+    """Say how a class is written and read.
+
+    :param kind: the class.
+    :param special: the functions that do it.
+    """
+    _SPECIAL[kind] = special
+
+
+# Documents.
+
+
+def to_document(value: object) -> dict[str, Any]:
+    """Return a result as it appears in documents.
+
+    :param value: an instance of a class that declares its fields.
+    """
+    special = _SPECIAL.get(type(value))
+    if special is not None:
+        return dict(special.to_document(value))
+    found: dict[str, Any] = {}
+    kind: Any = type(value)
+    for each in told_fields(kind):
+        held = getattr(value, each.name)
+        name = each.document or each.name
+        if each.document is None:
+            continue
+        part, many = _part_of(each.kind)
+        if part is not None and many:
+            found[name] = [to_document(item) for item in held]
+        elif part is not None and part in _SPECIAL:
+            found |= to_document(held)
+        elif part is not None:
+            found[name] = None if held is None else to_document(held)
+        elif each.kind is complex:
+            found |= {"real": json_number(held.real), "imaginary": json_number(held.imag)}
+        elif isinstance(held, np.ndarray):
+            told = named(value.parameters, held)  # type: ignore[attr-defined]
+            found[name] = (
+                {n: [low, told[n]] for n, low in found[name].items()} if name in found else told
+            )
+        elif name in found:
+            found[name] = [found[name], json_number(held)]
+        elif isinstance(held, enum.Enum):
+            found[name] = held.name.lower()
+        else:
+            found[name] = _plain(held)
+    return found
+
+
+def of_document(kind: Any, document: Any, **given: Any) -> Any:
+    """Return the result that a document tells.
+
+    A field that documents of earlier versions lack has its default.
+
+    :param kind: class of the result.
+    :param document: as `json` reads it.
+    :param given: fields that are known otherwise.
+    :raises LookupError, TypeError, ValueError, AttributeError: if it tells no such result.
+    """
+    special = _SPECIAL.get(kind)
+    if special is not None:
+        return special.of_document(document)
+    found = dict(given)
+    seen: set[str] = set()
+    for each in told_fields(kind):
+        if each.document is None or each.derived or each.name in given:
+            continue
+        name = each.document or each.name
+        part, many = _part_of(each.kind)
+        if part is not None and not many and part in _SPECIAL:
+            found[each.name] = of_document(part, document)
+        elif each.kind is complex:
+            found[each.name] = complex(number(document["real"]), number(document["imaginary"]))
+        elif name in document or each.default is MISSING:
+            held = document[name]
+            if each.document:
+                # Two fields share the name: the lower end, then the upper one.
+                held = _end(held, 1 if name in seen else 0)
+                seen.add(name)
+            found[each.name] = _of_json(each, held, part, many, document)
+    return kind(**found)
+
+
+def _end(held: Any, which: int) -> Any:
+    if isinstance(held, dict):
+        return {name: _end(ends, which) for name, ends in held.items()}
+    low, high = held
+    return (low, high)[which]
+
+
+def _of_json(each: Told, held: Any, part: Any, many: bool, document: dict[str, Any]) -> Any:
+    if part is not None and many:
+        return tuple(of_document(part, item) for item in held)
+    if part is not None:
+        return None if held is None else of_document(part, held)
+    if get_origin(each.kind) is np.ndarray:
+        return np.array([number(held[name]) for name in document["values"]])
+    if get_origin(each.kind) is tuple:
+        return tuple(map(get_args(each.kind)[0], held))
+    if isinstance(each.kind, enum.EnumType):
+        return each.kind[str(held).upper()]
+    if each.word:
+        return word(held)
+    if each.kind is float:
+        return each.null if held is None else float(held)
+    return each.kind(held)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, str | tuple):
+        return list(value) if isinstance(value, tuple) else value
+    return json_number(value)
+
+
+def json_number(value: Any) -> Any:
+    """Return what JSON has for a number: null for none, [re, im] for a complex one."""
+    if isinstance(value, bool | int):
+        return value
+    told = complex(value)
+    if told.imag != 0.0:
+        return [json_number(told.real), json_number(told.imag)]
+    return told.real if math.isfinite(told.real) else None
+
+
+def json_numbers(values: Iterable[complex]) -> list[Any]:
+    """Return several numbers as JSON has them."""
+    return [json_number(value) for value in values]
+
+
+def named(names: Sequence[str], values: Iterable[float]) -> dict[str, Any]:
+    """Return numbers by their names, as JSON has them."""
+    return {name: json_number(value) for name, value in zip(names, values, strict=True)}
+
+
+def number(value: Any) -> float:
+    """Return a number of a document; NaN for null."""
+    return math.nan if value is None else float(value)
+
+
+def word(value: Any) -> str:
+    """Return the name of a method, a rule or a parameter.
+
+    :raises ValueError: if it is not made of letters, digits and underscores.
+    """
+    if not isinstance(value, str) or not value.isidentifier():
+        raise ValueError(f"{value!r} is no name")
+    return value
+
+
+def columns(kind: Any) -> tuple[str, ...]:
+    """Return the fields of a result that are columns of tables of many bags."""
+    found = sorted((f for f in told_fields(kind) if f.column), key=lambda f: f.column)
+    return tuple(f.name for f in found)
+
+
+# Messages.
+
+
+def to_message(message: Any, value: object, prefix: str = "") -> None:
+    """Write a result into the fields of a message.
+
+    :param message: of rclpy, or a stand-in with the same fields.
+    :param value: an instance of a class that declares its fields.
+    :param prefix: of the names of its fields.
+    """
+    special = _SPECIAL.get(type(value))
+    if special is not None and special.to_message is not None:
+        special.to_message(message, value)
+        return
+    kind: Any = type(value)
+    for each in told_fields(kind):
+        if each.message is None:
+            continue
+        held, name = getattr(value, each.name), each.message or prefix + each.name
+        part, many = _part_of(each.kind)
+        if part is not None and many:
+            _write_columns(message, held, part, each.prefix)
+        elif part is not None:
+            to_message(message, part() if held is None else held, each.prefix)
+        elif get_origin(each.kind) is np.ndarray:
+            setattr(message, name, float64_array(held))
+        elif get_origin(each.kind) is tuple:
+            setattr(message, name, list(map(str, held)))
+        else:
+            setattr(message, name, each.kind(held))
+
+
+def _parts(each: Told, prefix: str) -> tuple[tuple[str, str], ...]:
+    """Return the names in messages of what makes up a field, each with the attribute it is."""
+    if each.kind is complex:
+        return (f"{prefix}real", "real"), (f"{prefix}imaginary", "imag")
+    return ((each.message or prefix + each.name, ""),)
+
+
+def _write_columns(message: Any, items: Sequence[object], kind: type, prefix: str) -> None:
+    for each in told_fields(kind):
+        held = [getattr(item, each.name) for item in items]
+        for name, which in _parts(each, prefix):
+            values = [getattr(value, which) for value in held] if which else held
+            setattr(message, name, list(values) if each.kind is str else float64_array(values))
+
+
+def of_message(
+    kind: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str = ""
+) -> Any:
+    """Return the result that a message tells.
+
+    :param kind: class of the result.
+    :param message: of rclpy, or decoded from a bag.
+    :param error: what to raise.
+    :param of: what the fields belong to, as in "of the model".
+    :param prefix: of the names of its fields.
+    :raises RelayAutotuneError: of that kind, if a number is outside of its declared range, arrays
+        that go together differ in length, or a number is another one than those that it follows
+        from make it.
+    """
+    special = _SPECIAL.get(kind)
+    if special is not None and special.of_message is not None:
+        return special.of_message(message, error, of)
+    found: dict[str, Any] = {}
+    for each in told_fields(kind):
+        if each.message is None or each.derived:
+            continue
+        part, many = _part_of(each.kind)
+        if part is not None and many:
+            found[each.name] = _read_columns(part, message, error, of, each.prefix)
+        elif part is not None:
+            told = of_message(part, message, error, of, each.prefix)
+            # Of what was not computed, every number is told as such.
+            absent = each.default is None and repr(told) == repr(part())
+            found[each.name] = None if absent else told
+        else:
+            found[each.name] = _of_field(each, message, error, of, prefix)
+    value = kind(**found)
+    _check_derived(value, message, error, of, prefix)
+    return value
+
+
+def _of_field(
+    each: Told, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
+) -> Any:
+    name = each.message or prefix + each.name
+    held = getattr(message, name)
+    if get_origin(each.kind) is np.ndarray:
+        held = np.asarray(held, dtype=np.float64)
+        _require_length(name, held, message.parameters, "parameters", error, of)
+    elif get_origin(each.kind) is tuple:
+        held = tuple(map(get_args(each.kind)[0], held))
+    else:
+        held = each.kind(held)
+    problem = each.problem(held) if isinstance(held, float | np.ndarray) else None
+    if problem is not None:
+        raise error(f"{name} {of} {problem}")
+    return held
+
+
+def _read_columns(
+    kind: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
+) -> tuple[Any, ...]:
+    told: dict[str, list[Any]] = {}
+    first = ""
+    for each in told_fields(kind):
+        parts = []
+        for name, _ in _parts(each, prefix):
+            held, first = list(getattr(message, name)), first or name
+            _require_length(name, held, getattr(message, first), first, error, of)
+            problem = None if each.kind is str else each.problem(held)
+            if problem is not None:
+                raise error(f"{name} {of} {problem}")
+            parts.append(held)
+        told[each.name] = list(map(each.kind, *parts))
+    return tuple(
+        kind(**dict(zip(told, row, strict=True))) for row in zip(*told.values(), strict=True)
+    )
+
+
+def _require_length(
+    name: str, found: Any, like: Any, first: str, error: type[RelayAutotuneError], of: str
+) -> None:
+    if len(found) != len(like):
+        raise error(
+            f"{name} {of} has {len(found)} numbers, expected {len(like)}: one for each of {first}"
+        )
+
+
+def _check_derived(
+    value: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
+) -> None:
+    kind: Any = type(value)
+    derived = [f for f in told_fields(kind) if f.derived]
+    said = {f.name: float(getattr(message, prefix + f.name)) for f in derived}
+    # Who writes a message by hand may leave out what follows from the rest.
+    for name in said if any(said.values()) else ():
+        follows = getattr(value, name)
+        if not abs(said[name] - follows) <= _SAME * abs(follows):
+            raise error(
+                f"{name} {of} is {said[name]:g}, but the other numbers make it {follows:g}: they "
+                f"contradict each other"
+            )

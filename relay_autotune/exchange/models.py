@@ -1,0 +1,188 @@
+"""Models in documents and messages: the transfer function, its parameters, how sure they are."""
+
+from __future__ import annotations
+
+import array
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from relay_autotune.errors import ModelError, RelayAutotuneError
+from relay_autotune.exchange.fields import (
+    Special,
+    float64_array,
+    json_number,
+    json_numbers,
+    named,
+    number,
+    register,
+    word,
+)
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import Rival
+from relay_autotune.process.structures import GENERAL, structure_of
+from relay_autotune.process.transfer_function import TransferFunction
+
+# The roots of more take long, and no structure has as many.
+_MOST_COEFFICIENTS = 50
+# How far the polynomials may be from what the parameters make them, by rounding.
+_SAME = 1e-6
+# What a model is in documents, and in the tables of many bags.
+COLUMNS = ("structure", "gain", "zeros", "time_constants", "dead_time")
+
+
+def model_fields(model: TransferFunction) -> dict[str, Any]:
+    """Return a transfer function as it appears in documents."""
+    return {
+        "gain": json_number(model.gain),
+        "zeros": json_numbers(model.zeros),
+        "time_constants": json_numbers(model.time_constants),
+        "dead_time": json_number(model.dead_time),
+        "numerator": json_numbers(model.numerator),
+        "denominator": json_numbers(model.denominator),
+    }
+
+
+def model_of_fields(m: dict[str, Any]) -> TransferFunction:
+    """Return the transfer function that :func:`model_fields` tells.
+
+    :raises ModelError: if it is none.
+    """
+    found = TransferFunction.from_polynomials(
+        [number(c) for c in m["numerator"]],
+        [number(c) for c in m["denominator"]],
+        number(m["dead_time"]),
+        str(m.get("structure", GENERAL)),
+    )
+    constants = tuple(_complex(c) for c in m["time_constants"])
+    zeros = tuple(_complex(c) for c in m["zeros"])
+    # Roots of the polynomials would come back rounded.
+    return TransferFunction(
+        number(m["gain"]), zeros, constants, found.integrators, found.dead_time, found.structure
+    )
+
+
+def _complex(value: Any) -> complex:
+    return complex(*map(float, value)) if isinstance(value, list) else complex(float(value))
+
+
+def _estimate_fields(estimate: Estimate) -> dict[str, Any]:
+    names, finite = estimate.structure.names, bool(np.all(np.isfinite(estimate.covariance)))
+    return {
+        "structure": estimate.model.structure,
+        **model_fields(estimate.model),
+        "values": named(names, estimate.values),
+        "std": named(names, estimate.std),
+        # By rows; null where any of it was not estimated.
+        "covariance": [json_numbers(row) for row in estimate.covariance] if finite else None,
+    }
+
+
+def _estimate_of_fields(m: dict[str, Any]) -> Estimate:
+    model, names = model_of_fields(m), tuple(map(word, m["values"]))
+    if m["covariance"] is None:
+        covariance = np.full((len(names), len(names)), math.nan)
+        np.fill_diagonal(covariance, [number(m["std"][n]) ** 2 for n in names])
+    else:
+        covariance = np.array(m["covariance"], dtype=float).reshape(len(names), len(names))
+    values = np.array([number(v) for v in m["values"].values()])
+    return Estimate(structure_of(model, names), values, covariance)
+
+
+def _rival_fields(rival: Rival) -> dict[str, Any]:
+    return {
+        "structure": rival.model.structure,
+        "support": json_number(rival.support),
+        **model_fields(rival.model),
+    }
+
+
+def _rival_of_fields(r: dict[str, Any]) -> Rival:
+    return Rival(Estimate.of_model(model_of_fields(r)), number(r["support"]))
+
+
+def _estimate_to_message(message: Any, estimate: Estimate) -> None:
+    model = estimate.model
+    message.structure = model.structure
+    message.gain = float(model.gain)
+    message.zeros = _real(model.zeros)
+    message.time_constants = _real(model.time_constants)
+    message.numerator = float64_array(model.numerator)
+    message.denominator = float64_array(model.denominator)
+    message.dead_time = float(model.dead_time)
+    message.order = int(model.order)
+    message.parameters = list(estimate.structure.names)
+    message.std = float64_array(estimate.std)
+    message.covariance = float64_array(estimate.covariance)
+
+
+def _real(values: Sequence[complex]) -> array.array[float]:
+    # The fields hold real numbers; a complex pair is told by numerator and denominator alone.
+    if any(complex(value).imag != 0.0 for value in values):
+        return array.array("d")
+    return array.array("d", (complex(value).real for value in values))
+
+
+def model_of_message(message: Any) -> TransferFunction:
+    """Return the transfer function that a `TransferFunction` message tells by its polynomials.
+
+    :raises ModelError: if it is none, or too large.
+    """
+    if max(len(message.numerator), len(message.denominator)) > _MOST_COEFFICIENTS:
+        raise ModelError(
+            f"the model has {len(message.numerator)} and {len(message.denominator)} "
+            f"coefficients, expected {_MOST_COEFFICIENTS} at most"
+        )
+    return TransferFunction.from_polynomials(
+        tuple(float(c) for c in message.numerator),
+        tuple(float(c) for c in message.denominator),
+        dead_time=float(message.dead_time),
+        structure=str(message.structure) or GENERAL,
+    )
+
+
+def _estimate_of_message(message: Any, error: type[RelayAutotuneError], of: str) -> Estimate:
+    model, names = model_of_message(message), tuple(map(str, message.parameters))
+    std = np.asarray(message.std, dtype=np.float64)
+    covariance = np.asarray(message.covariance, dtype=np.float64)
+    for name, found, expected in (
+        ("std", std.size, len(names)),
+        ("covariance", covariance.size, len(names) ** 2),
+    ):
+        if found != expected:
+            raise error(
+                f"{name} {of} has {found} numbers, expected {expected}: one for each of parameters"
+            )
+    if bool(np.any(std < 0.0)):
+        raise error(f"std {of} has a negative number, expected >= 0 or NaN")
+    covariance = covariance.reshape(len(names), len(names))
+    if len(message.time_constants) + model.integrators == model.order:
+        # Roots of the polynomials are rounded.
+        zeros = tuple(map(complex, message.zeros)) or model.zeros
+        constants = tuple(map(complex, message.time_constants))
+        exact = TransferFunction(
+            float(message.gain), zeros, constants, model.integrators, model.dead_time,
+            model.structure,
+        )  # fmt: skip
+    else:
+        exact = model
+    structure = structure_of(exact, names)
+    values = structure.values_of(exact)
+    found_model = structure.build(values)
+    for name in ("numerator", "denominator"):
+        told, follows = list(getattr(message, name)), list(getattr(found_model, name))
+        if len(told) != len(follows) or not np.allclose(told, follows, rtol=_SAME, atol=0.0):
+            raise error(
+                f"{name} {of} is {told}, but its gain and time constants make it {follows}: they "
+                f"contradict each other"
+            )
+    return Estimate(structure, values, covariance)
+
+
+register(
+    Estimate,
+    Special(_estimate_fields, _estimate_of_fields, _estimate_to_message, _estimate_of_message),
+)
+register(Rival, Special(_rival_fields, _rival_of_fields))
