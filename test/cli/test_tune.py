@@ -12,7 +12,7 @@ import yaml
 
 from relay_autotune.cli import tune
 from relay_autotune.cli.tune_model import model_of
-from relay_autotune.exchange.document import model_fields
+from relay_autotune.exchange.models import model_fields
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, design
 from relay_autotune.tuning.compensators import COMPENSATORS

@@ -16,10 +16,11 @@ from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.messages import fill_transfer_function
 from relay_autotune.identification import Estimate, Known, identify
 from relay_autotune.identification.judgement.assessment import assess, fit_of_model
-from relay_autotune.identification.judgement.validation import DIFFERENCES, integrated_error
+from relay_autotune.identification.judgement.validation import Validation, integrated_error
 from relay_autotune.identification.waveform.residuals import noise_to_signal
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.quantities import told_fields
 from relay_autotune.record.record import Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.0, 2.0, 1.0)
@@ -85,7 +86,7 @@ def test_json_table_and_message_carry_all_of_it(record, models):
     analysis = Analysis(record, models=tuple(models), selected=0)
     shown = json.loads(to_json(document("x", [analysis])))["experiments"][0]["models"]
     for model, fields in zip(models, shown, strict=True):
-        for name in DIFFERENCES:
+        for name in (f.name for f in told_fields(Validation)):
             assert fields["validation"][name] == getattr(model.validation, name)
         assert fields["fit"]["noise_to_signal_power"] == model.fit.noise_to_signal_power
         assert [p["frequency"] for p in fields["points"]] == [p.frequency for p in model.points]
