@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from relay_autotune.bag.experiments import interrupted_experiment, recorded_experiments
 from relay_autotune.bag.limits import LARGEST_CHUNK
@@ -17,8 +18,12 @@ from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.record import Record
 
+if TYPE_CHECKING:
+    from relay_autotune.bag.sqlite_file import SqliteFile
+
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
-_WHOLE = ([".mcap", ".zstd"], [".mcap", ".zst"])
+_STORED = (".mcap", ".db3")
+_WHOLE = tuple([kind, end] for kind in _STORED for end in (".zstd", ".zst"))
 
 
 @dataclass(frozen=True)
@@ -74,8 +79,8 @@ def read_experiments(
     else an experiment of relay_node whose recording was cut short; else the one pair of topics
     that looks like measurement and command.
 
-    :param path: a rosbag2 directory, an MCAP file, or a CSV file (by its ending); or several of
-        the first two that are one timeline.
+    :param path: a rosbag2 directory, an MCAP or ``.db3`` file, or a CSV file (by its ending); or
+        several of the first three that are one timeline.
     :param selection: what is wanted of it; default: everything.
     :param progress: told of how far a bag has been read.
     :raises SelectionError: if the selection does not fit, or more than one pair does.
@@ -92,7 +97,7 @@ def read_experiments(
     else:
         with ExitStack() as opened:
             files = [
-                opened.enter_context(McapFile(file, wanted.largest_chunk))
+                opened.enter_context(_opened(file, wanted.largest_chunk))
                 for part in paths
                 for file in _data_files(part)
             ]
@@ -109,6 +114,15 @@ def read_experiments(
     return Recording(path, parts, tuple(notes))
 
 
+def _opened(path: Path, largest: int) -> McapFile | SqliteFile:
+    if ".db3" in path.suffixes[-2:]:
+        # Imported here: most recordings need no database.
+        from relay_autotune.bag.sqlite_file import SqliteFile
+
+        return SqliteFile(path, largest)
+    return McapFile(path, largest)
+
+
 def _data_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
@@ -117,19 +131,17 @@ def _data_files(path: Path) -> list[Path]:
     except OSError as error:
         raise BagError(f"cannot read {path}: {error.strerror or error}") from error
     # The folder itself counts: a killed recorder's metadata.yaml is missing or out of date.
-    files = [entry for entry in entries if entry.suffix == ".mcap"]
+    files = [entry for entry in entries if entry.suffix in _STORED]
     plain = {file.name for file in files}
     # A recorder that was killed while it compressed leaves both.
     files += [e for e in entries if e.suffixes[-2:] in _WHOLE and e.stem not in plain]
     files.sort(key=_natural)
     if not files:
         found = ", ".join(entry.name for entry in entries[:5]) or "nothing"
-        advice = (
-            "convert it with: ros2 bag convert"
-            if any(entry.suffix == ".db3" for entry in entries)
-            else "expected a rosbag2 directory with .mcap files"
+        raise BagError(
+            f"the directory {path} holds no .mcap or .db3 file, but {found}; expected a rosbag2 "
+            "directory"
         )
-        raise BagError(f"the directory {path} holds no .mcap file, but {found}; {advice}")
     return files
 
 

@@ -23,6 +23,7 @@ from relay_autotune.bag.packages import expanding_package
 from relay_autotune.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
+SQLITE_MAGIC = b"SQLite format 3\0"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 # Of each range that is announced at most so much is fetched before it is read.
@@ -30,7 +31,7 @@ _ANNOUNCED = 64 << 10
 
 # What the file might be instead, by its first bytes.
 _OTHERS = (
-    (b"SQLite format 3", "an SQLite file; convert such a bag with: ros2 bag convert"),
+    (b"SQLite format 3", "an SQLite file; expected a name that ends with .db3"),
     (b"#ROSBAG", "a ROS 1 bag; convert it with: rosbags-convert"),
 )
 
@@ -59,18 +60,21 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 class Source:
-    """A file that begins as MCAP files do, open for reading ranges of it.
+    """A file that begins as recordings do, open for reading ranges of it.
 
     The file is read, not mapped: a file that another process cuts short then gives fewer bytes,
     where a mapping would end this process.
 
     :param path: the file; it may be compressed as a whole with zstd.
+    :param magic: the bytes with which it has to begin.
     :raises BagError: if it is missing, unreadable, empty or something else.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, magic: bytes = MAGIC) -> None:
         self.path = path
         self.notes: list[str] = []
+        self._magic = magic
+        self._kind = "an MCAP file" if magic == MAGIC else "a rosbag2 file in SQLite"
         self._file = open_regular(path)
         try:
             if self.read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
@@ -80,6 +84,10 @@ class Source:
         except BaseException:
             self.close()
             raise
+
+    def fileno(self) -> int:
+        """Return the descriptor of the open file."""
+        return self._file.fileno()
 
     def look_again(self) -> None:
         """Take the size that the file has now; it may have grown or shrunk."""
@@ -129,13 +137,13 @@ class Source:
                 f"{self.path} is empty (0 bytes); expected an MCAP recording: "
                 f"the recorder was ended before it wrote anything"
             )
-        if start[: len(MAGIC)] != MAGIC[: len(start)]:
+        if start[: len(self._magic)] != self._magic[: len(start)]:
             told = next((what for head, what in _OTHERS if start.startswith(head)), None)
             found = f"it is {told}" if told else f"it begins with {start[:8]!r}"
-            raise BagError(f"{self.path} is not an MCAP file: {found}")
-        if len(start) < len(MAGIC):
+            raise BagError(f"{self.path} is not {self._kind}: {found}")
+        if len(start) < len(self._magic):
             raise BagError(
-                f"{self.path} holds only the first {len(start)} bytes of an MCAP file; "
+                f"{self.path} holds only the first {len(start)} bytes of {self._kind}; "
                 f"nothing was recorded in it"
             )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from relay_autotune.bag.schema import Struct, message_type
 from relay_autotune.bag.timing import SignalReader, TimedSignal
 from relay_autotune.errors import BagError
 from relay_autotune.record.record import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from relay_autotune.bag.sqlite_file import SqliteFile
 
 # Told of how far a file has been read: bytes done, bytes in all.
 Progress = Callable[[int, int], None]
@@ -56,7 +59,7 @@ class Topics:
     """
 
     path: FilePath
-    files: Sequence[McapFile]
+    files: Sequence[McapFile | SqliteFile]
     clock: str = "publish"
     progress: Progress | None = None
     _signals: dict[str, TimedSignal] = field(default_factory=dict)

@@ -361,7 +361,7 @@ def test_directories_without_a_bag(tmp_path):
     with pytest.raises(BagError, match=r"holds no \.mcap file, but nothing"):
         read_experiments(tmp_path)
     (tmp_path / "old_0.db3").write_bytes(b"")
-    with pytest.raises(BagError, match=r"old_0\.db3; convert it with: ros2 bag convert"):
+    with pytest.raises(BagError, match=r"old_0\.db3 is empty"):
         read_experiments(tmp_path)
 
 

@@ -1,0 +1,103 @@
+"""Recordings of rosbag2 in SQLite."""
+
+from __future__ import annotations
+
+import sqlite3
+
+import numpy as np
+import pytest
+import zstandard
+
+from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.writer import encode_float64
+from relay_autotune.errors import BagError
+
+NAMES = Selection("/y", "/u")
+DEFINITION = "float64 data\n"
+
+
+def bag(path, first=0, last=60, *, definitions=True, pack=bytes):
+    database = sqlite3.connect(path)
+    database.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+        " serialization_format TEXT, offered_qos_profiles TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+        " data BLOB);"
+    )
+    if definitions:
+        database.execute(
+            "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT,"
+            " encoding TEXT, encoded_message_definition TEXT, type_description_hash TEXT)"
+        )
+        database.execute(
+            "INSERT INTO message_definitions VALUES(1, ?, 'ros2msg', ?, '')",
+            ("std_msgs/msg/Float64", DEFINITION),
+        )
+    for number, name in ((1, "/y"), (2, "/u")):
+        database.execute(
+            "INSERT INTO topics VALUES(?, ?, 'std_msgs/msg/Float64', 'cdr', '')", (number, name)
+        )
+    for k in range(first, last):
+        time = 1_790_000_000_000_000_000 + k * 100_000_000
+        for topic, value in ((1, k % 7 + 0.5), (2, float(k // 5 % 2))):
+            database.execute(
+                "INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)",
+                (topic, time, pack(encode_float64(value))),
+            )
+    database.commit()
+    database.close()
+    return path
+
+
+def check(path):
+    (record,) = read_experiments(path, Selection("/y", "/u", start=0.0)).experiments
+    np.testing.assert_allclose(record.time, np.arange(60) * 0.1, atol=1e-9)
+    np.testing.assert_array_equal(record.measurement, np.arange(60) % 7 + 0.5)
+    np.testing.assert_allclose(record.input().times, np.arange(5, 60, 5) * 0.1, atol=1e-9)
+    assert record.start == 1_790_000_000.0
+
+
+def test_a_single_file(tmp_path):
+    check(bag(tmp_path / "a.db3"))
+
+
+def test_a_file_without_definitions_uses_those_that_are_installed(tmp_path):
+    check(bag(tmp_path / "a.db3", definitions=False))
+
+
+def test_a_directory_of_split_files(tmp_path):
+    bag(tmp_path / "bag_0.db3", 0, 20)
+    bag(tmp_path / "bag_1.db3", 20, 45)
+    bag(tmp_path / "bag_2.db3", 45, 60)
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    check(tmp_path)
+
+
+def test_messages_that_are_compressed_one_by_one(tmp_path):
+    check(bag(tmp_path / "a.db3", pack=zstandard.ZstdCompressor().compress))
+
+
+def test_a_file_that_is_compressed_as_a_whole(tmp_path):
+    plain = bag(tmp_path / "a.db3")
+    packed = tmp_path / "b.db3.zstd"
+    packed.write_bytes(zstandard.ZstdCompressor().compress(plain.read_bytes()))
+    check(packed)
+
+
+def test_what_is_no_such_file_is_a_sentence(tmp_path):
+    (tmp_path / "a.db3").write_bytes(b"no database at all")
+    with pytest.raises(BagError, match="is not a rosbag2 file in SQLite"):
+        read_experiments(tmp_path / "a.db3", NAMES)
+    whole = bag(tmp_path / "b.db3").read_bytes()
+    (tmp_path / "c.db3").write_bytes(whole[:100] + b"\xff" * 4000)
+    with pytest.raises(BagError, match="cannot be read as a rosbag2 file in SQLite"):
+        read_experiments(tmp_path / "c.db3", NAMES)
+    other = sqlite3.connect(tmp_path / "d.db3")
+    other.executescript(
+        "CREATE TABLE topics(id INTEGER);"
+        "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+        " SELECT x AS id FROM c;"
+    )
+    other.close()
+    with pytest.raises(BagError, match="without the tables topics and messages"):
+        read_experiments(tmp_path / "d.db3", NAMES)
