@@ -96,11 +96,10 @@ def read_experiments(
         raise SelectionError(f"--time names a column of a CSV file, but {path} is none")
     else:
         with ExitStack() as opened:
-            files = [
-                opened.enter_context(_opened(file, wanted.largest_chunk))
-                for part in paths
-                for file in _data_files(part)
-            ]
+            files: list[McapFile | SqliteFile] = []
+            for file in (file for part in paths for file in _data_files(part)):
+                files.append(_opened(file, wanted.largest_chunk))
+                opened.enter_context(files[-1])
             topics = Topics(path, files, wanted.clock, progress)
             try:
                 records, notes = _of_topics(topics, wanted)
