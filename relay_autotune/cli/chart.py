@@ -189,7 +189,7 @@ ANY, POSITIVE, NOT_NEGATIVE, NOT_ZERO = "", "> 0", ">= 0", "not 0"
 
 
 @dataclass(frozen=True)
-class Number:
+class ChartNumber:
     """A number that the command line may give.
 
     :param unit: its unit.
@@ -222,33 +222,37 @@ class Chart:
 
 
 # The methods get "gain" and "dead_time" by their argument `known`.
-NUMBERS: dict[str, Number] = {
-    "period": Number("s", "period of the limit cycle", POSITIVE),
-    "period_high": Number("s", "time that the command stays high", POSITIVE),
-    "period_low": Number("s", "time that the command stays low", POSITIVE),
-    "amplitude": Number("y", "half of peak to peak of the measurement", POSITIVE),
-    "peak_max": Number("y", "highest measurement, from its steady state"),
-    "peak_min": Number("y", "lowest measurement, from its steady state"),
-    "relay": Number("u", "amplitude of the relay, half the distance of its levels", POSITIVE),
-    "bias": Number("u", "middle of the relay's levels, from the steady state"),
-    "hysteresis": Number("y", "half width of the switching band, 0 if not given", NOT_NEGATIVE),
-    "gain": Number("y/u", "static gain of the process", NOT_ZERO),
-    "dead_time": Number("s", "dead time of the process", NOT_NEGATIVE),
-    "extra_delay": Number("s", "dead time added to the relay, in the second test", POSITIVE),
-    "period_2": Number("s", "period in the second test", POSITIVE),
-    "amplitude_2": Number("y", "half of peak to peak in the second test", POSITIVE),
-    "relay_2": Number("u", "amplitude of the relay in the second test, if another", POSITIVE),
-    "mean_measurement": Number("y", "mean over whole cycles, from the steady state"),
-    "mean_command": Number("u", "mean over whole cycles, from the steady state"),
-    "time_to_peak": Number("s", "from a switch to the peak after it", POSITIVE),
-    "rise": Number(
+NUMBERS: dict[str, ChartNumber] = {
+    "period": ChartNumber("s", "period of the limit cycle", POSITIVE),
+    "period_high": ChartNumber("s", "time that the command stays high", POSITIVE),
+    "period_low": ChartNumber("s", "time that the command stays low", POSITIVE),
+    "amplitude": ChartNumber("y", "half of peak to peak of the measurement", POSITIVE),
+    "peak_max": ChartNumber("y", "highest measurement, from its steady state"),
+    "peak_min": ChartNumber("y", "lowest measurement, from its steady state"),
+    "relay": ChartNumber("u", "amplitude of the relay, half the distance of its levels", POSITIVE),
+    "bias": ChartNumber("u", "middle of the relay's levels, from the steady state"),
+    "hysteresis": ChartNumber(
+        "y", "half width of the switching band, 0 if not given", NOT_NEGATIVE
+    ),
+    "gain": ChartNumber("y/u", "static gain of the process", NOT_ZERO),
+    "dead_time": ChartNumber("s", "dead time of the process", NOT_NEGATIVE),
+    "extra_delay": ChartNumber("s", "dead time added to the relay, in the second test", POSITIVE),
+    "period_2": ChartNumber("s", "period in the second test", POSITIVE),
+    "amplitude_2": ChartNumber("y", "half of peak to peak in the second test", POSITIVE),
+    "relay_2": ChartNumber("u", "amplitude of the relay in the second test, if another", POSITIVE),
+    "mean_measurement": ChartNumber("y", "mean over whole cycles, from the steady state"),
+    "mean_command": ChartNumber("u", "mean over whole cycles, from the steady state"),
+    "time_to_peak": ChartNumber("s", "from a switch to the peak after it", POSITIVE),
+    "rise": ChartNumber(
         "s", "from the steady state to the peak, if not the time from the switch", POSITIVE
     ),
-    "time_half": Number("s", "from the steady state to half of the peak", POSITIVE),
-    "step": Number("u", "height of a step of the command", NOT_ZERO),
-    "t1": Number("s", "from the end of the dead time to the extremum", POSITIVE),
-    "t2": Number("s", "from the end of the dead time to the return", POSITIVE),
-    "extremum": Number("y", "minimum or maximum after a step, from the steady state", NOT_ZERO),
+    "time_half": ChartNumber("s", "from the steady state to half of the peak", POSITIVE),
+    "step": ChartNumber("u", "height of a step of the command", NOT_ZERO),
+    "t1": ChartNumber("s", "from the end of the dead time to the extremum", POSITIVE),
+    "t2": ChartNumber("s", "from the end of the dead time to the return", POSITIVE),
+    "extremum": ChartNumber(
+        "y", "minimum or maximum after a step, from the steady state", NOT_ZERO
+    ),
 }
 
 CHART_METHODS: dict[str, Chart] = {

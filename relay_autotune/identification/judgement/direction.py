@@ -19,7 +19,7 @@ from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
     Problem,
-    State,
+    Trial,
     information_criterion,
     problem_of,
 )
@@ -115,7 +115,7 @@ def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:
     return not float(np.ptp(rest)) <= _BESIDE * float(np.ptp(record.measurement))
 
 
-def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, State]]:
+def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, Trial]]:
     """Fit what answers the other way at first; with other structures no oscillation stays.
 
     In the direction of the relay, a FOPDT shows the fast part of an inverse response.

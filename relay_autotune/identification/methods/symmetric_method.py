@@ -31,8 +31,8 @@ from relay_autotune.identification.methods.square_wave import level
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import (
     NOT_SETTLED,
+    CycleRun,
     RelayTest,
-    Stretch,
     relay_test,
 )
 from relay_autotune.identification.shown.dead_time import DeadTime, read_dead_time
@@ -114,14 +114,14 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
     reader = CycleReader.of(whole)
     dead_time = read_dead_time(test, record, known, noisy=reader.noisy)
 
-    def read(stretch: Stretch) -> SymmetricCycle:
+    def read(stretch: CycleRun) -> SymmetricCycle:
         return reader.read(stretch, dead_time.value)
 
     cycle = read(whole)
     model, remark = _choice(method, test, read, gain, known)
     solution = _by_shape(whole, model, cycle, method.solve(model, cycle, gain))
 
-    def values(stretch: Stretch) -> FloatArray:
+    def values(stretch: CycleRun) -> FloatArray:
         single = _alike(method.solve(model, read(stretch), gain), solution)
         return single.values(sign, dead_time.value)
 
@@ -241,7 +241,7 @@ def choose(
 def _choice(
     method: SymmetricMethod,
     test: RelayTest,
-    read: Callable[[Stretch], SymmetricCycle],
+    read: Callable[[CycleRun], SymmetricCycle],
     gain: float,
     known: Known,
 ) -> tuple[Structure, str]:
@@ -256,7 +256,7 @@ def _choice(
     def tolerance(order: int) -> float:
         """Allow for the scatter of the cycles, and half a sample interval of dead time."""
 
-        def value(stretch: Stretch) -> FloatArray:
+        def value(stretch: CycleRun) -> FloatArray:
             found = method.mismatch(order, read(stretch), gain)
             if not math.isfinite(found):
                 raise IdentificationError("this cycle alone has no time constant")
@@ -277,7 +277,7 @@ def _choice(
 
 
 def _choose_without_gain(
-    method: SymmetricMethod, cycle: SymmetricCycle, whole: Stretch | None
+    method: SymmetricMethod, cycle: SymmetricCycle, whole: CycleRun | None
 ) -> tuple[Structure, str]:
     """Choose among equal lags by the shape of the half cycles.
 
@@ -322,7 +322,7 @@ def alike(misfit: float, least: float) -> bool:
 
 
 def shape_misfit(
-    whole: Stretch, model: Structure, cycle: SymmetricCycle, solution: Solution
+    whole: CycleRun, model: Structure, cycle: SymmetricCycle, solution: Solution
 ) -> float:
     """Return the root mean square of half cycles minus those of a solution [y]."""
     since, y = half_cycles(whole)
@@ -373,7 +373,7 @@ def _mismatch_text(model: Structure, difference: float) -> str:
 
 
 def _by_shape(
-    whole: Stretch, model: Structure, cycle: SymmetricCycle, solution: Solution
+    whole: CycleRun, model: Structure, cycle: SymmetricCycle, solution: Solution
 ) -> Solution:
     """Put the one of several solutions first whose half cycles are most like the record's."""
     if not solution.others:

@@ -35,7 +35,7 @@ NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 
 
 @dataclass(frozen=True)
-class Stretch:
+class CycleRun:
     """Cycles of a relay test with their features.
 
     :param record: its ``cycle_start`` bounds these cycles alone.
@@ -56,10 +56,12 @@ class RelayTest:
     :param singles: each of them by itself; where they are very many, some, evenly spread.
     """
 
-    whole: Stretch
-    singles: tuple[Stretch, ...]
+    whole: CycleRun
+    singles: tuple[CycleRun, ...]
 
-    def scatter(self, measure: Callable[[Stretch], FloatArray]) -> tuple[FloatArray | None, float]:
+    def scatter(
+        self, measure: Callable[[CycleRun], FloatArray]
+    ) -> tuple[FloatArray | None, float]:
         """Return the covariance of a mean over cycles, from how the single cycles differ.
 
         :param measure: from a stretch to values, shape (p,); a cycle for which it raises an
@@ -121,7 +123,7 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
         ends = bounds[average.cycles[0]], bounds[average.cycles[-1] + 1]
         _require_two_levels(method, settings, u, record.time[list(ends)])
 
-    def stretch(first: int, last: int, cycle: LimitCycle) -> Stretch:
+    def stretch(first: int, last: int, cycle: LimitCycle) -> CycleRun:
         # A copy that shares the columns, which are many and read-only.
         part = copy.copy(record)
         for name, value in (
@@ -130,7 +132,7 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
             ("held_input", u),
         ):
             object.__setattr__(part, name, value)
-        return Stretch(part, settings, cycle)
+        return CycleRun(part, settings, cycle)
 
     stride = -(-len(average.cycles) // _MOST_SINGLES)
     return RelayTest(

@@ -12,7 +12,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.kick import ResponseDetector
 from relay_autotune.experiment.settling import RestState
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.shown.cycle_scatter import RelayTest, Stretch
+from relay_autotune.identification.shown.cycle_scatter import CycleRun, RelayTest
 from relay_autotune.identification.shown.fold import Fold, fold
 from relay_autotune.record.record import Record, RelaySettings
 
@@ -76,7 +76,7 @@ def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool
     return DeadTime(value, interval / math.sqrt(12.0), source)
 
 
-def _edge(stretch: Stretch) -> tuple[float, bool]:
+def _edge(stretch: CycleRun) -> tuple[float, bool]:
     """Return the time from a switch to the edge after it, and whether it is that of one lag."""
     try:
         curve = fold(stretch.record, tuple(range(len(stretch.record.cycle_start) - 1)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.cycle_scatter import Stretch
+from relay_autotune.identification.shown.cycle_scatter import CycleRun
 from relay_autotune.identification.shown.fourier import (
     FrequencyPoint,
     cycle_window,
@@ -31,7 +31,7 @@ _TOO_UNCERTAIN = 0.2
 _NEIGHBOURS = 6
 
 
-def measured_points(whole: Stretch) -> Points:
+def measured_points(whole: CycleRun) -> Points:
     """Return the points at the harmonics that the command of a relay test excites.
 
     Their standard deviations are those of white noise, and of straight lines between the samples.
@@ -73,7 +73,7 @@ def measured_points(whole: Stretch) -> Points:
     return tuple(found)
 
 
-def with_noise_about(model: TransferFunction, whole: Stretch, points: Points) -> Points:
+def with_noise_about(model: TransferFunction, whole: CycleRun, points: Points) -> Points:
     """Return points with the standard deviations that the noise about a model tells.
 
     What the model leaves of the samples is noise; its Fourier integrals at the frequencies
@@ -122,7 +122,7 @@ def _drowned(point: FrequencyPoint) -> IdentificationError:
     )
 
 
-def _excited(whole: Stretch, point: FrequencyPoint) -> complex:
+def _excited(whole: CycleRun, point: FrequencyPoint) -> complex:
     start, end, cycles = cycle_window(whole.record)
     return excitation(whole.record, round(point.frequency * (end - start) / cycles / 2 / math.pi))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.cycle_scatter import RelayTest, Stretch
+from relay_autotune.identification.shown.cycle_scatter import CycleRun, RelayTest
 from relay_autotune.identification.shown.fourier import cycle_means
 from relay_autotune.record.record import FloatArray, Record, RelaySettings, asked_once
 
@@ -85,7 +85,7 @@ def static_gain(test: RelayTest, rest: SteadyState) -> StaticGain:
         the process integrates.
     """
 
-    def ratio(part: Stretch) -> FloatArray:
+    def ratio(part: CycleRun) -> FloatArray:
         mean_y, mean_u = cycle_means(part.record)
         away = mean_u - part.settings.baseline
         if abs(away) < _LEAST_BIAS * part.settings.amplitude:

@@ -11,7 +11,7 @@ from scipy.special import log_ndtr
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.shown.cycle_scatter import Stretch
+from relay_autotune.identification.shown.cycle_scatter import CycleRun
 from relay_autotune.record.record import RelaySettings
 
 FloatArray = NDArray[np.float64]
@@ -102,7 +102,7 @@ class CycleReader:
     noisy: bool
 
     @classmethod
-    def of(cls, whole: Stretch) -> CycleReader:
+    def of(cls, whole: CycleRun) -> CycleReader:
         """Return the reader for the cycles of a relay test.
 
         :param whole: all of them.
@@ -114,7 +114,7 @@ class CycleReader:
             return cls(0.0, False)
         return cls(min(_excess_of_peaks(whole, noise), 0.5 * float(amplitude)), True)
 
-    def read(self, stretch: Stretch, dead_time: float) -> SymmetricCycle:
+    def read(self, stretch: CycleRun, dead_time: float) -> SymmetricCycle:
         """Return the numbers of some cycles.
 
         :param stretch: the cycles.
@@ -140,7 +140,7 @@ class CycleReader:
         )
 
 
-def skew_warning(stretch: Stretch) -> str:
+def skew_warning(stretch: CycleRun) -> str:
     """Return a sentence if the half periods differ too much for a symmetric relay, else none."""
     cycle = stretch.cycle
     skew = abs(cycle.period_high - cycle.period_low) / cycle.period
@@ -152,13 +152,13 @@ def skew_warning(stretch: Stretch) -> str:
     )
 
 
-def features(stretch: Stretch) -> FloatArray:
+def features(stretch: CycleRun) -> FloatArray:
     """Return period [s] and amplitude [y] of a stretch of cycles."""
     cycle = stretch.cycle
     return np.array((cycle.period, 0.5 * (cycle.peak_max - cycle.peak_min)))
 
 
-def half_cycles(stretch: Stretch) -> tuple[FloatArray, FloatArray]:
+def half_cycles(stretch: CycleRun) -> tuple[FloatArray, FloatArray]:
     """Lay the samples of all half cycles over one another.
 
     :param stretch: the cycles.
@@ -178,7 +178,7 @@ def half_cycles(stretch: Stretch) -> tuple[FloatArray, FloatArray]:
     return since[inside], (side * (record.measurement[first:last] - middle))[inside]
 
 
-def _excess_of_peaks(whole: Stretch, noise: float) -> float:
+def _excess_of_peaks(whole: CycleRun, noise: float) -> float:
     """Return by how much the highest sample of a half cycle exceeds its peak on average [y].
 
     With heights s_i and standard deviation sigma of the noise, the highest sample is below z with
@@ -200,7 +200,7 @@ def _excess_of_peaks(whole: Stretch, noise: float) -> float:
     return max(mean - top, 0.0)
 
 
-def _level_at_switch(stretch: Stretch, noisy: bool) -> float:
+def _level_at_switch(stretch: CycleRun, noisy: bool) -> float:
     """Return where the measurement is at a switch, from the middle of the peaks [y].
 
     In noise a straight line through the samples around each switch tells it, without the sample

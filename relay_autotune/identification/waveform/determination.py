@@ -21,7 +21,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
     estimate_of,
 )
 from relay_autotune.identification.waveform.profiles import profile_ends
-from relay_autotune.identification.waveform.separable import Problem, State, refine
+from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -114,7 +114,7 @@ class _Parameter:
     """One parameter of the field as a function of theta and the linear coefficients."""
 
     def __init__(
-        self, problem: Problem, state: State, scale: float, number: int, logarithmic: bool
+        self, problem: Problem, state: Trial, scale: float, number: int, logarithmic: bool
     ) -> None:
         self._structure, self._like, self._scale = problem.structure, state.theta, scale
         self._number, self._logarithmic = number, logarithmic

@@ -32,7 +32,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
 from relay_autotune.identification.waveform.halves import Halves, halves_of
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.selection import Candidate, support
-from relay_autotune.identification.waveform.separable import Problem, State, evaluate, refine
+from relay_autotune.identification.waveform.separable import Problem, Trial, evaluate, refine
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
@@ -225,7 +225,7 @@ def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) ->
     return Rival(Estimate.of_root(found.structure, found.values, root), share)
 
 
-def _prediction(records: Sequence[Record], problem: Problem, state: State) -> float:
+def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> float:
     """Return the error over the last cycle of the model that the samples before it give."""
     record = records[0]
     if len(records) > 1 or len(record.cycle_start) < 3:

@@ -18,7 +18,7 @@ from relay_autotune.identification.waveform.residuals import (
     weights,
 )
 from relay_autotune.identification.waveform.selection import Candidate
-from relay_autotune.identification.waveform.separable import Problem, State
+from relay_autotune.identification.waveform.separable import Problem, Trial
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Fit:
     """
 
     problem: Problem
-    state: State
+    state: Trial
     candidates: tuple[Candidate, ...]
     scale: float
     base: FloatArray | None = None
@@ -65,7 +65,7 @@ class Noise:
     step: float = 0.0
 
 
-def raw_residual(problem: Problem, state: State) -> FloatArray:
+def raw_residual(problem: Problem, state: Trial) -> FloatArray:
     """Return what a fit leaves of each sample, whatever it counts, shape (n,)."""
     if problem.weight is None and problem.colour is None:
         return state.residual
@@ -86,7 +86,7 @@ def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
     return Noise(coloured, larger * samples / held, step)
 
 
-def estimate_of(problem: Problem, state: State, fit: Fit, noise: Noise) -> Estimate | None:
+def estimate_of(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> Estimate | None:
     """Return the parameters of the field with their covariance to first order.
 
     :param problem: what was fitted.
@@ -104,7 +104,7 @@ def estimate_of(problem: Problem, state: State, fit: Fit, noise: Noise) -> Estim
     return Estimate.of_root(*read, root)
 
 
-def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
+def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
     """Return B of the covariance B B' of all linear coefficients and theta, in this order.
 
     Of least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
@@ -135,7 +135,7 @@ def _root(problem: Problem, state: State, fit: Fit, noise: Noise) -> FloatArray:
     return np.asarray(root * np.maximum(larger, 1.0)[:, None] / slope)
 
 
-def _scores(problem: Problem, state: State, fit: Fit) -> tuple[FloatArray, FloatArray, float]:
+def _scores(problem: Problem, state: Trial, fit: Fit) -> tuple[FloatArray, FloatArray, float]:
     """Return Jacobian, derivative of the loss at each sample, and mean of its second one."""
     if fit.loss == "squares" or fit.base is None:
         return np.concatenate((state.columns, state.derivative)), state.residual, 1.0
@@ -148,7 +148,7 @@ def _scores(problem: Problem, state: State, fit: Fit) -> tuple[FloatArray, Float
     return jacobian, scores, max(mean_slope(residual, scale, fit.loss), 0.1)
 
 
-def _gradient(problem: Problem, state: State, scale: float) -> FloatArray:
+def _gradient(problem: Problem, state: Trial, scale: float) -> FloatArray:
     """Return d(parameters of the field)/d(linear coefficients, theta), shape (p, k + m)."""
     structure, k = problem.structure, state.coefficients.size
 

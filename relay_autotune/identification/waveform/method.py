@@ -39,7 +39,7 @@ from relay_autotune.identification.waveform.selection import (
 )
 from relay_autotune.identification.waveform.separable import (
     Problem,
-    State,
+    Trial,
     information_criterion,
     problem_of,
     refine,
@@ -208,7 +208,7 @@ def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
     return _fit(_weighted(problem, noise), known, sign, fit.scale)
 
 
-def _noise_of_each(problem: Problem, state: State) -> FloatArray:
+def _noise_of_each(problem: Problem, state: Trial) -> FloatArray:
     residual = raw_residual(problem, state)
     noise = np.sqrt([np.mean(residual[part] ** 2) for part in problem.experiments])
     # One without noise counts for all, but not for more than numbers hold.
@@ -266,7 +266,7 @@ def _places(whole: Problem, part: Problem) -> NDArray[np.int64]:
     return np.searchsorted(whole.index, part.index)
 
 
-def _outliers(whole: Problem, problem: Problem, state: State) -> NDArray[np.bool_]:
+def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool_]:
     """Return which samples no noise of the residual's own width explains, shape (n,).
 
     :param whole: all samples.
@@ -328,7 +328,7 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
         )
 
 
-def _responds(problem: Problem, state: State, evidence: float = 0.0) -> bool:
+def _responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
     """Return whether a fit explains more than its parameters cost, beside drift and the like.
 
     :param problem: what was fitted.
@@ -343,7 +343,7 @@ def _responds(problem: Problem, state: State, evidence: float = 0.0) -> bool:
     return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
 
 
-def _require_response(problem: Problem, state: State) -> None:
+def _require_response(problem: Problem, state: Trial) -> None:
     if not _responds(problem, state, _SEARCHED):
         raise IdentificationError(
             "the measurement shows no response to the command beyond its noise: raise the "

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.identification.differences import jacobian, relative_steps
-from relay_autotune.identification.waveform.separable import Problem, State
+from relay_autotune.identification.waveform.separable import Problem, Trial
 
 FloatArray = NDArray[np.float64]
 # A parameter as a function of theta and the linear coefficients.
@@ -32,7 +32,7 @@ _SMALL = 0.2
 
 def profile_ends(
     problem: Problem,
-    state: State,
+    state: Trial,
     parameter: Parameter,
     std: float,
     quantile: float,
@@ -89,7 +89,7 @@ class _Search:
     farthest: float
 
 
-def _end(problem: Problem, state: State, parameter: Parameter, search: _Search) -> float:
+def _end(problem: Problem, state: Trial, parameter: Parameter, search: _Search) -> float:
     place = (state.theta, state.coefficients)
     inside, outside = (0.0, 0.0), (math.inf, math.inf)
     reach = search.quantile * search.std

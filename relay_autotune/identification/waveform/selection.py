@@ -15,7 +15,7 @@ from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
     Problem,
-    State,
+    Trial,
     information_criterion,
     refine,
 )
@@ -82,7 +82,7 @@ _SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
 _ALWAYS = (FOPDT.name, IPDT.name)
 
 # A structure, and where the starts of its fit lead at first.
-_Begun = tuple[Structure, list[State]]
+_Begun = tuple[Structure, list[Trial]]
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Candidate:
     """
 
     problem: Problem
-    state: State
+    state: Trial
     model: TransferFunction
     criterion: float
 
@@ -119,7 +119,7 @@ class Ground:
     """
 
     problem: Problem
-    fopdt: State
+    fopdt: Trial
     starts: Starts
     floor: float
     sign: int
@@ -137,12 +137,12 @@ class Ground:
         return cls(problem, fopdt, Starts(problem, fopdt), floor, sign)
 
     @cached_property
-    def unstable(self) -> list[State]:
+    def unstable(self) -> list[Trial]:
         """The beginning of an unstable FOPDT's fit, from which two structures go on."""
         problem = replace(self.problem, structure=UNSTABLE_FOPDT)
         return begin(problem, self.starts.unstable(problem))
 
-    def candidate(self, problem: Problem, state: State) -> Candidate | None:
+    def candidate(self, problem: Problem, state: Trial) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure."""
         structure = problem.structure
         model = structure.model_at(state.theta, state.coefficients)
@@ -343,7 +343,7 @@ def nuisances_of(problem: Problem) -> tuple[bool, bool, bool]:
     return problem.drift, problem.relaxation, problem.past
 
 
-def _followed(problem: Problem, begun: list[State], least: float) -> State | None:
+def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | None:
     """Return the best fit that a beginning leads to; None where it is hopeless.
 
     :param problem: the problem.
@@ -352,10 +352,10 @@ def _followed(problem: Problem, begun: list[State], least: float) -> State | Non
     """
     asked = problem.structure.name in _ALWAYS
 
-    def promises_nothing(states: list[State]) -> bool:
+    def promises_nothing(states: list[Trial]) -> bool:
         return least_promised(problem, states) > _NO_PROMISE * max(least, _CLEAN)
 
-    def is_hopeless(state: State) -> bool:
+    def is_hopeless(state: Trial) -> bool:
         return state.cost / state.residual.size > _BEYOND_HOPE * least
 
     if not asked and promises_nothing(begun):
@@ -373,8 +373,8 @@ def _followed(problem: Problem, begun: list[State], least: float) -> State | Non
 
 
 def _without_the_unknown(
-    problem: Problem, fopdt: State, floor: float, sign: int
-) -> tuple[Problem, State]:
+    problem: Problem, fopdt: Trial, floor: float, sign: int
+) -> tuple[Problem, Trial]:
     """Begin later where a record that was cut out of a movement explains itself better so.
 
     :param problem: all samples.
@@ -403,7 +403,7 @@ def _without_the_unknown(
     return later, second
 
 
-def after_the_unknown(problem: Problem, state: State) -> Problem:
+def after_the_unknown(problem: Problem, state: Trial) -> Problem:
     """Return the samples whose input is known; all of them where the process was at rest.
 
     What was fed to a process that was not at rest before the record is not known, and acts for

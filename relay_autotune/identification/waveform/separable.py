@@ -204,7 +204,7 @@ def problem_of(
 
 
 @dataclass(frozen=True)
-class State:
+class Trial:
     """A trial theta with everything that follows from it.
 
     :param theta: shape (m,).
@@ -232,7 +232,7 @@ class State:
         return int(self.theta.size + self.coefficients.size)
 
 
-def evaluate(problem: Problem, theta: FloatArray) -> State:
+def evaluate(problem: Problem, theta: FloatArray) -> Trial:
     """Return the best linear coefficients for one theta, and what they leave.
 
     :param problem: the problem.
@@ -249,7 +249,7 @@ def evaluate(problem: Problem, theta: FloatArray) -> State:
         np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
     )
     cost = float(residual @ residual)
-    return State(theta, coefficients, residual, cost, q, derivative, columns)
+    return Trial(theta, coefficients, residual, cost, q, derivative, columns)
 
 
 def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
@@ -273,7 +273,7 @@ def refine(
     tolerance: float = _LEAST_GAIN,
     most: int = _MOST_ITERATIONS,
     damping: float = _FIRST_DAMPING,
-) -> State:
+) -> Trial:
     """Return the least sum of squares near a theta.
 
     :param problem: the problem.
@@ -326,7 +326,7 @@ def refine(
     return replace(state, damping=damping)
 
 
-def promised(problem: Problem, state: State) -> float:
+def promised(problem: Problem, state: Trial) -> float:
     """Return how much less the sum of squares would be if the model were linear in theta.
 
     :param problem: the problem.
@@ -336,7 +336,7 @@ def promised(problem: Problem, state: State) -> float:
     return float(gradient @ _solve(normal, gradient, 0.0))
 
 
-def _linearised(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _linearised(problem: Problem, state: Trial) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the units of steps, and the normal equations' matrix and right side in them."""
     scale = unit_steps(problem.structure, state.theta)
     jacobian = state.derivative * scale[:, None]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.waveform.separable import (
     Problem,
-    State,
+    Trial,
     evaluate,
     promised,
     refine,
@@ -96,7 +96,7 @@ def coarse(problem: Problem) -> Problem:
     return problem.thinned(_GRID_SAMPLES)
 
 
-def begin(problem: Problem, thetas: list[FloatArray]) -> list[State]:
+def begin(problem: Problem, thetas: list[FloatArray]) -> list[Trial]:
     """Return where a few steps on few samples lead from each start, the best first.
 
     They show which starts are worth more. A single start is followed to its end.
@@ -109,7 +109,7 @@ def begin(problem: Problem, thetas: list[FloatArray]) -> list[State]:
     return sorted(begun, key=lambda s: s.cost)
 
 
-def go_on(problem: Problem, begun: list[State]) -> list[State]:
+def go_on(problem: Problem, begun: list[Trial]) -> list[Trial]:
     """Return the fits to few samples that a beginning leads to, the best first.
 
     :param problem: the problem.
@@ -126,7 +126,7 @@ def go_on(problem: Problem, begun: list[State]) -> list[State]:
     return _apart_from_each_other(problem, reached, _UNDECIDED)[:2]
 
 
-def least_promised(problem: Problem, begun: list[State]) -> float:
+def least_promised(problem: Problem, begun: list[Trial]) -> float:
     """Return the least mean square that any beginning would lead to if models were linear.
 
     :param problem: the problem.
@@ -136,10 +136,10 @@ def least_promised(problem: Problem, begun: list[State]) -> float:
     return min(s.cost - promised(few, s) for s in begun) / few.time.size
 
 
-def _apart_from_each_other(problem: Problem, states: list[State], limit: float) -> list[State]:
+def _apart_from_each_other(problem: Problem, states: list[Trial], limit: float) -> list[Trial]:
     """Return the best state and those of little higher cost that are elsewhere."""
     states = sorted(states, key=lambda s: s.cost)
-    chosen: list[State] = []
+    chosen: list[Trial] = []
     for state in states:
         size = unit_steps(problem.structure, state.theta)
         near = (np.abs((state.theta - c.theta) / size).max() < _SAME for c in chosen)
@@ -148,7 +148,7 @@ def _apart_from_each_other(problem: Problem, states: list[State], limit: float) 
     return chosen
 
 
-def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> State:
+def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> Trial:
     """Return the best fit that any of the starts leads to: first on few samples, then on all.
 
     :param problem: the problem.
@@ -158,7 +158,7 @@ def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float 
     return refine_all(problem, go_on(problem, begin(problem, thetas)), tolerance or _EXACT)
 
 
-def refine_all(problem: Problem, rough: list[State], tolerance: float) -> State:
+def refine_all(problem: Problem, rough: list[Trial], tolerance: float) -> Trial:
     """Return the best fit to all samples from fits to few of them.
 
     :param problem: the problem.
@@ -242,7 +242,7 @@ class Starts:
     :param fopdt: its best fit.
     """
 
-    def __init__(self, problem: Problem, fopdt: State) -> None:
+    def __init__(self, problem: Problem, fopdt: Trial) -> None:
         shortest, self.longest = time_scales(problem)
         # A FOPDT that fits badly may run off to an integrator, which tells the others nothing.
         self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
