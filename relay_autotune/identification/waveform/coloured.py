@@ -19,7 +19,7 @@ from relay_autotune.identification.waveform.colour import Colour, colour_of, slo
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit
 from relay_autotune.identification.waveform.residuals import ljung_box, worth
 from relay_autotune.identification.waveform.selection import Candidate, Ground, nuisances_of
-from relay_autotune.identification.waveform.separable import Problem, State, refine
+from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.identification.waveform.starts import (
     Starts,
     changes_within,
@@ -125,7 +125,7 @@ def _dense_enough(problem: Problem, sign: int) -> Problem:
     return problem.thinned(int(min(max(asked, _FEW), _MOST)))
 
 
-def _colour(problem: Problem, state: State) -> Colour | None:
+def _colour(problem: Problem, state: Trial) -> Colour | None:
     """Return the colour of what a fit leaves, each sample as it counts."""
     columns, _ = problem.columns(state.theta)
     left = problem.y - state.coefficients @ columns
