@@ -214,6 +214,7 @@ class IdentifierNode(ServedNode):
                 fit.taken(found)
             finally:
                 self._look()
+                self.tidy_when_idle()
 
         self.compute(fit.work, taken)
 

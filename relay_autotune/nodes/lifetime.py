@@ -58,6 +58,14 @@ class ServedNode(Node):
         """Do ``work`` once no message, timer or request waits."""
         self._when_idle.append(work)
 
+    def tidy_when_idle(self) -> None:
+        """Free what a finished experiment leaves behind, once nothing waits.
+
+        Full collections are far apart here, so that none falls into a running experiment; objects
+        that refer to each other would pile up from one experiment to the next.
+        """
+        self.defer_until_idle(_tidy)
+
     def work(self, *, idle: bool) -> bool:
         """Do one piece of deferred work; return True if there is more.
 
@@ -201,6 +209,10 @@ def _help(name: str, purpose: str, parameters: Sequence[Quantity]) -> str:
             entry.description, 80, initial_indent=" " * 6, subsequent_indent=" " * 6
         )
     return "\n".join(lines)
+
+
+def _tidy() -> None:
+    gc.collect()
 
 
 def _serve(node: ServedNode, signals: _Signals) -> int:

@@ -370,6 +370,7 @@ class RelayNode(ServedNode):
             self._results.experiment(message)
         self._recordings.message(session.id, "relay_experiment", session.now_ns(), message)
         self._action.tell(experiment)
+        self.tidy_when_idle()
 
         def closed(missing: str) -> None:
             bag = self._recordings.path_of(session.id)
