@@ -2,13 +2,15 @@
 
     . ./env.sh && python3 -m benchmarks.verdicts [RUNS]
 
-Each kind is recorded RUNS times (default 20) by steps from rest, with another seed for the noise.
-A result is right where its gains, on the true process, make a stable loop with Ms of at most 1.75
-(1.25 times what is asked for); of a nonlinear process the truth is its linearisation.
+Each kind is recorded RUNS times (default 20), with another seed for the noise: by steps from rest,
+or by a relay experiment. A result is right where its gains, on the true process, make a stable
+loop with Ms of at most 1.75 (1.25 times what is asked for); of a nonlinear process the truth is
+its linearisation where it rests.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -19,10 +21,12 @@ from numpy.typing import NDArray
 
 from benchmarks.markdown import table
 from relay_autotune.analysis import analyse_alone
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.judgement.table import CHECKS
-from relay_autotune.loop.analysis import ms_on
-from relay_autotune.process.response import response
+from relay_autotune.loop.gains import Gains
+from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict
 
@@ -30,9 +34,11 @@ FloatArray = NDArray[np.float64]
 Noise = Callable[[np.random.Generator, int], FloatArray]
 
 _PERIOD, _LENGTH, _LIMIT = 0.25, 240.0, 1.75
+_MOST_SAMPLES, _SETTLED_TURN = 4000, 0.1
 _STEPS = PiecewiseConstant(
     np.array([20.0, 80.0, 110.0, 150.0, 200.0]), np.array([1.0, -0.5, 0.5, -1.0, 0.0]), 0.0
 )
+_FREQUENCIES = np.geomspace(1e-5, 1e3, 40_000)
 
 
 def white(rng: np.random.Generator, n: int) -> FloatArray:
@@ -49,8 +55,33 @@ def coloured(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def wandering(rng: np.random.Generator, n: int) -> FloatArray:
-    """Return a random walk that ends about one unit away."""
-    return np.cumsum(rng.normal(0.0, 1.0 / np.sqrt(n), n))
+    """Return a random walk that ends about one unit away after the steps."""
+    return np.cumsum(rng.normal(0.0, math.sqrt(_PERIOD / _LENGTH), n))
+
+
+class Outflow:
+    """A tank with an outflow by the root of its level, ``4 h' = 1 + q - sqrt(1 + h)``.
+
+    :param inflow: what q follows the command with.
+    """
+
+    def __init__(self, inflow: TransferFunction) -> None:
+        self._inflow = VirtualProcess(inflow)
+        self._time, self._level = 0.0, 0.0
+
+    def command(self, value: float) -> None:
+        """Give a command."""
+        self._inflow.command(value)
+
+    def measure(self, time: float) -> float:
+        """Return the level at a time [s]."""
+        steps = max(1, round((time - self._time) / 0.025))
+        h = (time - self._time) / steps
+        for _ in range(steps):
+            self._time += h
+            q = self._inflow.measure(self._time)
+            self._level += h / 4.0 * (1.0 + q - math.sqrt(max(1.0 + self._level, 0.0)))
+        return self._level
 
 
 @dataclass(frozen=True)
@@ -58,15 +89,32 @@ class Kind:
     """One kind of record.
 
     :param name: for the table.
-    :param process: the truth.
+    :param processes: the truth, which is their sum.
     :param noise: noise that is added to its response.
-    :param bend: nonlinearity of the sensor or the process.
+    :param bend: nonlinearity of the sensor.
+    :param actuator: limits and stiction of the actuator, as fields of ``Actuator``.
+    :param outflow: transfer function from command to inflow of a tank; None: no tank.
     """
 
     name: str
-    process: TransferFunction
+    processes: tuple[TransferFunction, ...]
     noise: Noise = white
-    bend: Callable[[FloatArray], FloatArray] = field(default=lambda y: y)
+    bend: Callable[[float], float] = field(default=lambda y: y)
+    actuator: dict[str, float] = field(default_factory=dict)
+    outflow: TransferFunction | None = None
+
+    def ms(self, gains: Gains) -> float:
+        """Return Ms of the loop with the true process; infinite where it is unstable.
+
+        Of a stable process and a controller with an integrator, ``1 + L`` turns by a quarter
+        from the lowest frequency to the highest where the loop is stable (Nyquist).
+        """
+        s = 1j * _FREQUENCIES
+        back = 1.0 + sum(p(s) for p in self.processes) * gains(s)
+        turn = np.unwrap(np.angle(back))
+        if abs(turn[-1] - turn[0] - 0.5 * math.pi) > _SETTLED_TURN:
+            return math.inf
+        return float(np.max(1.0 / np.abs(back)))
 
 
 _FOPDT = TransferFunction.fopdt(1.0, 8.0, 3.0)
@@ -75,68 +123,108 @@ _LAGS = TransferFunction(1.0, (), (0.8,) * 20, 0, 0.5)
 _WALL = TransferFunction(
     1.0, (), tuple(80.0 / (np.pi * (2 * k + 1)) ** 2 for k in range(8)), 0, 0.0
 )
+# (1 - e^-4s)/(4 s) e^-0.5s/(3 s + 1), by sixteen equal parts of the delay.
+_SPREAD = tuple(TransferFunction.fopdt(1.0 / 16, 3.0, 0.5 + (k + 0.5) / 4) for k in range(16))
+_TANK = TransferFunction(2.0, (), (8.0, 1.0), 0, 1.0)
 KINDS = (
-    Kind("FOPDT, white noise", _FOPDT),
-    Kind("two lags, white noise", TransferFunction(1.0, (), (8.0, 3.0), 0, 1.0)),
-    Kind("inverse response, white noise", TransferFunction(1.0, (-3.0,), (8.0, 3.0), 0, 1.0)),
-    Kind("twenty lags", _LAGS),
-    Kind("heat conduction", _WALL),
-    Kind("FOPDT, noise with pole 0.98", _FOPDT, coloured),
-    Kind("FOPDT, random walk", _FOPDT, wandering),
-    Kind("FOPDT, saturated sensor", _FOPDT, bend=lambda y: np.clip(y, -0.3, 0.3)),
-    Kind("square of the response", _FOPDT, bend=lambda y: y + 1.5 * y**2),
-    Kind("no process, random walk", TransferFunction.fopdt(1e-6, 8.0, 3.0), wandering),
+    Kind("FOPDT", (_FOPDT,)),
+    Kind("two lags", (TransferFunction(1.0, (), (8.0, 3.0), 0, 1.0),)),
+    Kind("inverse response", (TransferFunction(1.0, (-3.0,), (8.0, 3.0), 0, 1.0),)),
+    Kind("twenty lags", (_LAGS,)),
+    Kind("heat conduction", (_WALL,)),
+    Kind("distributed delay", _SPREAD),
+    Kind("FOPDT, noise with pole 0.98", (_FOPDT,), coloured),
+    Kind("FOPDT, random walk", (_FOPDT,), wandering),
+    Kind("FOPDT, saturated sensor", (_FOPDT,), bend=lambda y: min(max(y, -0.3), 0.3)),
+    Kind("FOPDT, saturated actuator", (_FOPDT,), actuator={"minimum": -0.1, "maximum": 0.6}),
+    Kind("FOPDT, stiction", (_FOPDT,), actuator={"stiction": 0.6}),
+    Kind("square-root outflow", (_TANK,), outflow=TransferFunction.fopdt(1.0, 1.0, 1.0)),
+    Kind("square of the response", (_FOPDT,), bend=lambda y: y + 1.5 * y**2),
+    Kind("no process, random walk", (TransferFunction.fopdt(1e-6, 8.0, 3.0),), wandering),
 )
 
 
-def record_of(kind: Kind, seed: int) -> Record:
-    """Return one record of a kind.
+def record_of(kind: Kind, seed: int, *, relay: bool) -> Record | None:
+    """Return one record of a kind; None: the relay experiment came to no end.
 
     :param kind: which.
     :param seed: of its noise.
+    :param relay: True: of a relay experiment; False: of steps.
     """
-    time = np.arange(0.0, _LENGTH, _PERIOD)
-    y = kind.bend(response(kind.process, time, _STEPS))
-    y = y + kind.noise(np.random.default_rng(seed), time.size)
-    return Record(time=time, measurement=y, command=_STEPS(time), held_input=_STEPS)
+    plants: list[VirtualProcess | Outflow] = [VirtualProcess(p) for p in kind.processes]
+    if kind.outflow is not None:
+        plants = [Outflow(kind.outflow)]
+    actuator = Actuator(0.0, **kind.actuator)
+    samples = _MOST_SAMPLES if relay else round(_LENGTH / _PERIOD)
+    noise = kind.noise(np.random.default_rng(seed), samples)
+    tune = RelayExperiment(ExperimentParameters(setpoint=0.0, amplitude=0.5, max_cycles=6), 0.0)
+    time: FloatArray = _PERIOD * np.arange(samples, dtype=np.float64)
+    steps, y = _STEPS(time), np.zeros(samples)
+    for k in range(samples):
+        y[k] = kind.bend(sum(p.measure(float(time[k])) for p in plants)) + noise[k]
+        command = tune.step(float(time[k]), float(y[k])) if relay else float(steps[k])
+        for plant in plants:
+            plant.command(actuator.move(command))
+        if relay and tune.finished:
+            break
+    if not relay:
+        return Record(time=time, measurement=y, command=steps)
+    return tune.record() if tune.finished else None
+
+
+@dataclass
+class Tally:
+    """What was counted of one kind of record.
+
+    :param verdicts: how often each was given.
+    :param wrong: how often with gains that are wrong.
+    """
+
+    verdicts: Counter[Verdict] = field(default_factory=Counter)
+    wrong: Counter[Verdict] = field(default_factory=Counter)
 
 
 def main(runs: int = 20) -> None:
-    """Print both tables."""
+    """Count, and print both tables after each round, so that it may be ended early."""
+    tests = [(kind, relay) for kind in KINDS for relay in (False, True)]
+    tallies = [Tally() for _ in tests]
     spoke: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
     count: Counter[bool] = Counter()
-    rows = []
-    for kind in KINDS:
-        verdicts: Counter[Verdict] = Counter()
-        wrong: Counter[Verdict] = Counter()
-        for seed in range(runs):
-            found = analyse_alone(record_of(kind, seed))
-            verdicts[found.verdict] += 1
+    for seed in range(runs):
+        for (kind, relay), tally in zip(tests, tallies, strict=True):
+            record = record_of(kind, seed, relay=relay)
+            if record is None:
+                tally.verdicts[Verdict.NONE] += 1
+                continue
+            found = analyse_alone(record)
+            tally.verdicts[found.verdict] += 1
             gains = found.best_gains
             if gains is None:
                 continue
-            right = ms_on(gains, kind.process) <= _LIMIT
+            right = kind.ms(gains) <= _LIMIT
             count[right] += 1
-            wrong[found.verdict] += not right
+            tally.wrong[found.verdict] += not right
             spoke[right].update(
                 f.name for f in found.judgement.findings if f.result is not Result.PASSED
             )
-        rows.append(
+            print(kind.name, relay, found.verdict.name, right, file=sys.stderr, flush=True)
+        head = ["record", "test", "trusted", "doubtful", "none"]
+        rows = [
             [
                 kind.name,
-                *(str(verdicts[v]) for v in (Verdict.TRUSTED, Verdict.DOUBTFUL, Verdict.NONE)),
-                *(str(wrong[v]) for v in (Verdict.TRUSTED, Verdict.DOUBTFUL)),
+                "relay" if relay else "steps",
+                *(str(t.verdicts[v]) for v in (Verdict.TRUSTED, Verdict.DOUBTFUL, Verdict.NONE)),
+                *(str(t.wrong[v]) for v in (Verdict.TRUSTED, Verdict.DOUBTFUL)),
             ]
-        )
-        print(rows[-1], file=sys.stderr, flush=True)
-    head = ["record", "trusted", "doubtful", "none", "wrong trusted", "wrong doubtful"]
-    print(table(head, rows))
-    print()
-    shares = [
-        [f"`{c.name}`", *(f"{spoke[r][c.name]} of {count[r]}" for r in (True, False))]
-        for c in CHECKS
-    ]
-    print(table(["check", "spoke on right gains", "spoke on wrong gains"], shares))
+            for (kind, relay), t in zip(tests, tallies, strict=True)
+        ]
+        print(table([*head, "wrong trusted", "wrong doubtful"], rows), end="\n\n")
+        shares = [
+            [f"`{c.name}`", *(f"{spoke[r][c.name]} of {count[r]}" for r in (True, False))]
+            for c in CHECKS
+        ]
+        head = ["check", "spoke on right gains", "spoke on wrong gains"]
+        print(table(head, shares), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":
