@@ -190,6 +190,7 @@ def main(runs: int = 20) -> None:
     tallies = [Tally() for _ in tests]
     spoke: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
     count: Counter[bool] = Counter()
+    refused: Counter[str] = Counter()
     for seed in range(runs):
         for (kind, relay), tally in zip(tests, tallies, strict=True):
             record = record_of(kind, seed, relay=relay)
@@ -200,6 +201,8 @@ def main(runs: int = 20) -> None:
             tally.verdicts[found.verdict] += 1
             gains = found.best_gains
             if gains is None:
+                failed = [f for f in found.judgement.findings if f.result is Result.FAILED]
+                refused.update(f.name for f in failed)
                 continue
             right = kind.ms(gains) <= _LIMIT
             count[right] += 1
@@ -220,10 +223,14 @@ def main(runs: int = 20) -> None:
         ]
         print(table([*head, "wrong trusted", "wrong doubtful"], rows), end="\n\n")
         shares = [
-            [f"`{c.name}`", *(f"{spoke[r][c.name]} of {count[r]}" for r in (True, False))]
+            [
+                f"`{c.name}`",
+                *(f"{spoke[r][c.name]} of {count[r]}" for r in (True, False)),
+                str(refused[c.name]),
+            ]
             for c in CHECKS
         ]
-        head = ["check", "spoke on right gains", "spoke on wrong gains"]
+        head = ["check", "spoke on right gains", "spoke on wrong gains", "refused gains"]
         print(table(head, shares), end="\n\n", flush=True)
 
 

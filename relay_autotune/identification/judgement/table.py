@@ -1,8 +1,8 @@
 """The table of checks. Adding a check is adding a row, and the function that measures it.
 
 Each function returns a number that is the larger the worse, or None where the check does not
-apply. The limits were set on simulated records of right and of wrong models; how often each row
-speaks on either is in docs/verdict.md.
+apply. How often each row speaks on right and on wrong gains, of records of many kinds, is counted
+by benchmarks/verdicts.py and shown in docs/verdict.md.
 """
 
 from __future__ import annotations
