@@ -93,6 +93,10 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
         if parameter.logarithmic:
             near, far = (_limit(e) if math.isinf(e) else math.exp(min(e, 700.0)) for e in ends)
             ends = (near, far) if value > 0.0 else (-far, -near)
+        if fit.problem.colour is not None and math.isinf(ends[1]) and parameter.least == 0.0:
+            # A dead time beyond part of the record is no candidate in a colour: the profile broke
+            # off where it could not be held, as between two samples.
+            ends = (ends[0], math.nan)
         # An end that could not be found stays the linear one.
         low[i] = low[i] if math.isnan(ends[0]) else min(ends[0], value)
         high[i] = high[i] if math.isnan(ends[1]) else max(ends[1], value)
