@@ -46,6 +46,7 @@ test-nightly: setup
 
 lint: setup
 	@$(ENTER) && ruff check $(SOURCES)
+	@$(ENTER) && ruff check --preview --select CPY001 $(SOURCES)
 	@$(ENTER) && ruff format --check $(SOURCES)
 	@$(ENTER) && mypy
 

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Install the package relay_autotune; colcon calls this."""
 
 from pathlib import Path

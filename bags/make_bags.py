@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Make the bags of this folder: `. ./env.sh && python3 bags/make_bags.py [FOLDER]`.
 
 The first two are recorded by relay_node from a whole tune in lockstep, in processes of their own

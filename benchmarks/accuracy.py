@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Errors of every method: `python3 benchmarks/accuracy.py [--seeds N] [--fits N] [--quick]`.
 
 The waveform fit on each process of cases.py: without noise; with noise that the relay sees or

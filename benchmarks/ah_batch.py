@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The batch of Astrom and Hagglund: `python3 benchmarks/ah_batch.py [--ratio R] [--quick]`.
 
 Each of the 133 processes goes through RelayExperiment with its default parameters, which samples

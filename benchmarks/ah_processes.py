@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The batch of test processes of Astrom and Hagglund: 133 processes in nine families.
 
 Often quoted as 134; every transcription found lists 133.

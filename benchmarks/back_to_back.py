@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Tunes one after the other for twenty minutes, and what the processes hold after each.
 
 Usage, after `. ./env.sh`:

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Time and memory of reading bags: `python3 benchmarks/bag_reading.py [--quick] [--folder DIR]`.
 
 Two topics of std_msgs/Float64 are read with their times, by this package and by the fastest way of

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Search for the controller with the smallest IAE over a grid of gains, as an independent check.
 
 Nothing of the search in `relay_autotune.tuning` is used: the bounds are tested loop by loop on a

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The processes on which identification is measured, their records and what is known of them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The studies of Chang, Shen and Yu 1992: `python3 benchmarks/chang_studies.py [--quick]`.
 
 Its Figures 2 to 6 as tables, with the errata: errors of the original ATV and of the exact

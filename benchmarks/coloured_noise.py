@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Relay tests under coloured noise: errors and intervals beside a fit that knows the colour.
 
 A FOPDT under a biased relay, sampled 20 times in each dead time, with noise of one colour or a

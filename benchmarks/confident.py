@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """How early `stop_when: confident` ends a test: `python3 benchmarks/confident.py [--records N]`.
 
 Each process for which the papers show a relay test is tested as relay_node does it, at a

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Kills of controller_node at random moments of apply and verify, and which gains follow.
 
 Usage, after `. ./env.sh`:

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """How often 95 % intervals hold the truth: `python3 benchmarks/coverage.py [--records N]`.
 
 At a noise-to-signal ratio of 0.1, with the true structure given; and, in a table of its own, those

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Gains from noisy experiments: `python3 benchmarks/design_identified.py [--quick]`.
 
 Each of the 133 processes goes through RelayExperiment with its default parameters, which sees the

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Gains for the batch of processes, known: `python3 benchmarks/design_known.py [--quick]`.
 
 Robust PI and PID design on each of the 133 processes, against a search over a grid of gains, and

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Time of robust design: `python3 benchmarks/design_time.py [--quick]`."""
 
 from __future__ import annotations

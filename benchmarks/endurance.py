@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A tune of ten minutes at 1 kHz under a full load of the processors, beside a bare echo node.
 
 Usage, after `. ./env.sh`:

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The faults of docs/safety.md over real DDS, again and again at random moments.
 
 Usage, after `. ./env.sh`:

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Run benchmarks and put their tables into docs/benchmarks.md.
 
     . ./env.sh && python3 benchmarks/fill_page.py [NAME ...]

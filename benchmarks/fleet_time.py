@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Time of many bags, one job and two: `python3 benchmarks/fleet_time.py [--count N] [--quick]`.
 
 The bags are step tests of 60 s at 10 Hz, each with noise of its own; `replay` writes their results

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Damage bags at random and read them: `python3 benchmarks/fuzz_bags.py [--quick] [--count N]`.
 
 Seeds of every kind (chunks plain, zstd and lz4; without chunks, index or summary; compressed as a

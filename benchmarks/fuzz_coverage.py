@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Damage bags where it opens new paths of the reader: `python3 benchmarks/fuzz_coverage.py`.
 
 Guided by coverage with atheris, which is not among the requirements: `pip install atheris`. An

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Bags of valid framing that lie inside it: `python3 benchmarks/fuzz_framing.py [--count N]`.
 
 A small recording is taken apart into its records, and one to three of them are changed: lengths

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a record can tell of K_u at best: the Cramer-Rao bound."""
 
 from __future__ import annotations

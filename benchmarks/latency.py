@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Added latency of relay_node against a bare node that only echoes, side by side in one run.
 
 Usage, after `. ./env.sh`:

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Steps a second of a tune in lockstep: `python3 benchmarks/lockstep.py [--runs 5] [--quick]`.
 
 Each run starts the three installed executables, plant_node, relay_node and identifier_node, in a

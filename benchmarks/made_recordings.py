@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Recordings made for benchmarks: small ones of every kind, and large ones of a few numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Errors of every method on every process, for accuracy.py."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Every rule on the papers' examples: `python3 benchmarks/paper_designs.py [--quick]`.
 
 The loops of the worked cases with the Ms and IAE that they must have; what each rule gives for

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Processes of every structure, those of the papers among them, and noisy records of each."""
 
 from __future__ import annotations

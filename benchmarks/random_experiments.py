@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Relay experiments on random processes, with noise, disturbances and faults, without DDS."""
 
 from __future__ import annotations

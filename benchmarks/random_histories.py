@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Random histories of a relay experiment: whether each one ends, and how long it takes.
 
     python3 benchmarks/random_histories.py [--seeds A:B] [--file FILE] [--summary] [--quick]

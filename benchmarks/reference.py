@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A fixed reference workload, so that times can be compared between machines.
 
 Import this before numpy: it pins the linear algebra to one thread.

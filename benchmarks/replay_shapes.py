@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Time and memory of a replay over shapes of input: `python3 benchmarks/replay_shapes.py`.
 
 Each recording is a process of two lags and a dead time under another command, sampled so often as

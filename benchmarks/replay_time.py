@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Time of `replay` beside that of its imports: `python3 benchmarks/replay_time.py [--quick]`.
 
 Whole processes in turns: Python alone; numpy and those parts of scipy that `replay` uses; `replay`

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Experiments on random processes with noise, disturbances and faults, without DDS.
 
     python3 benchmarks/simulated_experiments.py [--seeds A:B] [--file FILE] [--summary] [--quick]

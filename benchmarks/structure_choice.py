@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Which structure the fit chooses: `python3 benchmarks/structure_choice.py [--records N]`.
 
 Processes of every structure, in noise that the relay does not see; beside the choice, how good

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The scatter of the targets over 30 seeds: `python3 benchmarks/target_spread.py [--quick]`.
 
 The targets are medians and 95th percentiles over 30 records of another implementation. Some lie

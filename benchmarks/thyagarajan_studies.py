@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Thyagarajan and Yu's studies: `python3 benchmarks/thyagarajan_studies.py [--seeds N] [--quick]`.
 
 The category map (their Fig 4), how noise and hysteresis change the category, the shapes of the

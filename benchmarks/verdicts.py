@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """How often each check fails on right and on wrong models, over records of many kinds.
 
     . ./env.sh && python3 -m benchmarks.verdicts [RUNS]

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Settings of Sphinx for the user guide; `make docs` builds it."""
 
 import re

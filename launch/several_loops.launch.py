@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Several loops from a file that lists them, each in a namespace of its own with what tunes it.
 
 ros2 launch relay_autotune several_loops.launch.py loops:=plant.yaml

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Relay-feedback autotuning: experiments, identification and controller design.
 
 The names in ``__all__`` are the interface for programs and notebooks. Each is loaded at its first

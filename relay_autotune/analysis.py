@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """From a record to models and gains; live nodes and replay share this path."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The errors that this package raises: found, expected, what to do; and look-up by name."""
 
 from __future__ import annotations

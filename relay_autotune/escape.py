@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Escape invisible characters in foreign text.
 
 A name in a file, or a reason from the network, may hold sequences that move a terminal's cursor,

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Meaning and range of a value, declared once at the field that holds it.
 
 A frozen dataclass declares its fields by :func:`quantity`. Checks, ROS parameters with their

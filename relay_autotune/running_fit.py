@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Repeated fits of a running experiment, with as little work as possible."""
 
 from __future__ import annotations

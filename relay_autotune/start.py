@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The start of each installed executable; it loads the rest.
 
 Loading takes most of a second, with nothing to clean up. So Ctrl-C ends the process at once then,

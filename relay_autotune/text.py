@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Numbers and transfer functions as text: plain, LaTeX and MathML."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Pin the linear algebra to one thread; import this before numpy.
 
 The order of additions depends on the number of threads, and with it the last digits of a fit.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The judgement of an experiment: one finding for each check, and one verdict from all."""
 
 from __future__ import annotations

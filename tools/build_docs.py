@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Build the user guide as a web site in docs/_build/html; `make docs` calls this.
 
 The pages are plain Markdown that a forge shows as they are. So that they need no directives of

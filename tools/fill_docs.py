@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Write tables and texts from the code into the pages of docs/; a test compares the two.
 
     . ./env.sh && python3 tools/fill_docs.py

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Prepare the environments that the package runs and is tested in; `make setup` calls this.
 
     prepare.py          the main one: .venv/ and install/, with the ROS 2 Jazzy that is sourced, or

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Lay the two packages side by side, as ROS release tools expect them.
 
     python3 tools/release_tree.py FOLDER      `make release` calls it with release/

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Draw the pictures of the guide that show reports: the demo's, and each figure's of a bag.
 
     . ./env.sh && python3 tools/report_images.py [BROWSER]

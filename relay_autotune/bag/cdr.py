@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Numbers out of many serialized messages at once.
 
 The layout is that of plain CDR (OMG formal/02-06-51, 15.3): each number is aligned to its own

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The content of a chunk: expanded within limits, checked, and of a cut one what there is."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Arrays that grow, at the cost of the memory that they end up with."""
 
 from __future__ import annotations

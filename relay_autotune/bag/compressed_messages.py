@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Messages that were compressed one by one, as rosbag2 does it with compression_mode MESSAGE.
 
 Each serialized message is then a frame of zstd that declares its size (rosbag2_compression_zstd,

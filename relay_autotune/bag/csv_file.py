@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Logs of other tools: text with columns of time, measurement and command, as tools write it.
 
 Columns are separated by commas, semicolons or tabs; with the last two a decimal comma may be

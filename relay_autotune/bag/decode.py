@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Decoding our own messages by the definition that their bag holds."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The experiments that relay_node left in a bag: whole ones, and one that was cut short."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Which number of a message is meant: `TOPIC[:FIELD]`, such as `/imu:linear_acceleration.x`."""
 
 from __future__ import annotations

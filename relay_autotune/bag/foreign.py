@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Experiments in the recordings of others, which do not say where they are."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The fields of message types in a definition in IDL, as rosidl writes it (OMG IDL 4.2).
 
 Modules, structures, type names, enumerations, and constants where they are sizes; annotations and

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a file may ask for at most, whatever it declares."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Where the messages are in a run of records, found by array operations."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Reading an MCAP file, finished or torn: its channels, and the messages that are wanted.
 
 A file without its footer, as a killed recorder leaves it, is read from its front to the tear.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Where the messages of an MCAP file are: its chunks, and the records outside of any."""
 
 from __future__ import annotations

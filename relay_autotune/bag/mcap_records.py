@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The records of an MCAP file: reading each without trusting what it declares.
 
 Layout: https://mcap.dev/spec. Every length is checked against what is there before it is used.

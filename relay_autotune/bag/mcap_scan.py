@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The layout of an MCAP file by going through it from its front, as far as it makes sense."""
 
 from __future__ import annotations

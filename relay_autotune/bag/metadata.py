@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The texts of a rosbag2 directory: metadata.yaml (version 9) and QoS profiles."""
 
 from __future__ import annotations

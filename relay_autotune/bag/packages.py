@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The packages that expand compressed recordings, imported where one is met."""
 
 from __future__ import annotations

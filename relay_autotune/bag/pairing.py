@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Which of a bag's signals could be the measurement and the command of one loop."""
 
 from __future__ import annotations

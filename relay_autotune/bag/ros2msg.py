@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The fields of message types in a definition of the encoding ``ros2msg``.
 
 Each line is a field, ``TYPE NAME [DEFAULT]``, a constant, ``TYPE NAME=VALUE``, or a comment. The

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Message types as their bag defines them: a tree of structures, arrays and numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A measurement and a command that were recorded on their own, joined to a record."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The bytes of a recording: ranges of a file, expanded first if it is compressed as a whole."""
 
 from __future__ import annotations

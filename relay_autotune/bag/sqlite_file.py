@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Reading a rosbag2 file in SQLite: its channels, and the messages that are wanted."""
 
 from __future__ import annotations

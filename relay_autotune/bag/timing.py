@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Values with their times, taken in piece by piece and put into the order of a clock."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Writing a rosbag2 directory that stays readable if the process is killed."""
 
 from __future__ import annotations

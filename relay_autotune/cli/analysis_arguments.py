@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Options of all commands that read recordings: which part, how to identify, how to tune."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What the commands have in common: arguments, messages and the way they end."""
 
 from __future__ import annotations

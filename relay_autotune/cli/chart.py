@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The input of `identify`: numbers read off a chart, and the methods that use them."""
 
 from __future__ import annotations

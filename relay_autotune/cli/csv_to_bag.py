@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Make a rosbag2 bag of two columns of a CSV file: `csv_to_bag CSV BAG`."""
 
 from __future__ import annotations

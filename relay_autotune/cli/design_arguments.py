@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Options that say what is asked of a controller and where its gains go, for several commands."""
 
 from __future__ import annotations

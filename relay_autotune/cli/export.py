@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Gains as files that other programs load: ros2_controllers' pid_controller, and plain YAML.
 
 `ros2 param load` parses a file as YAML, turns each value into text and parses that again. A number

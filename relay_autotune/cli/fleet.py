@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Many bags, on the processors of this machine or on a Dask cluster; each is done once."""
 
 from __future__ import annotations

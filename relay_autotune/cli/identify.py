@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Identify a process from numbers read off a chart: `identify --method NAME --period P ...`."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Progress of a long computation, shown only on a terminal."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Identify and tune from recordings: `replay BAG [BAG ...]`."""
 
 from __future__ import annotations

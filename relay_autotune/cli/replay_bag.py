@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What `replay` makes of one bag: the same in this process, in another one and on another host."""
 
 from __future__ import annotations

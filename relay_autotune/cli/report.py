@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Write a report of recordings or results: `report BAG|RECORD.csv|RESULT.json ... -o FILE`."""
 
 from __future__ import annotations

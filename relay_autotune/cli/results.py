@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The results of many bags in a file, as they come; a run that was cut short goes on from it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """From a transfer function to gains: `tune --gain K --time-constants T --dead-time D`."""
 
 from __future__ import annotations

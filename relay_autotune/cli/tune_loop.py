@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """tune_loop: start a tune on a running relay_node, show its progress, and print the result.
 
 Ctrl-C, or closing the terminal, cancels the tune; the plant then stays at the safe command, and

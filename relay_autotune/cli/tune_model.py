@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The process that `tune` designs for: from flags, or from a JSON document."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The report of a tune: its record is analysed again with the identifier_node's parameters."""
 
 from __future__ import annotations

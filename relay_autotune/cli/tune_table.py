@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The output of `tune` for people: one rule in full, or all rules side by side."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The text that a tune shows: its progress, its result, and the next commands.
 
 Everything here is made from the messages of the action `Tune` alone.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""A PI or PID controller as it runs on a loop: sample by sample, in manual or automatic.
 
 The law is that of :class:`~relay_autotune.loop.gains.Controller`, sample by sample as in

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The history of a controller's gains: in force, earlier, proven, failed.
 
 A :class:`GainsHistory` is immutable: each event returns the next history, or is refused. It

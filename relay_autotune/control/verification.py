@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Verify gains with a step: compare it with the model's prediction of the same step."""
 
 from __future__ import annotations

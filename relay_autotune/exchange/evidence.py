@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""What an experiment lets one expect of a model and of gains that are said to be of it.
 
 Anybody who may publish on a topic may say what a process is and how to control it. The record says

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Results as documents and as messages, and back, by what their fields declare.
 
 A field is declared once, by :func:`relay_autotune.quantities.told`; what its type means in a

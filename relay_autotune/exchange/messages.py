@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Between the core's dataclasses and the messages of `relay_autotune_msgs`.
 
 Nothing here imports ROS: every function takes any object with the fields of the message, an

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Models in documents and messages: the transfer function, its parameters, how sure they are."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Models and controllers as systems of python-control, for those who go on with it."""
 
 from __future__ import annotations

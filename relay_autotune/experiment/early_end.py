@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """When to fit a running experiment, and whether its result is accurate enough to end it."""
 
 from __future__ import annotations

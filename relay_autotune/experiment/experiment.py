@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The relay experiment: it takes samples, answers with commands and records both."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Read the response to the first step of the relay: its start and its direction."""
 
 from __future__ import annotations

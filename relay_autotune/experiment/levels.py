@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The two command levels of the relay: given, or grown from small to large within the limits."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The part of an experiment in which the relay switches: its cycles, or why there are none."""
 
 from __future__ import annotations

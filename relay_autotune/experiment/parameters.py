@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The parameters of a relay experiment: defaults, units, ranges and checks."""
 
 from __future__ import annotations

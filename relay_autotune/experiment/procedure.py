@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The procedure of a relay experiment, state by state.
 
 The states, the command in each of them, and what ends it::

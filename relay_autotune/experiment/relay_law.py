@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The relay: when it switches, and how long it waits for the measurement to come back."""
 
 from __future__ import annotations

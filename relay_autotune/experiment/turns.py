@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Which switches of the relay begin a cycle, and what to do when no cycle is clear."""
 
 from __future__ import annotations

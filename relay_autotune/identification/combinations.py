@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a record determines where it does not determine every parameter, and what would."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Derivatives by differences, and how far to step for them."""
 
 from __future__ import annotations

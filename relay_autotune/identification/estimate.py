@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A model by the values of its parameters, how sure they are, and what follows from both."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What an identification gives: model, uncertainty, quality of fit."""
 
 from __future__ import annotations

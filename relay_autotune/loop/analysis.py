@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Analysis of a closed loop: stability, robustness, responses to set-point and load."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Linear controllers as the loop analysis uses them: PI, PID, or with an internal model."""
 
 from __future__ import annotations

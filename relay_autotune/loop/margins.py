@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Margins of a loop: peaks of the sensitivities, margins of gain, phase and delay."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Effect of measurement noise on the command of a sampled controller."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Responses of a closed loop to steps of set-point and load, and their figures of merit.
 
 The transforms are inverted by a fast Fourier transform along ``Re s = sigma`` (Dubner and Abate

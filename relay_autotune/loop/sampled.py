@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""The sampled controller: at a sampling period, within the limits of its actuator.
 
 The filter is exact for a measurement that is linear between samples. So its lag is the same at

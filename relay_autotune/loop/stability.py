@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Number of closed-loop poles in the right half plane, by an exact argument principle.
 
 The characteristic equation is ``1 + sum L_k(s) = 0``, each L_k rational with a dead time of its

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """controller_node: a PI or PID controller that takes new gains when it is told to."""
 
 from __future__ import annotations

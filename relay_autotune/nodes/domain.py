@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A free ROS domain, so that a demo or a test does not meet another loop."""
 
 from __future__ import annotations

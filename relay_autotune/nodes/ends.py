@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Publishers and subscriptions of relay_node, with their quality of service."""
 
 from __future__ import annotations

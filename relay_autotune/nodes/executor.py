@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A single-threaded executor with a fast path for the messages of one subscription.
 
 rclpy's executor checks every service, timer and event of a node twice for each message. This

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The history of a controller's gains on disk; it survives a kill and a loss of power.
 
 Each state replaces the previous one in one step: write a temporary file, fsync it, rename it over

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The single owner of a controller's gains: applies them and keeps a journal on disk."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Checks of graph, controller, actuator and clock while a tune runs."""
 
 from __future__ import annotations

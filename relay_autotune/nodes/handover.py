@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Pass the present controller's command through, interrupt it for a tune, and return to it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The status that relay_node publishes on /diagnostics."""
 
 from __future__ import annotations

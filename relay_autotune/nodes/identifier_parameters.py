@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The parameters of identifier_node: method, rule, known process values, design options."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The life of a node's process: its signals, its executor, its deferred work and its end.
 
 rclpy's own signal handlers invalidate the context before any Python code runs, so that nothing

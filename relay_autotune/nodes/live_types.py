@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Message types of measurement and command: how value and stamp are read and written."""
 
 from __future__ import annotations

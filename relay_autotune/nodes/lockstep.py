@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The times of the lockstep protocol between plant_node and relay_node.
 
 The plant repeats its first measurement until a command comes. The first command starts the run,

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The loop around relay_node: the present controller, the actuator, other publishers."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Declare a node's parameters from a table, and explain refused values."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """plant_node: a simulated process on a measurement and a command topic."""
 
 from __future__ import annotations

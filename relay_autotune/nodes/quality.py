@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The quality of service of each topic, and why a publisher and a subscriber do not match."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A thread that writes the bag of one experiment, so that no callback waits for a disk."""
 
 from __future__ import annotations

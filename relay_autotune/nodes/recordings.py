@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The bags of experiments: opened at the start, closed once model and gains are in them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """relay_node: runs relay experiments on a loop and records them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Gains of a controller in another node, set through its parameters: all of them or none."""
 
 from __future__ import annotations

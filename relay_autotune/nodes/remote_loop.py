@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A loop whose controller is another node: gains by parameters, the set-point by a topic."""
 
 from __future__ import annotations

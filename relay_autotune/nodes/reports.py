@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Messages of relay_node about a tune: cycles, record, state."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Check records, models and gains from topics, or refuse them with a reason.
 
 Any node of the network can publish them. Here each message becomes a checked object of the core

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """One experiment in relay_node: its time base, its stamps and its recording."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A relay experiment on the set-point: the present loop stays closed."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Signs of life of identifier_node, so that others wait for its results, but not for ever."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Silence of the measurement: a fault, or a sensor that publishes only on change."""
 
 from __future__ import annotations

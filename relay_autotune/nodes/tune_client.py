@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A client of relay_node's action ~/tune, which also finds the other nodes of the loop."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The action ~/verify of controller_node: make steps, compare, pass or fail."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Factors of a denominator: poles, parameters, and the derivatives for a fit."""
 
 from __future__ import annotations

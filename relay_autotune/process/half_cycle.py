@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Exact steady oscillation of a model under a symmetric relay.
 
 Between two switches the state moves freely, but for the delayed step of the command that arrives

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The parameters of models: name, unit, scale and range of each, and checks of their values."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Exact motion of rational transfer functions between changes of a held input.
 
 The process is a chain of first-order lags (complex constants for oscillating pairs), with the

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Magnitude and phase of a transfer function, over any number of decades."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Exact response of a process to a piecewise-constant input."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A relay that acts at its samples only, on a process simulated exactly between them."""
 
 from __future__ import annotations

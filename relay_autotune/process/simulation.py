@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Exact simulation: a process stepped from outside, and relay experiments driven by events."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The structures of processes: one row each, with everything else derived from the rows."""
 
 from __future__ import annotations

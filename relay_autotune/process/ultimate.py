@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Stability by the exact phase: ultimate point, and poles of a closed loop."""
 
 from __future__ import annotations

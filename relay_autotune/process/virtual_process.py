@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A simulated process in a loop: actuator, exact dynamics, disturbances and sensor."""
 
 from __future__ import annotations

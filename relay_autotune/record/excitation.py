@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the experiments in a long record: the parts in which the command moves the process."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Find the relay in a record of unknown origin: its levels, its cycles, its settings."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Make a long record short: average it in blocks, as far as its response is slow to them.
 
 A model of a few parameters is told by some thousand samples; a million of them cost time and

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The report of an experiment: figures, and a page that says what they mean.
 
 Loading this module is cheap; matplotlib and the template engine are loaded when something is

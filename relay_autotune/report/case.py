@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The content of a report about one experiment, from samples or from a document."""
 
 from __future__ import annotations

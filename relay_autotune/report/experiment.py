@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Figures of the samples: the experiment, the fit over it, the limit cycle in the phase plane."""
 
 from __future__ import annotations

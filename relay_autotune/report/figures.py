@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The figures of a report: what each shows, when it can be drawn, how it is to be read."""
 
 from __future__ import annotations

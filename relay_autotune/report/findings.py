@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The words of a report: the verdict, its checks, the numbers, and what remains uncertain."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Figures of the frequency response: Nyquist with the Ms circle, Bode."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Cases from the JSON documents that `replay --json` prints, which hold no samples."""
 
 from __future__ import annotations

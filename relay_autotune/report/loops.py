@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Figures of the controller: what the recommended gains do, and those of each other rule."""
 
 from __future__ import annotations

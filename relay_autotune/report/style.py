@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The look of figures, and how a figure becomes a file or a part of a page.
 
 The colours are those of Okabe and Ito, which people of any colour vision can distinguish; lines

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The figure of a model's uncertainty, and of how well the methods agree."""
 
 from __future__ import annotations

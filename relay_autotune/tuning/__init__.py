@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Controller design: rules by name, and what their gains do on the model."""
 
 from __future__ import annotations

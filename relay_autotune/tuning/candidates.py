@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Controllers that a search compares, and the limit on the noise in their command."""
 
 from __future__ import annotations

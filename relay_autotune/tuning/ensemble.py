@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Models within the uncertainty of an identification, and controllers judged on all of them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""The three forms of a PID controller, and the exact conversions between them.
 
 All computations use the ISA form; the others are the parallel and the series form:

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""The largest integral gain that bounds on Ms and Mt allow, in closed form.
 
 With a filter F, ``L = (kp (1 + td s) + ki/s) F G``. A bound on the sensitivity keeps L(jw) out of

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The proportional gains between which a loop without integral action is stable."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Integrated absolute errors of many controllers at once, after a step of the load.
 
 The error's own integral is ``1/ki`` exactly, whatever the process; only the part of the other

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Least cost by a pattern search whose directions change from step to step.
 
 The cost need not be smooth. Where two of its pieces meet in a ridge, few directions lead down

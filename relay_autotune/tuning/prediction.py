@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Robustness of the gains that a model would give, before they are asked for."""
 
 from __future__ import annotations

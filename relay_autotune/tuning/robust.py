@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Robust design: the PI or PID controller with the smallest IAE within bounds on Ms and Mt."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The search for the PI or PID controller with the smallest IAE within bounds on Ms and Mt.
 
 With the largest integral gain that the bounds allow, only kp and td remain to be chosen. A scan

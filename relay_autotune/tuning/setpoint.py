@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The set-point weight b that avoids an unnecessary overshoot after a set-point step."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a design rule is given: the process, its uncertainty, and the options."""
 
 from __future__ import annotations

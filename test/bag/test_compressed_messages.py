@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Bags whose messages were compressed one by one (`ros2 bag record --compression-mode message`).
 
 The library rosbags writes such directories too, with their metadata.yaml, independently of rosbag2

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Several bags on one timeline, and directories as recorders leave them."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Recordings of rosbag2 in SQLite."""
 
 from __future__ import annotations

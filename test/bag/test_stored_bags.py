@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The bags of the folder bags/ stay readable, and say what they have always said."""
 
 from __future__ import annotations

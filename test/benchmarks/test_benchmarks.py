@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Each benchmark runs and prints its table; what it measures is not judged here."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Exported gains arrive as the numbers they are, the way `ros2 param load` reads them."""
 
 from __future__ import annotations

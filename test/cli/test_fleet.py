@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Many bags: in processes, on a cluster, into files, and again after a run that was cut short."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The identify command as its users meet it: the installed executable, run as a process."""
 
 from __future__ import annotations

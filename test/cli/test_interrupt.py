@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Ctrl-C while an executable starts, or is at work."""
 
 from __future__ import annotations

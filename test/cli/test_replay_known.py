@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What is known of the process, and several tests for one model, in `replay`."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The command `tune`: a model in, gains out, and one line where there are none."""
 
 from __future__ import annotations

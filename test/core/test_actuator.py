@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The actuator's limits, play and stiction, each against its definition."""
 
 from __future__ import annotations

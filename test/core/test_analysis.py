@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Stability, margins and responses against python-control, scipy and closed forms."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What is said of every model: its residual, the relay test run again on it, its error."""
 
 from __future__ import annotations

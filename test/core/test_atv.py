@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The original ATV against worked cases and the describing function itself."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The one path from a record to gains: never an exception, gains only where they are due."""
 
 from __future__ import annotations

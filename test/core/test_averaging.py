@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The spread between structures: what rivals add to the uncertainty of K_u."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Chang et al.'s equations against the paper's worked cases, simulations and exact records."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The structure chosen from what the relay experiment records, its settling and kick with it."""
 
 from __future__ import annotations

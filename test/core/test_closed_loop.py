@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The sampled closed loop against the continuous one."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Models from records whose noise is no white noise, or that begin before anything is known."""
 
 from __future__ import annotations

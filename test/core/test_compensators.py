@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Compensators against their own equations, and as they run on the exact process."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A relay of the wrong direction, which oscillates on the first answer of an inverse response."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A test that ends once it knows enough: when it is looked at, and whether what it says holds."""
 
 from __future__ import annotations

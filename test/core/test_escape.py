@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Text of others is shown with everything in it visible."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a record lets one expect of a model and of gains, and what it does not let pass."""
 
 from __future__ import annotations

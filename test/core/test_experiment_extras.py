@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """An amplitude that is found, delays, rates, limits, faults of the sensor, and what follows."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The forms of a PID controller are one controller."""
 
 from __future__ import annotations

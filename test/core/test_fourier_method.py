@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `fourier` against processes whose frequency response is known."""
 
 from __future__ import annotations

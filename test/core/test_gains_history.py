@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Which gains are in force: what always holds, and the cases that came up."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The steady half cycle of a model, against the simulated experiment and the worked cases."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Random histories: whatever happens to the loop, an experiment ends, with a reason, in time."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Each check on records of a known process: right models pass, wrong ones do not."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Seeing a response, and which way it goes."""
 
 from __future__ import annotations

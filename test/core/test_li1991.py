@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Two tests, one with a dead time added: exact limit cycles and records."""
 
 from __future__ import annotations

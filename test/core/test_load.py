@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A load that comes early in a test, where too few cycles follow to leave it out."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Luyben's step test: the worked cases, the closed form, and records from end to end."""
 
 from __future__ import annotations

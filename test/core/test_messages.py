@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Messages and back, with stand-ins that have the fields of the message and nothing else."""
 
 from __future__ import annotations

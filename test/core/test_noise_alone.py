@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A relay whose actuator sticks, which goes on with the noise of the sensor alone."""
 
 from __future__ import annotations

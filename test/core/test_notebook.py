@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a notebook shows of an analysis."""
 
 from __future__ import annotations

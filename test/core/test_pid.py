@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The controller that runs, and the proof of its gains."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What real plants do during an experiment, and what comes out of it."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The relay experiment on processes whose answer is known, and on everything that goes wrong."""
 
 from __future__ import annotations

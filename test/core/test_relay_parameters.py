@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The parameters of an experiment: the table and what is refused."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A sensor that speaks only when its value changes, in a simulated experiment."""
 
 from __future__ import annotations

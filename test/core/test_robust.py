@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Robust design against worked cases, closed forms and what no controller can do."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Luyben's rules, and the exact gain of a resonance, against the worked cases and a grid."""
 
 from __future__ import annotations

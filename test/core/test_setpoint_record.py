@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The record of a relay on the set-point, whose command is that of the present controller."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Event-driven relay experiments against closed forms and worked limit cycles."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Every structure of the waveform fit: responses, derivatives, recovery, choice."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Whatever the methods for an unbiased relay are given, they answer with a model or a sentence."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What may be asked of a controller, and what is refused with the limit that was crossed."""
 
 from __future__ import annotations

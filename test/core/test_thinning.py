@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Long records are averaged before they are analysed, and tell the same model."""
 
 import numpy as np

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Thyagarajan and Yu's equations against the worked cases, exact limit cycles, and each other."""
 
 from __future__ import annotations

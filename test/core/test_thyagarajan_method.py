@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `thyagarajan` on records, from end to end."""
 
 from __future__ import annotations

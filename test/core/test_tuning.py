@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Analysis against worked loops; gains that carry what the model does not say."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Ultimate points and closed-loop stability against worked cases and Pade approximations."""
 
 from __future__ import annotations

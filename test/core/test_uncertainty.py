@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Intervals of any function of a model, profiles, combinations, advice, robust losses."""
 
 from __future__ import annotations

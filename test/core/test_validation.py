@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The relay experiment run again on models, and the error measure of eqs 29 and 30."""
 
 from __future__ import annotations

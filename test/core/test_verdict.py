@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The verdict of a table of checks, and how it travels with the gains of an experiment."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Wang's methods against the paper's worked cases and on exact records."""
 
 from __future__ import annotations

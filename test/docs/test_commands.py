@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Every command of README and guide is one that there is, wherever it stands."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Whatever README and guide name exists in the code, and the guide names what there is."""
 
 from __future__ import annotations

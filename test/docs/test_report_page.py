@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The page on the report names what the command and the figures have."""
 
 from __future__ import annotations

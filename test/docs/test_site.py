@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The guide as a web site: every page is in its contents, and every link leads to a page of it."""
 
 from __future__ import annotations

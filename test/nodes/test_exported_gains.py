@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Exported gains through ROS's own two readers of parameter files."""
 
 from __future__ import annotations

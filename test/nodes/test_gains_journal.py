@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The journal of gains: what is read is what was written, whole, whenever the process ends."""
 
 from __future__ import annotations

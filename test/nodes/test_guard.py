@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What is watched in a tune: an actuator that does not follow, and two where one may be."""
 
 from __future__ import annotations

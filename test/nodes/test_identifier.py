@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What identifier_node is told of the process, and the two experiments of the method li."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Ranges and refusals of the nodes' parameter tables."""
 
 from __future__ import annotations

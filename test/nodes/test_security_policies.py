@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The policies of config/security allow each node what it does, and nothing else."""
 
 from __future__ import annotations

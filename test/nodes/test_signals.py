@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Signals that end a process, and output that nobody takes."""
 
 from __future__ import annotations

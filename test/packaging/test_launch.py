@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Launch files, parameter files and layouts name only what there is.
 
 `ros2 launch` itself is no requirement of the tests, so the files are read as what they are: XML,

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What the set-up finds missing it says in one line, and what it made it recognises."""
 
 import importlib.util

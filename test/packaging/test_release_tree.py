@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The release tree: both packages side by side, as the ecosystem's tools look for them."""
 
 import os

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The page opens without a network, holds every figure, and takes nothing from a bag for HTML."""
 
 from __future__ import annotations

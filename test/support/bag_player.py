@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Publish a bag's messages at their times, as `ros2 bag play` does: `bag_player.py BAG RATE`.
 
 It replaces that command where only the wheels of rclpy are installed. It publishes the recorded

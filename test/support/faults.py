@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The faults of a tune, each with the loop that makes it and the expected reason."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A simulated loop around a relay_node, fast enough for a fault in half a second.
 
 The process is of first order with dead time. The relay runs in another process of the machine. The

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Jobs for worker processes, in a module that they can import."""
 
 from __future__ import annotations

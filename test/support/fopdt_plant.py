@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A first-order process with dead time in closed form, as independent truth for the tests.
 
 Between changes of the delayed input, y(t) = K u + (y(t0) - K u) exp(-(t - t0)/tau). It shares no

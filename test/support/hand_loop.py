@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A controller_node in a loop that the test steps sample by sample, with its own stamps."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Random histories of a relay experiment: events of any kind, at any time, of any length.
 
 A history has a process, parameters and one to four events. Each event has its own begin and its

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A loop of installed executables as processes over DDS, and a node that observes it."""
 
 from __future__ import annotations

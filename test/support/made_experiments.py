@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Experiments as relay_node publishes them, of an exactly simulated process."""
 
 from __future__ import annotations

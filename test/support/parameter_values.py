@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Checks of the values that a parameter file or a command gives to a node."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A loop controlled by a node of the test, whose gains controller_node manages.
 
 That node shares no code with the package.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Removal of the shared memory that killed processes leave in a test run's domain."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A relay experiment on a simulated process, without ROS."""
 
 from __future__ import annotations

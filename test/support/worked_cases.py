@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The worked cases of the papers with their exact values, as the tests use them."""
 
 from __future__ import annotations

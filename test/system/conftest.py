@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A rig for each test, in a free ROS domain."""
 
 from __future__ import annotations

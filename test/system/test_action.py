@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The action ~/tune: feedback for each cycle, a result with model and gains, cancel, refusals."""
 
 from __future__ import annotations

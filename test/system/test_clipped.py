@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """An actuator that goes less far than it is told, of which nobody knows: the tune fails."""
 
 from __future__ import annotations

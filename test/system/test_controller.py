@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The whole way over DDS: controller, tune, apply, verify, revert."""
 
 from __future__ import annotations

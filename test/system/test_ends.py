@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """After any end of a tune, the last command is the baseline and the record is kept."""
 
 from __future__ import annotations

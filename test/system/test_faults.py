@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Every fault of docs/safety.md over real DDS: safe command first, then reason, record, no gains.
 
 One relay_node serves all that do not end it; the loop about it is played by the test itself.

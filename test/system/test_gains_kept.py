@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The gains in force in controller_node after any event, in a loop stepped by the test."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The live commands of README and guide, exactly as written there."""
 
 from __future__ import annotations

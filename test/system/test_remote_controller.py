@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The gains of another node's controller: set through parameters, verified by its set-point."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Another node's gains, when that node hangs, or when controller_node ends during a change."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A recording gives the same result in replay, by ~/identify, and played into the nodes."""
 
 from __future__ import annotations

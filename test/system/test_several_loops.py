@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Two loops tune at once, each in its namespace; one of them ends early."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """tune_loop over real DDS, started like by a user or by a script."""
 
 from __future__ import annotations

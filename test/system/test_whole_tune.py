@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A whole tune of installed executables: in lockstep, with /clock, and in real time."""
 
 from __future__ import annotations

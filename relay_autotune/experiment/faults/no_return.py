@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Why a measurement does not come back to the relay: what it did instead."""
 
 from __future__ import annotations

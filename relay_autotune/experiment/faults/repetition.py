@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A sensor that publishes only on change: the meaning of its silence."""
 
 from __future__ import annotations

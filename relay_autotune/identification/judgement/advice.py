@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What test would determine the parameters that a record does not."""
 
 from __future__ import annotations

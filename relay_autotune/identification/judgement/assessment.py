@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """How far an identified model is to be trusted: its residual, its limit cycle, its rivals.
 
 Every method's model is judged alike, on the record that it was identified from.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Checks that tell a linear model from a process that is none, on the data it was fitted to."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Whether a record speaks for a process of the other direction than its relay worked in.
 
 A process with an inverse response (a zero in the right half plane) first answers the other way.

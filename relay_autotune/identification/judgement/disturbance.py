@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Leave out the part of a record that a disturbance has made useless."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What the checks look at: the record, the model that counts, its rivals, the gains."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A step of the load that came during a test, estimated together with the model."""
 
 from __future__ import annotations

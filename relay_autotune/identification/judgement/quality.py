@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """How much of a record a model leaves unexplained, with one set of thresholds for all who ask."""
 
 from __future__ import annotations

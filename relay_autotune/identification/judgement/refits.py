@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Other fits of a record, on whose models gains have to hold: of its halves, and plain ones.
 
 A part of a record tells some directions of the parameters and not others. So its models are drawn

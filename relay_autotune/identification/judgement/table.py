@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The table of checks. Adding a check is adding a row, and the function that measures it.
 
 Each function returns a number that is the larger the worse, or None where the check does not

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Whether an identified model reproduces the relay test that it was identified from.
 
 Thyagarajan and Yu 2003 run the relay experiment again on each model and look at the two curves

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a record shows of a process without any structure, beside the model that was chosen.
 
 The model is run on the recorded command alone, from rest at an unknown constant command and

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""The original ATV: lags from the describing function's ultimate point (Luyben 1987).
 
 As Chang, Shen and Yu 1992 have it (eqs 1, 2, 6, 7, 13): period and amplitude give an estimate of

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `chang`: models 1 to 5 by the exact equations (Chang, Shen and Yu 1992).
 
 Models of lags from the period and the amplitude of a relay test, exact in time.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `fourier`: measured points of the frequency response, and a model through them.
 
 The ratio of two Fourier integrals over whole cycles is the frequency response itself, without any

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Models 1 to 5 of Chang, Shen and Yu 1992, as the methods for a symmetric relay report them."""
 
 from __future__ import annotations

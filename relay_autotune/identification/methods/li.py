@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `li`: gain, lags and dead time from several relay tests (Li et al. 1991).
 
 Gain, lags and dead time from two relay tests, one with a dead time added to the relay.

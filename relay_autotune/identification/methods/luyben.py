@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `luyben_step`: an integrating process with inverse response, from a step test.
 
 Dead time, extremum and return are read off a smooth curve: the baseline, and from the end of the

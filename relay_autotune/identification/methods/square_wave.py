@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Steady oscillation of real lags driven by a symmetric square wave, in closed form.
 
 All is for unit static gain and unit height of the square wave, so that y here is y/(K h). With T

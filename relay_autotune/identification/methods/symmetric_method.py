@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What the methods for an unbiased relay have in common: choice of a model, uncertainty, remarks.
 
 Of models 1 to 3 period and amplitude give a time constant each, if the gain is known; how much

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The method `thyagarajan`: the structure by the shape of the limit cycle, then its parameters.
 
 Thyagarajan and Yu 2003. The exact equations are used, with the level at which the relay was seen

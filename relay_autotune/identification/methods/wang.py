@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The methods `wang_biased` and `wang_unbiased`: FOPDT models from one relay test.
 
 Wang, Hang and Zou 1997. Peaks and fundamental are those of the averaged period, whose peaks noise

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """A relay test as its averaged limit cycle, and the uncertainty that its cycles tell."""
 
 from __future__ import annotations

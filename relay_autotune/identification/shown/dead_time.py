@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The dead time of a process, as the record of a relay test shows it."""
 
 from __future__ import annotations

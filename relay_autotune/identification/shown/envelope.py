@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """How the peaks of a relay test grow to their limit cycle."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The averaged period of a relay test as a smooth curve that keeps its sharp edges.
 
 All samples of the steady cycles are laid over one period by the time since the last switch. A

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The frequency response at the harmonics of a limit cycle, each point with its uncertainty."""
 
 from __future__ import annotations

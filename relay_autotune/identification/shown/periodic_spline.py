@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Least squares with periodic cubic splines that may have a kink."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The state about which a relay test moves, and the static gain that its means tell."""
 
 from __future__ import annotations

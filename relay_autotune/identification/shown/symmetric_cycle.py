@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The limit cycle of an unbiased relay in numbers."""
 
 from __future__ import annotations

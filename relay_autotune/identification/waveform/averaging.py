@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Uncertainty that knows that the structure was chosen."""
 
 from __future__ import annotations

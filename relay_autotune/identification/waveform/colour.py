@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The colour of noise: an autoregression whose order the data choose."""
 
 from __future__ import annotations

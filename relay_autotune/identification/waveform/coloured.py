@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The fit where what is left is no white noise: generalised least squares in the noise's colour.
 
 A criterion that takes correlated samples for independent ones prefers what bends to the noise.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Intervals of what a fit does not determine, and what it does determine all the same."""
 
 from __future__ import annotations

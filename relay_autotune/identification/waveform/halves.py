@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Whether both halves of a record tell one model, and what they tell where they do not."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Fit of a model to every sample of one or several records, by separable least squares.
 
 The model is

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Responses by partial fractions, where the poles are equal or well apart.
 
 With the step of a held input as a pole at s = 0, an output is

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Which fits explain the samples by what no sample can show."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Responses of any structure to the recorded input, with derivatives by its parameters."""
 
 from __future__ import annotations

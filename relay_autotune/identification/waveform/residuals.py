@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Tests on residuals, and covariances that stay honest where they are correlated."""
 
 from __future__ import annotations

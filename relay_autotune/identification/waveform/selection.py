@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The structures that may explain the data, every one fitted, with the criterion of its fit."""
 
 from __future__ import annotations

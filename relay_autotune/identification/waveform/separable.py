@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Separable least squares: linear coefficients by QR, the others by Levenberg and Marquardt.
 
 Variable projection (Golub and Pereyra 1973) with Kaufman's approximation of the Jacobian.

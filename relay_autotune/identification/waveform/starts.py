@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Where a fit begins: a grid for FOPDT, and from its fit every other structure."""
 
 from __future__ import annotations

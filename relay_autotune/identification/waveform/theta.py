@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The parameters of a fit, theta: what they do to the output, how far they move, what they mean.
 
 Theta is the logarithms of the parameters of a structure's factors, then the dead time.

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Published tuning rules, each with its source and where it applies."""
 
 from __future__ import annotations

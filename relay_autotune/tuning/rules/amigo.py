@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Åström and Hägglund's rules of approximate M-constrained integral gain (AMIGO).
 
 Åström and Hägglund, "Revisiting the Ziegler-Nichols step response method for PID control",

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What a rule may ask of its task, and the sentences with which it refuses."""
 
 from __future__ import annotations

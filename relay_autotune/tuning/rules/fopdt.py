@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Rules for a stable FOPDT process, ``K exp(-D s)/(tau s + 1)``."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """The limit cycle that a relay would make of a model, and what the describing function reads."""
 
 from __future__ import annotations

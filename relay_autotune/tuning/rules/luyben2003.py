@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Luyben's rules for integrating processes with inverse response and dead time.
 
 Luyben, "Identification and Tuning of Integrating Processes with Deadtime and Inverse Response",

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""The gain at which a closed loop has a given resonance, exactly.
 
 The closed-loop log modulus ``L_c = 20 log |k L/(1 + k L)|`` equals the logarithm of M > 1 where

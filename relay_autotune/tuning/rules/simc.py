@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Skogestad's rules (SIMC), with the half rule.
 
 Skogestad, "Simple analytic rules for model reduction and PID controller tuning", J. Process

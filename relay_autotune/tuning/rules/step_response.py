@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """What the step response of a model tells rules that were made for step tests."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 """Rules that know the process by its ultimate point alone.
 
 There are two such points. The model's own is where its phase is -180 degrees. The other is what

@@ -1,3 +1,6 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
 r"""Internal model control of an unstable FOPDT process, ``K exp(-D s)/(tau s - 1)``.
 
 Rotstein and Lewin, "Simple PI and PID Tuning for Open-Loop Unstable Systems", Ind. Eng. Chem.
