@@ -64,6 +64,9 @@ _LASTING = 2.0
 # Before all structures are tried: a flexible one that leaves this much colour is enough to know.
 _CLEAR = 1e-12
 _LITTLE_WORTH = 0.5
+# Parts of a record, and how many times more than usual one of them leaves where something came.
+_BLOCKS = 10
+_UNEVEN = 5.0
 
 
 def is_coloured(fit: Fit) -> bool:
@@ -73,6 +76,16 @@ def is_coloured(fit: Fit) -> bool:
         return False
     p = ljung_box(state.residual)
     return not math.isnan(p) and p < _WHITE
+
+
+def is_an_event(fit: Fit) -> bool:
+    """Return whether most of what a fit leaves came at one time, as a step of the load does.
+
+    That is no noise, of whatever colour: the load is estimated, or the cycles are left out.
+    """
+    blocks = np.array_split(fit.state.residual, _BLOCKS)
+    powers = np.array([float(np.mean(block**2)) for block in blocks])
+    return float(powers.max()) > _UNEVEN * float(np.median(powers))
 
 
 def is_clearly_coloured(problem: Problem, sign: int) -> bool:

@@ -26,6 +26,7 @@ from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.coloured import (
     in_colour,
+    is_an_event,
     is_clearly_coloured,
     is_coloured,
 )
@@ -126,7 +127,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
     """Fit by least squares, or in the colour of the noise where that is not white."""
-    clear = known.loss == LOSSES[0] and is_clearly_coloured(problem, sign)
+    clear = not held and known.loss == LOSSES[0] and is_clearly_coloured(problem, sign)
     if clear:
         coloured = in_colour(problem, scale, known, sign, held=held)
         if coloured is not None:
@@ -134,11 +135,13 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     fit = _fit(problem, known, sign, scale)
     fit = _by_noise(problem, fit, known, sign)
     fit = _spared_of_outliers(problem, fit, known, sign)
-    if clear or not is_coloured(fit):
+    if clear or not is_coloured(fit) or (held and is_an_event(fit)):
         return fit
     rest = replace(fit.problem, structure=FOPDT)
     coloured = in_colour(rest, scale, known, sign, held=held)
-    return fit if coloured is None else replace(coloured, warnings=fit.warnings)
+    if coloured is None or not _responds(coloured.problem, coloured.state, _SEARCHED):
+        return fit
+    return replace(coloured, warnings=fit.warnings)
 
 
 def _measured(records: Sequence[Record]) -> list[FloatArray]:
