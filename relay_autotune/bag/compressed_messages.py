@@ -17,7 +17,7 @@ import numpy as np
 from relay_autotune.bag.locate import Content, Messages
 from relay_autotune.bag.mcap_records import DamageError
 from relay_autotune.bag.packages import expanding_package
-from relay_autotune.bag.source import ZSTD_MAGIC
+from relay_autotune.bag.source import ZSTD_MAGIC, Source
 
 # Messages are handed on when they have expanded to so many bytes together.
 _EXPANDED = 16 << 20
@@ -34,10 +34,12 @@ def are_compressed(messages: Messages) -> bool:
 class Expander:
     """Expands messages within limits, and counts those that cannot be expanded.
 
+    :param source: the file that holds the messages.
     :param largest: size that a message may have [bytes].
     """
 
-    def __init__(self, largest: int) -> None:
+    def __init__(self, source: Source, largest: int) -> None:
+        self._source = source
         self._largest = largest
         self._zstandard = expanding_package("zstandard")
         self._decompressor = self._zstandard.ZstdDecompressor()
@@ -47,6 +49,8 @@ class Expander:
         """Yield messages as they were before they were compressed, so many at a time.
 
         Those that cannot be expanded are left out; `first_refusal` then says why.
+
+        :raises BagError: if they expand to more than a recording does.
         """
         view = memoryview(messages.content)
         parts: list[bytes] = []
@@ -60,6 +64,7 @@ class Expander:
             except DamageError as damage:
                 self.first_refusal = self.first_refusal or str(damage)
                 continue
+            self._source.count_expanded(len(part))
             parts.append(part)
             kept.append(number)
             size += len(part)

@@ -11,7 +11,8 @@ LARGEST_CHUNK = 256 << 20
 # Bytes that zstd may hold back while it expands a stream: what its strongest level asks for.
 LARGEST_WINDOW = 128 << 20
 
-# A file compressed as a whole may expand to this many times its size, or to a gigabyte.
+# All that is compressed in a file, or the file as a whole, may expand to this many times its size,
+# or to a gigabyte.
 MOST_EXPANSION = 1000
 UNSUSPICIOUS = 1 << 30
 # ... and leaves this much of the disk free.

@@ -168,7 +168,7 @@ class McapFile:
         if not are_compressed(messages):
             yield messages
             return
-        expander = Expander(self._largest)
+        expander = Expander(self._source, self._largest)
         yield from expander.expand(messages)
         if expander.first_refusal and channel not in self._refused:
             self._refused.add(channel)

@@ -117,6 +117,7 @@ def segment_content(source: Source, segment: Segment, largest: int) -> Content:
 
     :param largest: size that a chunk may have [bytes].
     :raises DamageError: if nothing of it can be used.
+    :raises BagError: if the chunks of the file together expand to more than a recording does.
     """
     if not segment.is_chunk:
         return source.read(segment.start, segment.end)
@@ -127,7 +128,9 @@ def segment_content(source: Source, segment: Segment, largest: int) -> Content:
         )
     body = source.read(segment.start + RECORD.size, segment.end)
     whole = segment.whole and len(body) == segment.end - segment.start - RECORD.size
-    return chunk_content(body, whole=whole, largest=largest)
+    content = chunk_content(body, whole=whole, largest=largest)
+    source.count_expanded(len(content))
+    return content
 
 
 def is_chunk_there(source: Source, segment: Segment) -> bool:

@@ -76,6 +76,7 @@ class Source:
     def __init__(self, path: Path, magic: bytes = MAGIC) -> None:
         self.path = path
         self.notes: list[str] = []
+        self._expanded = 0
         self._magic = magic
         self._kind = "an MCAP file" if magic == MAGIC else "a rosbag2 file in SQLite"
         self._file = open_regular(path)
@@ -116,6 +117,23 @@ class Source:
         except OSError as error:
             raise BagError(f"cannot read {self.path}: {error.strerror or error}") from error
         return data
+
+    def count_expanded(self, size: int) -> None:
+        """Count what a compressed part has expanded to.
+
+        Each part has a limit of its own; a small file of many parts could still keep a reader busy
+        for hours.
+
+        :param size: of the part [bytes].
+        :raises BagError: if all parts together expand to more than a recording does.
+        """
+        self._expanded += size
+        most = max(UNSUSPICIOUS, MOST_EXPANSION * self.size)
+        if self._expanded > most:
+            raise BagError(
+                f"what {self.path} holds expands to more than {most} bytes, over "
+                f"{MOST_EXPANSION} times its size; expected a recording"
+            )
 
     def announce(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Tell the system what will be read, so that a disk fetches it all at once.

@@ -171,7 +171,7 @@ class SqliteFile:
             if not are_compressed(messages):
                 yield channel, before, messages
                 continue
-            expander = Expander(self._largest)
+            expander = Expander(self._source, self._largest)
             for part in expander.expand(messages):
                 yield channel, before, part
             if expander.first_refusal:

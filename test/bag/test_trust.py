@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from made_bags import REPOSITORY, START
 from mcap.writer import CompressionType, Writer
 
+from relay_autotune.bag import source
 from relay_autotune.bag.fields import named_field
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
@@ -130,6 +131,17 @@ def test_a_frame_that_holds_more_than_its_chunk_declares_is_not_expanded(tmp_pat
     assert most < 20e6
     assert COUNT - 50 < values.size < COUNT
     assert any("differ in their size" in note for note in notes)
+
+
+def test_chunks_that_together_expand_too_far_are_refused(tmp_path, monkeypatch):
+    """Each chunk may be within its limit where all of them are not."""
+    path = write(tmp_path / "bag.mcap", compression=CompressionType.ZSTD)
+    monkeypatch.setattr(source, "MOST_EXPANSION", 0)
+    monkeypatch.setattr(source, "UNSUSPICIOUS", 4000)
+    with pytest.raises(BagError, match="expands to more than 4000 bytes"):
+        read(path)
+    monkeypatch.setattr(source, "UNSUSPICIOUS", 1 << 20)
+    np.testing.assert_array_equal(read(path)[0], np.arange(COUNT))
 
 
 def test_large_chunks_are_not_in_memory_together(tmp_path):
