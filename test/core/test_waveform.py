@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.errors import IdentificationError
+from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
@@ -225,7 +225,7 @@ def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command
 
 
 def test_an_unknown_structure_is_refused():
-    with pytest.raises(IdentificationError, match="no structure"):
+    with pytest.raises(ParameterError, match="structure is 'ladder', expected one of fopdt"):
         identify_waveform(_staircase()[2], Known(structure="ladder"))
 
 
