@@ -83,8 +83,8 @@ class ServedNode(Node):
     def work_off(self) -> None:
         """Do all deferred work, and drop the idle work."""
         self._when_idle.clear()
-        while self.work(idle=False):
-            pass
+        while self._deferred:
+            self.work(idle=False)
 
     def compute(self, work: Callable[[], Any], taken: Callable[[Any], None]) -> None:
         """Do ``work`` in a thread while the callbacks go on, then hand over its result.

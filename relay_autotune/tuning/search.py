@@ -362,7 +362,7 @@ class Search:
         )
         chosen = upper * share
         # Beyond, the integral action alone would close the loop where no frequency was looked at.
-        chosen[chosen > self._largest_ki] = -math.inf
+        chosen[np.isfinite(chosen) & (chosen > self._largest_ki)] = -math.inf
         ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)
         return Candidates(kp, ki, td, tf)
 

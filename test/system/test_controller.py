@@ -356,7 +356,13 @@ def test_its_end_leaves_no_load_of_a_verification(rig: Rig, given: float) -> Non
     )  # fmt: skip
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
     models.publish(
-        TransferFunction(final=True, numerator=[2.0], denominator=[0.8, 1.0], dead_time=0.4)
+        TransferFunction(
+            final=True,
+            verdict=TransferFunction.VERDICT_TRUSTED,
+            numerator=[2.0],
+            denominator=[0.8, 1.0],
+            dead_time=0.4,
+        )
     )
     rig.until(lambda: len(commands) > 400, "a closed loop")
     client = ActionClient(rig.node, Verify, "controller_node/verify")
