@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 FloatArray = NDArray[np.float64]
 
@@ -43,6 +42,8 @@ class Colour:
         :param rows: shape (..., n).
         """
         p = min(self.order, rows.shape[-1])
+        from scipy.signal import lfilter  # loaded only where noise has a colour
+
         white = lfilter(np.concatenate(([1.0], -self.coefficients)), [1.0], rows, axis=-1)
         white[..., :p] = rows[..., :p] @ self.begin[:p, :p].T
         return np.asarray(white)
