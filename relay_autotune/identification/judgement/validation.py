@@ -96,7 +96,15 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: SteadyState) -> Val
     if model.process_sign * (-1 if settings.reverse_acting else 1) < 0:
         return Validation(reason="the model's gain is against the direction of the relay")
     try:
-        point = rest.value if rest.measured else _rest_by(model, seen, rest.value)
+        point = rest.value
+        if not rest.measured:
+            # The limit cycle depends on the levels, not on the baseline of others' relays, which
+            # is a guess: so it starts from the command that holds the model at the set-point.
+            shift = (middle - _rest_by(model, seen, middle)) / model.gain
+            settings = replace(
+                settings, baseline=settings.baseline + shift, bias=settings.bias - shift
+            )
+            point = middle
         cycle, modelled = _limit_cycle(model, settings, point, _KICK * size)
     except ModelError as error:
         return Validation(reason=str(error))
