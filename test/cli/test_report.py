@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from report_cases import completed, fruitless, only
+from analysed import completed
+from report_cases import fruitless, only
 
 from relay_autotune.cli import replay, report
 from relay_autotune.exchange.document import document, to_json

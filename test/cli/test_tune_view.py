@@ -12,7 +12,7 @@ from argparse import ArgumentParser
 from typing import Any
 
 import pytest
-from report_cases import completed as analysed
+from analysed import completed as analysed
 from report_cases import only
 
 from relay_autotune.cli import tune_loop

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from report_cases import completed
+from analysed import completed
 
 from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from analysed import SETTINGS, completed
 from matplotlib.path import Path
-from report_cases import SETTINGS, completed, fruitless
+from report_cases import fruitless
 
 from relay_autotune.record.record import Record
 from relay_autotune.report import draw

@@ -13,7 +13,8 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from report_cases import MODEL, aborted, completed, fruitless, only
+from analysed import MODEL, completed
+from report_cases import aborted, fruitless, only
 
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.models import model_fields

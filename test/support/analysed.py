@@ -1,0 +1,68 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""An analysed experiment for tests, of the core alone."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.analysis import Analysis, analyse
+from relay_autotune.identification import Known
+from relay_autotune.process.sampled_relay import simulate_sampled_relay
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome, Record, RelaySettings
+from relay_autotune.verdict import Check, Judgement, Measured, judge
+
+MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
+SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
+
+
+def relay_record(*, outcome: Outcome = Outcome.COMPLETED, reason: str = "") -> Record:
+    """Record a biased relay on 1.65 e^(-10 s)/(1 + 20 s), with noise."""
+    noise = np.random.default_rng(5).normal(0.0, 0.02, 700)
+    found = simulate_sampled_relay(MODEL, SETTINGS, period=0.4, noise=noise)
+    return Record(
+        time=found.time,
+        measurement=found.measurement,
+        command=found.command,
+        settings=SETTINGS,
+        noise_std=0.02,
+        cycle_start=found.cycle_start,
+        outcome=outcome,
+        reason=reason,
+        experiment_id="run-1",
+        start=1_790_000_000.0,
+    )
+
+
+@functools.cache
+def completed() -> Analysis:
+    """Return an experiment that gave a model and gains."""
+    return analyse(relay_record(), known=Known(structure="fopdt"))
+
+
+def swing_check(value: float | None, *, doubtful: float = 1.0, failed: float = 2.0) -> Check:
+    """Return a check whose measured number is `value`."""
+    measured = None if value is None else Measured(value, "in the cycles")
+    return Check(
+        name="swing",
+        title="Swing",
+        what="height of the swing",
+        unit="m",
+        doubtful=doubtful,
+        failed=failed,
+        sentence="the swing is {value} m {detail}, more than {limit} m",
+        remedy="hold it",
+        measure=lambda _: measured,
+    )
+
+
+def doubted() -> Analysis:
+    """Return the completed experiment with a check that is doubtful."""
+    found = completed()
+    judgement = Judgement((*found.judgement.findings, *judge((swing_check(1.5),), None)))
+    return replace(found, judgement=judgement)
