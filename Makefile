@@ -39,10 +39,14 @@ test-rest: lint
 # the numeric core with the oldest numeric libraries, without ROS
 test-oldest:
 	@$(PYTHON) tools/prepare.py oldest
-	@if [ -d .venv-oldest ]; then .venv-oldest/bin/python -m pytest -q test/core; fi
+	@if [ -d .venv-oldest ]; then \
+		.venv-oldest/bin/python -m pytest -q -m "not nightly and not long" test/core; fi
 
 test-nightly: setup
 	@$(ENTER) && python3 -m pytest -q -m nightly
+	@$(PYTHON) tools/prepare.py oldest
+	@if [ -d .venv-oldest ]; then \
+		.venv-oldest/bin/python -m pytest -q -m "nightly or long" test/core; fi
 
 lint: setup
 	@$(ENTER) && ruff check $(SOURCES)

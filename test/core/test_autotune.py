@@ -65,6 +65,7 @@ def test_while_it_runs_there_is_a_model_and_no_gains():
     assert found.gains == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("method", "rule"), [("waveform", "robust"), ("wang_biased", "imc")])
 def test_alone_they_are_what_they_are_beside_others(method, rule):
     beside = analyse(_record(), method=method, rule=rule)
@@ -76,6 +77,7 @@ def test_alone_they_are_what_they_are_beside_others(method, rule):
     assert alone.added_delay == beside.added_delay
 
 
+@pytest.mark.long
 def test_equal_records_give_equal_numbers():
     one, two = analyse(_record()), analyse(_record())
     assert one.model.values.tolist() == two.model.values.tolist()
@@ -150,6 +152,7 @@ def _beginning(record: Record, samples: int) -> Record:
     )
 
 
+@pytest.mark.long
 def test_a_running_test_forgets_a_disturbance_of_its_beginning():
     """While the model contradicts the record there is no interval to end the test on."""
     model = TransferFunction.fopdt(1.65, 20.0, 10.0)

@@ -220,6 +220,7 @@ def test_numbers_that_cannot_be_are_refused():
         two_equal_and_one(period, 0.1, amplitude / (2.0 * RELAY), 0.0, None)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=40)
 @given(
     order=st.integers(1, 8),

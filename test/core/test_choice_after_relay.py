@@ -48,6 +48,7 @@ def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=0.04)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     model = TransferFunction.lag_complex(1.0, 1.0, 10.0, 0.7, 0.0)
@@ -58,6 +59,7 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     assert not any("drift" in w for w in found.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("noise_std", "within"), [(0.0, 1e-9), (0.002, 3e-3)])
 @pytest.mark.parametrize(
     "model",
@@ -83,6 +85,7 @@ def test_an_inverse_response_is_found_that_a_fopdt_does_not_show(model, noise_st
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=within)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 15])
 def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
     model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)

@@ -93,7 +93,8 @@ def test_a_slow_disturbance_as_a_colour():
     assert colour.whitened(np.array([1.0, 0.0])) == pytest.approx([variance**-0.5, -0.99])
 
 
-@pytest.mark.parametrize("pole", [0.9, 0.98])
+@pytest.mark.long
+@pytest.mark.parametrize("pole", [0.9, pytest.param(0.98, marks=pytest.mark.nightly)])
 def test_correlated_noise_beside_a_relay_test(pole):
     """The interval of least squares, widened for correlation, held in 71 to 87 %."""
     true = ultimate_point(PROCESS)
@@ -106,6 +107,7 @@ def test_correlated_noise_beside_a_relay_test(pole):
     assert max(abs(d) for d in deviations) < 3.5
 
 
+@pytest.mark.long
 def test_a_load_that_walks_at_random_beside_a_relay_test():
     """A tenth of the error of least squares, which bends gain and dead time to the load."""
     true = ultimate_point(PROCESS)

@@ -33,12 +33,13 @@ def run(model, *, sign, period, **acting):
     return tuned(model, parameters, period=period, seed=11, **acting)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "period", "noise_std"),
     [
         (SECOND_ORDER, 0.015, 0.0),
-        (SECOND_ORDER, 0.015, 0.03),
-        (SLOWER, 0.04, 0.0),
+        pytest.param(SECOND_ORDER, 0.015, 0.03, marks=pytest.mark.nightly),
+        pytest.param(SLOWER, 0.04, 0.0, marks=pytest.mark.nightly),
         (SLOWER, 0.04, 0.5),
         (INTEGRATOR, 0.015, 0.03),
     ],
@@ -54,6 +55,7 @@ def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, per
     assert wrong.model.process_sign == -model.process_sign
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("model", "period"), [(SECOND_ORDER, 0.05), (SLOWER, 0.1)])
 def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     noise = {"noise_std": 0.01 * abs(model.gain)}
@@ -63,12 +65,13 @@ def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     assert np.sign(found.best_gains.kc) == model.process_sign
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "acting",
     [
         {"drift": 0.003, "noise_std": 0.01},
         {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01},
-        {"quantisation": 0.1},
+        pytest.param({"quantisation": 0.1}, marks=pytest.mark.nightly),
         {"noise_std": 0.1},
     ],
 )

@@ -117,6 +117,7 @@ def _ended(model: TransferFunction, sought: str, wanted: float) -> tuple[RelayEx
     return tune, found
 
 
+@pytest.mark.long
 def test_a_test_of_three_lags_ends_early_and_its_interval_is_true():
     # No FOPDT explains this process: the structure has to be chosen on the way.
     model = TransferFunction.lag_n(1.0, 1.0, 3, 0.5)
@@ -145,6 +146,7 @@ def test_the_predicted_ms_holds_on_the_process():
     assert abs(true_ms / found.ms - 1.0) < 2.0 * 0.04
 
 
+@pytest.mark.long
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_the_quick_fits_never_end_a_test_that_a_choice_would_not(seed):

@@ -284,6 +284,7 @@ def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
     assert lost_effect(replace(clipped_steps(9.0), held_input=two), PROCESS) is None
 
 
+@pytest.mark.long
 def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse_alone(clipped_steps(9.0)).verdict is Verdict.TRUSTED
     assert analyse_alone(clipped_steps(0.7)).verdict is not Verdict.TRUSTED

@@ -33,6 +33,7 @@ def run(model, *, load_time, load_size, noise_std, seed):
     return tuned(model, ExperimentParameters(amplitude=1.0), period=PERIOD, seed=seed, **acting)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "load_time", "load_size", "noise_std"),
     [
@@ -57,6 +58,7 @@ def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size
     assert time == pytest.approx(load_time, abs=3.0)
 
 
+@pytest.mark.long
 def test_a_load_that_no_structure_explains_does_not_pass_for_no_response():
     # What the models leave is so correlated that the simplest was chosen, which leaves all of it.
     tune = run(SECOND_ORDER, load_time=70.17, load_size=-0.4, noise_std=0.0, seed=1000)

@@ -62,6 +62,7 @@ def test_numbers_of_the_examples(name, inputs, exact, tol):
     assert 4.0 / (math.pi * shape.amplitude) == pytest.approx(exact["Ku"], rel=tol)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.class.grid"))
 def test_categories_over_order_and_dead_time(name, inputs, exact, tol):
     for case in exact:
@@ -105,6 +106,7 @@ PROCESSES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("category", PROCESSES)
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.1])
 def test_a_record_has_the_shape_of_its_process(category, noise):
@@ -131,6 +133,7 @@ def test_a_dense_record_gives_the_shape_exactly():
     assert found.std("time_to_peak") < 1e-5
 
 
+@pytest.mark.nightly
 def test_the_spread_over_seeds_is_the_one_reported():
     model, _ = PROCESSES["1a"]
     relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.1)

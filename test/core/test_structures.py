@@ -132,6 +132,7 @@ def _record(model: TransferFunction, noise: float = 0.0, seed: int = 0) -> Recor
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROCESSES)
 def test_without_noise_the_true_structure_is_found_exactly(name):
     model = PROCESSES[name]
@@ -149,6 +150,7 @@ def test_without_noise_the_true_structure_is_found_exactly(name):
     assert found.ultimate_gain == pytest.approx(ultimate_point(model).gain, rel=1e-8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROCESSES)
 def test_in_noise_the_choice_gives_the_ultimate_point(name):
     model = PROCESSES[name]
@@ -160,6 +162,7 @@ def test_in_noise_the_choice_gives_the_ultimate_point(name):
         assert abs(found.ultimate_gain - truth.gain) < 4.5 * found.ultimate_gain_std
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROCESSES)
 def test_the_true_structure_given_its_errors_are_those_stated(name):
     model = PROCESSES[name]
@@ -217,6 +220,7 @@ def test_a_fit_that_lives_between_the_samples_is_none(model, unseen):
     assert is_unseen(model, interval=0.1, length=100.0) is unseen
 
 
+@pytest.mark.long
 def test_a_drift_beside_a_slow_pole_and_zero_is_no_process():
     """One cycle of 2 e^(-0.1 s)/(0.2 s + 1), recorded on a machine that stepped the plant late.
 

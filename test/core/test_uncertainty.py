@@ -205,6 +205,7 @@ def test_steps_of_the_sensor_larger_than_its_noise_are_told_and_widen_the_interv
     assert not any("steps of" in w for w in found.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_limit_cycle_that_no_structure_explains_gives_a_warning_or_a_reason(seed):
     rng = np.random.default_rng(seed)

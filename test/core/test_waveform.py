@@ -79,6 +79,7 @@ def _bound(run: RelayRun, process: tuple[float, float, float], std: float) -> tu
 PROCESSES = [(1.65, 20.0, 10.0), (1.0, 2.0, 2.0), (1.0, 1.0, 0.1), (1.0, 1.0, 10.0)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("process", PROCESSES)
 def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
     run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
@@ -94,6 +95,7 @@ def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
     assert stated == pytest.approx(bounds[0], rel=0.1)
 
 
+@pytest.mark.long
 def test_the_intervals_cover_the_truth():
     process = (1.65, 20.0, 10.0)
     run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
@@ -162,6 +164,7 @@ def test_a_start_away_from_rest_is_estimated():
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("start", [600, 700, 800, 900])
 def test_a_record_cut_out_of_an_oscillation(start):
     record = _run(1.65, 20.0, 10.0, 0.3, 2000).record()
@@ -229,7 +232,8 @@ def test_an_unknown_structure_is_refused():
         identify_waveform(_staircase()[2], Known(structure="ladder"))
 
 
-@settings(deadline=None, max_examples=20)
+@pytest.mark.long
+@settings(deadline=None, max_examples=10)
 @given(
     seed=st.integers(0, 10_000),
     samples=st.integers(12, 120),

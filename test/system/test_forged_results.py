@@ -65,7 +65,7 @@ def gains_of(process: Process, name: str, **changes: Any) -> PidGains:
 def test_forged_results_end_no_tune_and_are_not_stored(rig: Rig) -> None:
     loop = Loop(rig)
     relay = loop.start()
-    loop.set(**DEFAULTS, stop_when="confident", max_cycles=1000, min_cycles=1000)
+    loop.set(**DEFAULTS | {"stop_when": "confident", "max_cycles": 1000, "min_cycles": 1000})
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
     gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
     answer = loop.tune()
@@ -145,7 +145,7 @@ def test_forged_gains_are_not_applied(rig: Rig) -> None:
     ends["relay_experiment"].publish(experiment_of(PROCESS, "ended", outcome=Outcome.ABORTED))
     rig.run_for(0.3)
     send("pi_gains", gains_of(PROCESS, "ended"), "gains come of completed ones alone")
-    send("pi_gains", gains_of(PROCESS, "done", kc=math.nan), "found kc = nan")
+    send("pi_gains", gains_of(PROCESS, "done", kc=math.nan), "kc of the gains is nan")
     send("pi_gains", gains_of(PROCESS, "done", p=1e308), "contradict each other")
     send("pi_gains", gains_of(PROCESS, "done"), "no record of their experiment has come")
     ends["relay_experiment"].publish(experiment_of(PROCESS, "done"))
@@ -183,7 +183,7 @@ def test_forged_records_are_refused_and_the_next_one_is_identified(rig: Rig) -> 
     running = experiment_of(PROCESS, "next", outcome=Outcome.UNKNOWN)
     running.command[7] = 1e308
     for end, message, said in (
-        (experiments, wrong, "the relay's amplitude is"),
+        (experiments, wrong, "amplitude of the relay is"),
         (progress, running, "command[7] of the record is 1e+308"),
         (cycles, RelayCycle(experiment_id="other", lead_in=2**32 - 1), "cycle 0 has 0 times"),
     ):

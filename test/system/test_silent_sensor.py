@@ -106,7 +106,13 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
     )
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
     models.publish(
-        TransferFunction(final=True, numerator=[2.0], denominator=[0.4, 1.0], dead_time=0.2)
+        TransferFunction(
+            final=True,
+            verdict=TransferFunction.VERDICT_TRUSTED,
+            numerator=[2.0],
+            denominator=[0.4, 1.0],
+            dead_time=0.2,
+        )
     )
     rig.until(lambda: len(commands) > 60, "a closed loop")
     # The sensor's only message at rest.

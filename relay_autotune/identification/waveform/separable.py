@@ -258,10 +258,11 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
 def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
     """Solve ``r c = right`` for an upper triangle r of a few columns, each of length one.
 
-    A column that the others make up carries no information: its coefficient stays zero.
+    A column that the others make up carries no information: its coefficient stays zero. So do
+    those beyond the number of samples, where r has fewer rows than columns.
     """
-    # Of so few, plain numbers are quicker than arrays.
-    found = [0.0] * len(right)
+    # For a few columns plain numbers are quicker than arrays.
+    found = [0.0] * len(r[0])
     for i in range(len(right) - 1, -1, -1):
         if abs(r[i][i]) >= _WEAK:
             rest = sum(a * c for a, c in zip(r[i][i + 1 :], found[i + 1 :], strict=True))
