@@ -95,9 +95,10 @@ class Loop:
 
     :param rig: the rig that runs the relay.
     :param kind: one of `KINDS`.
+    :param slower: factor on its times, where a busy machine must not change its dynamics.
     """
 
-    def __init__(self, rig: Rig, kind: str = "plain") -> None:
+    def __init__(self, rig: Rig, kind: str = "plain", *, slower: float = 1.0) -> None:
         self.rig, self.kind = rig, kind
         self.commands: list[float] = []
         self.experiments: list[Any] = rig.listen("relay_experiment", RelayExperiment)
@@ -109,7 +110,7 @@ class Loop:
             command, "command", lambda m: self.commands.append(value(m)), RELIABLE
         )
         self.speaks_on_change = kind == "on change"
-        self.slower = _SLOWER if self.speaks_on_change else 1.0
+        self.slower = _SLOWER if self.speaks_on_change else slower
         self.publisher: Any = None
         self.sensor_comes()
         self.clock = rig.node.create_publisher(Clock, "/clock", 10) if kind == "clock" else None

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -192,10 +193,30 @@ class Rig:
         client = self.clients.get(name)
         if client is None:
             client = self.clients[name] = self.node.create_client(kind, name)
+            self._be_known_to(name.rpartition("/")[0])
         self.until(client.service_is_ready, f"service {name}")
         future = client.call_async(request)
         self.until(future.done, f"answer of {name}")
         return future.result()
+
+    def _be_known_to(self, node: str) -> None:
+        """Wait until a node has discovered all clients made so far.
+
+        Until then its answers are lost. It discovers them in the order in which they were made, so
+        an answer to the last one shows that it knows the others.
+        """
+        last = self.node.create_client(GetParameters, f"{node}/get_parameters")
+        self.until(last.service_is_ready, f"{node}")
+
+        def answers() -> bool:
+            future = last.call_async(GetParameters.Request())
+            end = time.monotonic() + 1.0
+            while not future.done() and time.monotonic() < end:
+                self.executor.spin_once(timeout_sec=0.05)
+            return bool(future.done())
+
+        self.until(answers, f"an answer of {node}")
+        self.node.destroy_client(last)
 
     def ask_for_tune(self, **request: Any) -> Any:
         return self.call(StartTune, "relay_node/start_tune", StartTune.Request(**request))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from faulty_loop import DEFAULTS, LATCHED, Loop
+from faulty_loop import DEAD_TIME, DEFAULTS, LATCHED, TIME_CONSTANT, Loop
 from loop_rig import Rig
 from made_experiments import experiment_of
 from mcap.reader import make_reader
@@ -25,8 +25,9 @@ from relay_autotune.record.record import Outcome
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
 
-# That of the played loop.
-LOOP = Process.fopdt(2.0, 0.05, 0.025)
+# The played loop, slow enough for a busy machine.
+SLOWER = 8.0
+LOOP = Process.fopdt(2.0, SLOWER * TIME_CONSTANT, SLOWER * DEAD_TIME)
 PROCESS = Process.fopdt(2.0, 0.8, 0.4)
 # A fit that computes until a file exists.
 SLOW = """
@@ -63,7 +64,7 @@ def gains_of(process: Process, name: str, **changes: Any) -> PidGains:
 
 
 def test_forged_results_end_no_tune_and_are_not_stored(rig: Rig) -> None:
-    loop = Loop(rig)
+    loop = Loop(rig, slower=SLOWER)
     relay = loop.start()
     loop.set(**DEFAULTS | {"stop_when": "confident", "max_cycles": 1000, "min_cycles": 1000})
     models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
@@ -137,32 +138,34 @@ def test_forged_gains_are_not_applied(rig: Rig) -> None:
         answer = rig.call(GetParameters, "controller_node/get_parameters", request)
         return [value.double_value for value in answer.values]
 
-    def send(topic: str, message: Any, said: str) -> None:
-        ends[topic].publish(message)
-        rig.until(lambda: said in controller.log, said)
+    def send(said: str, **messages: Any) -> None:
+        # Messages of several topics come in any order, so they are sent until all have come.
+        def is_said() -> bool:
+            for topic, message in messages.items():
+                ends[topic].publish(message)
+            rig.run_for(0.1)
+            return said in controller.log
+
+        rig.until(is_said, said)
         assert in_force() == [0.3, 0.8]
 
     ends["relay_experiment"].publish(experiment_of(PROCESS, "ended", outcome=Outcome.ABORTED))
-    rig.run_for(0.3)
-    send("pi_gains", gains_of(PROCESS, "ended"), "gains come of completed ones alone")
-    send("pi_gains", gains_of(PROCESS, "done", kc=math.nan), "kc of the gains is nan")
-    send("pi_gains", gains_of(PROCESS, "done", p=1e308), "contradict each other")
-    send("pi_gains", gains_of(PROCESS, "done"), "no record of their experiment has come")
+    send("gains come of completed ones alone", pi_gains=gains_of(PROCESS, "ended"))
+    send("kc of the gains is nan", pi_gains=gains_of(PROCESS, "done", kc=math.nan))
+    send("contradict each other", pi_gains=gains_of(PROCESS, "done", p=1e308))
+    send("no record of their experiment has come", pi_gains=gains_of(PROCESS, "done"))
     ends["relay_experiment"].publish(experiment_of(PROCESS, "done"))
-    rig.until(lambda: "no model of their experiment has come" in controller.log, "the record")
-    send("transfer_function", model_of(Process.fopdt(-2.0, 0.8, 0.4), "done"), "other sign")
-    send("transfer_function", model_of(Process.fopdt(1e9, 0.8, 0.4), "done"), "y/u at")
+    send("no model of their experiment has come", pi_gains=gains_of(PROCESS, "done"))
+    for gain, said in ((-2.0, "other sign"), (1e9, "y/u at")):
+        send(said, transfer_function=model_of(Process.fopdt(gain, 0.8, 0.4), "done"))
+    right = model_of(PROCESS, "done")
     for wrong, said in (
         ({"kc": -0.3, "p": 0.0, "i": 0.0}, "the sign of the process"),
         ({"kc": 1e12, "p": 0.0, "i": 0.0}, "loop gain"),
         ({"ti": 1e-9, "p": 0.0, "i": 0.0}, "does not go with a period"),
         ({"kc": 2.9, "ti": 0.4, "p": 0.0, "i": 0.0}, "unstable loop"),
     ):
-        ends["pi_gains"].publish(gains_of(PROCESS, "done", **wrong))
-        rig.run_for(0.3)
-        ends["transfer_function"].publish(model_of(PROCESS, "done"))
-        rig.until(lambda said=said: said in controller.log, said)
-        assert in_force() == [0.3, 0.8]
+        send(said, pi_gains=gains_of(PROCESS, "done", **wrong), transfer_function=right)
         assert not rig.call(Trigger, "controller_node/apply", Trigger.Request()).success
         rig.call(Trigger, "controller_node/discard", Trigger.Request())
     good = gains_of(PROCESS, "done")
