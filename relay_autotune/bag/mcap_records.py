@@ -115,6 +115,13 @@ class Declarations:
             for name, schema_encoding, definition in [self._schemas.get(schema, ("", "", b""))]
         }
 
+    @property
+    def have_all_types(self) -> bool:
+        """True if the type of each channel is declared; 0 stands for a channel without a type."""
+        return all(
+            schema in self._schemas or schema == 0 for _, schema, *_ in self._channels.values()
+        )
+
     def take_all(self, content: bytes | memoryview, offsets: IntArray) -> None:
         """Take in those of the records inside of a chunk that declare channels.
 

@@ -63,6 +63,9 @@ def layout_by_summary(source: Source) -> Layout | None:
     if not chunks.start.size or not layout.declared.channels:
         # Messages outside of chunks, or no index of them: they must be looked for.
         return None
+    if not layout.declared.have_all_types:
+        # A type that is missing here may stand among the data.
+        return None
     layout.index = chunks
     return layout
 

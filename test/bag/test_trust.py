@@ -379,6 +379,17 @@ def test_a_summary_that_names_a_channel_differently_is_said(tmp_path):
     assert any("bag.mcap contradicts itself: channel 2" in note for note in notes)
 
 
+def test_a_type_that_the_summary_lacks_is_found_among_the_data(tmp_path):
+    path = write(tmp_path / "bag.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    *_, in_summary = records(data, 3)
+    struct.pack_into("<H", data, in_summary + 9, 9)
+    path.write_bytes(data)
+    values, notes = read(path)
+    np.testing.assert_array_equal(values, np.arange(COUNT))
+    assert notes == []
+
+
 def channel(text, encoding="ros2msg"):
     """Return a channel of a type x_msgs/msg/T of a definition."""
     return Channel(1, "/t", "x_msgs/msg/T", "cdr", encoding, text.encode(), {})
