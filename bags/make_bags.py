@@ -4,8 +4,8 @@
 """Make the bags of this folder: `. ./env.sh && python3 bags/make_bags.py [FOLDER]`.
 
 The first two are recorded by relay_node from a whole tune in lockstep, in processes of their own
-over DDS; the third is written as a foreign recorder would. What is there already is left alone:
-old bags stay as they are.
+over DDS; the third is written as a foreign recorder would, and the fourth as the log of another
+tool. What is there already is left alone: old bags stay as they are.
 """
 
 from __future__ import annotations
@@ -88,6 +88,21 @@ def write_step_test(target: Path) -> None:
             )
 
 
+def write_heater_log(target: Path) -> None:
+    """Write the log of a heater as a data logger does: a row for each 2 s, rounded.
+
+    The process is 0.62 e^(-16 s)/(110 s + 1), the noise white with 0.05 degC.
+    """
+    rng = np.random.default_rng(7)
+    model = TransferFunction.fopdt(0.62, 110.0, 16.0)
+    time = np.arange(0.0, 900.0, 2.0)
+    power = PiecewiseConstant(np.array([60.0, 480.0]), np.array([50.0, 20.0]), 0.0)
+    measured = 23.4 + response(model, time, power) + rng.normal(0.0, 0.05, time.size)
+    rows = zip(time, measured, power(time), strict=True)
+    lines = [f"{t:.0f},{y:.2f},{u:.0f}\n" for t, y, u in rows]
+    target.write_text("Time (sec),Temperature 1 (degC),Heater 1 (%)\n" + "".join(lines))
+
+
 def main() -> int:
     """Make those bags that are missing."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
@@ -98,6 +113,7 @@ def main() -> int:
             path, plant={"noise_std": 0.02, "seed": 11}, relay={"bias_ratio": 0.0}
         ),
         "step_test": write_step_test,
+        "heater.csv": write_heater_log,
     }
     for name, make in bags.items():
         if (folder / name).exists():

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -16,9 +17,10 @@ from relay_autotune.bag.experiments import interrupted_experiment, recorded_expe
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.signals import join, window
+from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.timing import CLOCKS
 from relay_autotune.bag.topics import Progress, Topics
-from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.record.record import Record
 
 if TYPE_CHECKING:
@@ -116,6 +118,30 @@ def read_experiments(
     return Recording(path, parts, tuple(notes))
 
 
+def may_be_recording(path: Path) -> bool:
+    """Return whether a path is to be read, as its name or its first bytes say.
+
+    What is missing, damaged or of ROS 1 is: reading it says what is wrong with it.
+
+    :param path: a file or a folder, such as one of many that a pattern of the shell gave.
+    """
+    if path.is_dir():
+        names = {entry.name for entry in path.iterdir()} if os.access(path, os.R_OK) else set()
+        # A bag that lost its files still has its description.
+        return "metadata.yaml" in names or not names or any(map(_named_so, map(Path, names)))
+    if not path.exists() or _named_so(path) or path.suffix.lower() == ".csv":
+        return True
+    try:
+        with open_regular(path) as file:
+            return known_start(file.read(32))
+    except RelayAutotuneError:
+        return True
+
+
+def _named_so(path: Path) -> bool:
+    return path.suffix in _STORED or path.suffixes[-2:] in _WHOLE
+
+
 def _opened(path: Path, largest: int) -> McapFile | SqliteFile:
     if ".db3" in path.suffixes[-2:]:
         # Imported here: most recordings need no database.
@@ -133,11 +159,9 @@ def _data_files(path: Path) -> list[Path]:
     except OSError as error:
         raise BagError(f"cannot read {path}: {error.strerror or error}") from error
     # The folder itself counts: a killed recorder's metadata.yaml is missing or out of date.
-    files = [entry for entry in entries if entry.suffix in _STORED]
-    plain = {file.name for file in files}
+    plain = {entry.name for entry in entries if entry.suffix in _STORED}
     # A recorder that was killed while it compressed leaves both.
-    files += [e for e in entries if e.suffixes[-2:] in _WHOLE and e.stem not in plain]
-    files.sort(key=_natural)
+    files = [e for e in entries if e.name in plain or (_named_so(e) and e.stem not in plain)]
     if not files:
         found = ", ".join(entry.name for entry in entries[:5]) or "nothing"
         raise BagError(

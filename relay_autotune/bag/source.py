@@ -62,6 +62,14 @@ def open_regular(path: Path) -> BinaryIO:
     )
 
 
+def known_start(head: bytes) -> bool:
+    """Return whether a file that begins so is a recording of some kind, also one for others.
+
+    :param head: its first bytes, 16 or more.
+    """
+    return head.startswith((MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, *(magic for magic, _ in _OTHERS)))
+
+
 class Source:
     """A file that begins as recordings do, open for reading ranges of it.
 

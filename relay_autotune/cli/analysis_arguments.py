@@ -72,13 +72,13 @@ def _size(text: str) -> int:
 
 
 def jobs_of(
-    options: argparse.Namespace, recordings: Sequence[str], *, with_table: bool = False
+    options: argparse.Namespace, recordings: Sequence[str], *, table_width: int | None = None
 ) -> list[Job]:
     """Return what is to be done with recordings, each once.
 
     :param options: with those of :func:`add_analysis`.
     :param recordings: their names.
-    :param with_table: True if results are printed as tables for people.
+    :param table_width: columns of a table for people; None: documents are wanted instead.
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
     from relay_autotune.analysis import check_names
@@ -113,7 +113,7 @@ def jobs_of(
             rule=options.rule,
             known=known,
             jointly=jointly,
-            with_table=with_table,
+            table_width=table_width,
             options=asked,
         )
         for group in groups

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
+from relay_autotune.cli.layout import broken, width
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.escape import visible
 from relay_autotune.quantities import Quantity
@@ -47,12 +48,16 @@ def finite(text: str) -> float:
 
 
 def say(program: str, text: str) -> None:
-    """Write a message that is not a result to standard error.
+    """Write a message that is not a result to standard error: one line, broken on a terminal.
 
     :param program: name of the command.
     :param text: the message; control characters in it are made visible.
     """
-    print(visible(f"{program}: {text}", keep="\n"), file=sys.stderr)
+    told = visible(f"{program}: {text}", keep="\n")
+    if sys.stderr.isatty():
+        # A terminal would break lines within words.
+        told = "\n".join("\n".join(broken(line, width())) for line in told.split("\n"))
+    print(told, file=sys.stderr)
 
 
 def guarded(program: str, work: Callable[[], int]) -> int:

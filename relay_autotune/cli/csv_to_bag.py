@@ -19,11 +19,12 @@ from relay_autotune.errors import BagError, SelectionError
 PROGRAM = "csv_to_bag"
 
 _EPILOG = """\
-The bag gets two topics of std_msgs/Float64, named for their columns without the unit: the column
-"Heater 1 (%)" becomes /heater_1.  Measurement and command of a row carry the time of that row.
+The bag gets two topics of std_msgs/Float64, named for their columns without the
+unit: the column "Heater 1 (%)" becomes /heater_1.  Measurement and command of a
+row carry the time of that row.
 
 Example:
-  csv_to_bag heater.csv heater_bag --time 'Time (sec)' \\
+  csv_to_bag bags/heater.csv heater_bag \\
       --measurement 'Temperature 1 (degC)' --command 'Heater 1 (%)'
   replay heater_bag --measurement /temperature_1 --command /heater_1
 """

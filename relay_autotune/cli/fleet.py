@@ -25,7 +25,7 @@ _CONNECT_S = 10.0
 _PR_SET_PDEATHSIG = 1
 _PRELOADED = [
     f"relay_autotune.{name}"
-    for name in ("threads", "autotune", "bag.reader", "cli.replay_bag", "document")
+    for name in ("threads", "analysis", "bag.reader", "cli.replay_bag", "exchange.document")
 ]
 
 Work = Callable[[Job], Done]

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from relay_autotune.cli.arguments import DONE, finite, guarded
+from relay_autotune.cli.layout import labelled, width
 
 PROGRAM = "identify"
 
@@ -19,8 +20,8 @@ Results go to standard output, everything else to standard error.
 Exit status: 0 done; 1 no model has these numbers; 2 the command line is wrong.
 
 Examples:
-  identify --method wang_biased --period-high 15.4 --period-low 20.4 --peak-max 0.5 \\
-           --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
+  identify --method wang_biased --period-high 15.4 --period-low 20.4 \\
+           --peak-max 0.5 --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
 """
 
 
@@ -51,10 +52,18 @@ def _parser() -> argparse.ArgumentParser:
     from relay_autotune.cli.chart import CHART_METHODS, NUMBERS, option
 
     methods = "\n".join(
-        f"  {name:<14} {chart.summary}\n{'':<17}"
-        + " ".join(option(n) for n in chart.required)
-        + "".join(f" [{option(n)}]" for n in chart.optional)
+        line
         for name, chart in CHART_METHODS.items()
+        for label, text in (
+            (name, chart.summary),
+            (
+                "",
+                "   ".join(
+                    [*map(option, chart.required), *(f"[{option(n)}]" for n in chart.optional)]
+                ),
+            ),
+        )
+        for line in labelled(label, text, width(), indent=17)
     )
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
@@ -93,7 +102,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print(to_json(to_document(found)), flush=True)
     else:
-        print("\n".join(identification_lines(found)))
+        print("\n".join(identification_lines(found, width())))
     return DONE
 
 

@@ -12,9 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
 from relay_autotune.cli.design_arguments import add_export, export_target
+from relay_autotune.cli.layout import width
 from relay_autotune.cli.progress import ProgressLine
 from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.errors import SelectionError
@@ -25,24 +27,27 @@ if TYPE_CHECKING:
 PROGRAM = "replay"
 
 _EPILOG = """\
-A BAG is a rosbag2 directory, an .mcap file, or a .csv file with a header line.  Topics need not
-be named if the bag holds experiments of relay_node, or one pair of topics, each of a single
-number, that looks like measurement and command.
+A BAG is a rosbag2 directory, an .mcap file, or a .csv file with a header line.
+Topics need not be named if the bag holds experiments of relay_node, or one pair
+of topics, each of a single number, that looks like measurement and command.
+Of several BAGs, those that are no recording are passed over, with a line each.
 
 Results go to standard output, everything else to standard error.
-Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command line, or the
-choice of topics, is wrong; 3 gains of at least one experiment are doubtful.
+Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command
+line, or the choice of topics, is wrong; 3 gains of at least one experiment are
+doubtful.
 
-Examples:
-  replay ~/.ros/relay_autotune/20261120T234315Z_2c010118
-  replay --measurement /tank/level --command /tank/valve robot_bag
-  replay --measurement /imu:angular_velocity.z --command /wheel/voltage robot_bag
-  replay --jobs 8 --output fleet.csv bags/*
-  replay --rule robust --ms 1.6 --export pid_controller --dof heater robot_bag > gains.yaml
-  replay --json log.csv --measurement level --command valve --time t
-  replay --method chang --gain 1.65 --dead-time 10 robot_bag
-  replay --method li without_extra_delay with_extra_delay     (several tests, one model)
-  replay --joint unbiased biased                              (the same, by all samples)
+Examples, with the recordings that come with the package:
+  replay bags/biased_relay
+  replay bags/heater.csv --measurement 'Temperature 1' --command 'Heater 1'
+  replay --json --start 10 --rule simc bags/step_test
+  replay --jobs 2 --output fleet.csv bags/*
+  replay --ms 1.6 --export pid_controller --dof heater bags/step_test > g.yaml
+  replay --method chang --gain 1.65 bags/unbiased_relay_with_noise
+  replay --joint bags/biased_relay bags/unbiased_relay_with_noise
+And with some of your own:
+  replay --measurement /imu:angular_velocity.z --command /wheel/volt robot_bag
+  replay --method li without_extra_delay with_extra_delay
 """
 
 
@@ -99,7 +104,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.report:
         from relay_autotune.cli.report import check_output
 
-        check_output(options.report)
+        check_output(PROGRAM, options.report)
         if options.output or options.scheduler or options.jobs > 1:
             raise SelectionError("--report cannot be had with --output, --jobs or --scheduler")
     if options.output:
@@ -126,7 +131,8 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
     with_table = not (options.json or options.output)
-    jobs = jobs_of(options, options.bags, with_table=with_table)
+    recordings = _recordings(options.bags)
+    jobs = jobs_of(options, recordings, table_width=width() if with_table else None)
     if options.scheduler:
         # The workers of a cluster have working directories of their own.
         jobs = [replace(j, paths=tuple(str(Path(p).absolute()) for p in j.paths)) for j in jobs]
@@ -144,6 +150,18 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
             )
         ]
     return jobs
+
+
+def _recordings(given: Sequence[str]) -> list[str]:
+    """Return what of the command line can be a recording; a pattern such as bags/* names more."""
+    found = [name for name in given if len(given) == 1 or may_be_recording(Path(name))]
+    if not found:
+        # Each then says by itself what it is.
+        return list(given)
+    for name in dict.fromkeys(given):
+        if name not in found:
+            say(PROGRAM, f"{name} is passed over: it is no recording (.mcap, .db3 or .csv)")
+    return found
 
 
 def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:

@@ -37,7 +37,7 @@ class Job:
     :param rule: whose gains count.
     :param known: what is known of the process.
     :param jointly: whether the experiments of all recordings give one model.
-    :param with_table: whether the table for people is wanted, else the document.
+    :param table_width: columns of the table for people; None: the document is wanted instead.
     :param options: what is asked of the controller; None: the defaults.
     :param export: the kind of file that is wanted instead, and where its gains go; None: none.
     :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
@@ -50,7 +50,7 @@ class Job:
     rule: str
     known: Known
     jointly: bool = False
-    with_table: bool = False
+    table_width: int | None = None
     options: DesignOptions | None = None
     export: tuple[str, Target] | None = None
     accept_doubtful: bool = False
@@ -174,12 +174,12 @@ def _exported(
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:
-    if job.with_table:
+    if job.table_width is not None:
         if error is not None:
             return ""
         from relay_autotune.cli.table import table
 
-        return table(job.name, analyses)
+        return table(job.name, analyses, job.table_width)
     from relay_autotune.exchange.document import document, to_json
 
     return to_json(document(job.name, analyses, error=error))

@@ -16,7 +16,7 @@ from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, guarded, say
 from relay_autotune.cli.replay_bag import Job, analysed
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
-from relay_autotune.report import PICTURES, write_figures, write_page, write_picture
+from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case
@@ -24,17 +24,20 @@ if TYPE_CHECKING:
 PROGRAM = "report"
 
 _EPILOG = """\
-Each source is a recording as `replay` reads it (a rosbag2 directory, an .mcap file or a .csv
-file), or a .json file as `replay --json` prints it.  The page is one file that opens without a
-network; from a .json file the figures that need samples are left out.
+Each source is a recording as `replay` reads it (a rosbag2 directory, an .mcap
+file or a .csv file), or a .json file as `replay --json` prints it.  The page is
+one file that opens without a network; from a .json file the figures that need
+samples are left out.
 
-Exit status: 0 done; 1 a source could not be read, or nothing was identified in it (the report is
-still written); 2 the command line, or the choice of topics, is wrong.
+Exit status: 0 done; 1 a source could not be read, or nothing was identified in
+it (the report is still written); 2 the command line, or the choice of topics,
+is wrong.
 
 Examples:
   report ~/.ros/relay_autotune/20261120T234315Z_2c010118 -o tune.html
   report demo_output/result.json -o demo.html
-  report robot_bag --measurement /tank/level --command /tank/valve -o tank.html --figures figures
+  report bags/step_test -o tank.html --figures figures \\
+      --measurement /reactor/temperature --command /reactor/heater
 """
 
 
@@ -72,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    check_output(options.output)
+    check_output(PROGRAM, options.output)
     cases: list[Case] = []
     status = DONE
     for names, read in _sources(options):
@@ -94,6 +97,7 @@ def _run(options: argparse.Namespace) -> int:
     print(options.output)
     if options.figures:
         try:
+            _announce_figures(options.figures, options.format)
             for path in write_figures(cases, options.figures, options.format):
                 print(path)
         except OSError as error:
@@ -101,11 +105,21 @@ def _run(options: argparse.Namespace) -> int:
     return status
 
 
-def check_output(output: str) -> None:
+def _announce_figures(folder: str, kind: str) -> None:
+    there = sorted(path.name for path in Path(folder).glob(f"*.{kind}"))
+    if there:
+        say(PROGRAM, f"{folder} has figures already; those of the same name are replaced")
+
+
+def check_output(program: str, output: str) -> None:
     """Refuse a report that could not be written, before any work is done.
 
+    An earlier report of the same name is replaced, and a line says so.
+
+    :param program: name of the command.
     :param output: name of its file.
-    :raises SelectionError: if the ending is unknown, or the folder does not exist.
+    :raises SelectionError: if the ending is unknown, the folder does not exist, or the file is a
+        page of somebody else.
     """
     path = Path(output)
     if path.suffix.lower() not in (".html", *PICTURES):
@@ -115,6 +129,13 @@ def check_output(output: str) -> None:
         )
     if not path.parent.is_dir():
         raise SelectionError(f"there is no folder {path.parent} for the report; make it first")
+    if not path.exists():
+        return
+    if path.suffix.lower() == ".html" and not is_ours(path):
+        raise SelectionError(
+            f"{path} exists and is no report of this package; name another file, or take it away"
+        )
+    say(program, f"{path} exists and will be replaced")
 
 
 def write_report(cases: Sequence[Case], output: str, *, title: str = "") -> None:

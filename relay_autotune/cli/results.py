@@ -51,7 +51,7 @@ class Results:
         with a row for each experiment, and the documents are in the same name with ``.jsonl``
         added.
     :raises SelectionError: if the ending is another one.
-    :raises BagError: if the file cannot be written, is in use, or holds something else.
+    :raises BagError: if the file cannot be written, is in use, or may hold something else.
     """
 
     def __init__(self, output: str) -> None:
@@ -65,6 +65,11 @@ class Results:
         if kind == ".parquet":
             _pyarrow()
         self.path = self._table if kind == ".jsonl" else Path(f"{output}.jsonl")
+        if self._table.exists() and not self.path.exists():
+            raise BagError(
+                f"{self._table} exists, and there is no {self.path} that it was made of; name "
+                "another file, or take it away"
+            )
         self.done: set[str] = set()
         self.status = DONE
         try:

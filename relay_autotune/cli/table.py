@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relay_autotune.cli.layout import WIDEST, labelled
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
@@ -25,56 +25,99 @@ if TYPE_CHECKING:
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import Gains
 
-_WIDTH = 99
 # Rivals beyond these are told in the JSON document alone.
 _RIVALS = 3
-_INDENT = "  "
-_LABEL = 16
+# An interval is told as a number down to this share of its value; below it all digits shown hold.
+_FINEST = 5e-5
+
+# What stands beside each other on a line: a label and a text, whose parts are three blanks apart.
+_Entry = tuple[str, str]
+_BLANK: _Entry = ("", "")
 
 
-def table(bag: str, analyses: Sequence[Analysis]) -> str:
+def table(bag: str, analyses: Sequence[Analysis], width: int = WIDEST) -> str:
     """Return what was made of each experiment of a recording.
 
     :param bag: the recording, as it was given.
     :param analyses: one for each experiment.
+    :param width: columns that a line may have.
     """
     blocks = [bag]
     for number, analysis in enumerate(analyses, start=1):
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
-        blocks.append("\n".join(_experiment(analysis, which)))
+        blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
     return "\n\n".join(blocks) + "\n"
 
 
-def _experiment(analysis: Analysis, which: str) -> list[str]:
+def verdict_lines(judgement: Judgement, width: int = WIDEST) -> list[str]:
+    """Return the verdict on an experiment, with each check that did not pass, as lines.
+
+    :param judgement: the verdict and its checks.
+    :param width: columns that a line may have.
+    """
+    return _laid_out(_verdict(judgement), width)
+
+
+def identification_lines(found: Identification, width: int = WIDEST) -> list[str]:
+    """Return an identified model with its accuracy, as lines.
+
+    :param found: the model.
+    :param width: columns that a line may have.
+    """
+    return _laid_out(_identification(found), width)
+
+
+def gains_lines(
+    gains: Gains,
+    verdict: Verdict = Verdict.UNKNOWN,
+    width: int = WIDEST,
+    forms: Sequence[tuple[str, str]] = (),
+) -> list[str]:
+    """Return a controller with what it does on the model, as lines.
+
+    :param gains: the controller, or a message with the same fields.
+    :param verdict: on the experiment that it comes from.
+    :param width: columns that a line may have.
+    :param forms: further forms of the gains, each by its name.
+    """
+    rule, isa, *rest = _gains(gains, verdict)
+    further = [(f"  {name}", text) for name, text in forms]
+    return _laid_out([rule, isa, *further, *rest], width)
+
+
+def _laid_out(entries: Sequence[_Entry], width: int) -> list[str]:
+    return [line for label, text in entries for line in labelled(label, text, width)]
+
+
+def _experiment(analysis: Analysis, which: str) -> list[_Entry]:
     record = analysis.record
-    lines = [_line(f"experiment{which}", _outcome(record))]
+    lines = [(f"experiment{which}", _outcome(record))]
     if record.reason and record.outcome != Outcome.COMPLETED:
-        lines += _wrapped("", record.reason)
-    lines.append(_line("recorded", _span(record)))
+        lines.append(("", record.reason))
+    lines.append(("recorded", _span(record)))
     lines += _limit_cycle(analysis)
     if analysis.model is not None:
-        lines += ["", *identification_lines(analysis.model)]
+        lines += [_BLANK, *_identification(analysis.model)]
         lines += _others(analysis)
     if analysis.models and analysis.judgement.judged:
-        lines += ["", *verdict_lines(analysis.judgement)]
+        lines += [_BLANK, *_verdict(analysis.judgement)]
     if analysis.best_gains is not None:
-        lines += ["", *gains_lines(analysis.best_gains, analysis.verdict)]
+        lines += [_BLANK, *_gains(analysis.best_gains, analysis.verdict)]
         lines += _other_gains(analysis)
     if analysis.reason:
-        lines += ["", *_wrapped("gains" if analysis.models else "process", analysis.reason)]
+        lines += [_BLANK, ("gains" if analysis.models else "process", analysis.reason)]
     return lines
 
 
-def verdict_lines(judgement: Judgement) -> list[str]:
-    """Return the verdict on an experiment, with each check that did not pass, as lines."""
+def _verdict(judgement: Judgement) -> list[_Entry]:
     worse = [f for f in judgement.findings if f.result is not Result.PASSED]
     if judgement.contradicted and not judgement.refused:
         # The worst of them stands in the place of the gains.
         worse = [f for f in worse if f is not judgement.worst]
-    lines = [_line("verdict", judgement.verdict.name.lower())]
-    for found in worse:
-        lines += _wrapped(f"  {found.title.lower()}", found.said)
-    return lines
+    return [
+        ("verdict", judgement.verdict.name.lower()),
+        *((f"  {found.title.lower()}", found.said) for found in worse),
+    ]
 
 
 def _outcome(record: Record) -> str:
@@ -93,18 +136,18 @@ def _span(record: Record) -> str:
     return text
 
 
-def _limit_cycle(analysis: Analysis) -> list[str]:
+def _limit_cycle(analysis: Analysis) -> list[_Entry]:
     if not analysis.cycles:
         return []
     cycle = limit_cycle(analysis.cycles)
     state = "converged" if cycle.converged else "not converged"
     return [
-        _line(
+        (
             "limit cycle",
             f"period {digits(cycle.period)} s (high {digits(cycle.period_high)} s, "
             f"low {digits(cycle.period_low)} s), {_count(len(cycle.cycles))}, {state}",
         ),
-        _line("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)}"),
+        ("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)}"),
     ]
 
 
@@ -112,8 +155,7 @@ def _count(cycles: int) -> str:
     return f"{cycles} cycle{'' if cycles == 1 else 's'}"
 
 
-def identification_lines(found: Identification) -> list[str]:
-    """Return an identified model with its accuracy, as lines."""
+def _identification(found: Identification) -> list[_Entry]:
     name = f"{found.structure}, {found.method}"
     lines = _process("process", found.model, name)
     structure = found.estimate.structure
@@ -129,37 +171,35 @@ def identification_lines(found: Identification) -> list[str]:
         ("ultimate freq.", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
     ):
         if math.isfinite(value):
-            interval = f"± {digits(NORMAL_95 * std, 2)}" if math.isfinite(std) else ""
-            lines.append(_row(label, value, unit, interval))
+            lines.append(_row(label, value, unit, _plus_minus(value, NORMAL_95 * std)))
     lines += _known_all_the_same(found)
-    lines += _wrapped("fit", _fit(found))
+    lines.append(("fit", _fit(found)))
     if found.validation is not None:
-        lines += _wrapped("limit cycle", _validation(found.validation))
+        lines.append(("limit cycle", _validation(found.validation)))
     for i, rival in enumerate(found.rivals[:_RIVALS]):
         share = f"{100.0 * rival.support:.2g} % of the support"
         note = f"{rival.model.structure}, {share}"
         lines += _process("rivals" if i == 0 else "", rival.model, note)
     for warning in found.warnings:
-        lines += _wrapped("warning", warning)
+        lines.append(("warning", warning))
     return lines
 
 
-def _known_all_the_same(found: Identification) -> list[str]:
+def _known_all_the_same(found: Identification) -> list[_Entry]:
     """Return what is determined beside parameters that are not, and what would help."""
     # K_u and w_u have lines of their own.
     shown = [c for c in found.combinations if not c.name.startswith("ultimate")]
     lines = []
     for c in shown:
         interval = f"95 %: {digits(c.ci95_low)} to {digits(c.ci95_high)}"
-        lines += _wrapped(
-            "determined", f"{c.name.replace('_', ' ')} {digits(c.value)} {c.unit} ({interval})"
-        )
+        known = f"{c.name.replace('_', ' ')} {digits(c.value)} {c.unit} ({interval})"
+        lines.append(("determined", known))
     for sentence in found.advice:
-        lines += _wrapped("would help", sentence)
+        lines.append(("would help", sentence))
     return lines
 
 
-def _others(analysis: Analysis) -> list[str]:
+def _others(analysis: Analysis) -> list[_Entry]:
     """Return what the other methods found, a line for each."""
     others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
     lines = []
@@ -201,11 +241,11 @@ def _validation(validation: Validation) -> str:
     return f"of the model: {parts[0]}, {parts[1]} {parts[2]}, {shape} off the record's"
 
 
-def _other_gains(analysis: Analysis) -> list[str]:
+def _other_gains(analysis: Analysis) -> list[_Entry]:
     """Return what the other rules say, a line for each."""
     others = [gains for i, gains in enumerate(analysis.gains) if i != analysis.recommended]
     return [
-        _line(
+        (
             "also" if i == 0 else "",
             f"kc {digits(g.kc)} u/y   ti {digits(g.ti)} s   td {digits(g.td)} s   "
             f"Ms {digits(g.ms, 3)}   ({g.rule})",
@@ -214,32 +254,27 @@ def _other_gains(analysis: Analysis) -> list[str]:
     ]
 
 
-def gains_lines(gains: Gains, verdict: Verdict = Verdict.UNKNOWN) -> list[str]:
-    """Return a controller with what it does on the model, as lines.
-
-    :param gains: the controller, or a message with the same fields.
-    :param verdict: on the experiment that it comes from.
-    """
+def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
     mark = "   DOUBTFUL: see the verdict" if verdict is Verdict.DOUBTFUL else ""
     lines = [
-        _line("gains", gains.rule + mark),
-        _line(
+        ("gains", gains.rule + mark),
+        (
             "  ISA form",
             f"kc {digits(gains.kc)} u/y   ti {digits(gains.ti)} s   td {digits(gains.td)} s"
             + (f"   tf {digits(gains.tf)} s" if gains.tf else "")
             + f"   b {gains.b:g}",
         ),
-        _line(
+        (
             "  parallel form",
             f"p {digits(gains.p)} u/y   i {digits(gains.i)} u/(y s)   d {digits(gains.d)} u s/y",
         ),
-        _line(
+        (
             "  predicted",
             f"Ms {digits(gains.ms, 3)} (95 %: {digits(gains.ms_95, 3)})   "
             f"Mt {digits(gains.mt, 3)}   gain margin {digits(gains.gain_margin, 3)}   "
             f"phase margin {digits(math.degrees(gains.phase_margin), 3)} deg",
         ),
-        _line(
+        (
             "",
             f"delay margin {digits(gains.delay_margin, 3)} s   "
             f"IAE of a unit load step {digits(gains.iae_load, 3)} y s/u",
@@ -247,35 +282,32 @@ def gains_lines(gains: Gains, verdict: Verdict = Verdict.UNKNOWN) -> list[str]:
     ]
     if math.isfinite(gains.overshoot):
         lines.append(
-            _line(
+            (
                 "",
                 f"set-point step: overshoot {digits(100.0 * gains.overshoot, 3)} %   "
                 f"settled after {digits(gains.settling_time, 3)} s",
             )
         )
-    lines += _wrapped("  because", gains.reason) if gains.reason else []
+    if gains.reason:
+        lines.append(("  because", gains.reason))
     for warning in gains.warnings:
-        lines += _wrapped("  warning", warning)
+        lines.append(("  warning", warning))
     return lines
 
 
-def _row(label: str, value: float, unit: str, interval: str) -> str:
-    return _line("  " + label, f"{digits(value):>9} {unit:<6} {interval}".rstrip())
+def _plus_minus(value: float, half: float) -> str:
+    """Return the half width of an interval; what no digit shows is rounding, not accuracy."""
+    if not math.isfinite(half):
+        return ""
+    if half < _FINEST * abs(value):
+        return f"± less than {100.0 * _FINEST:g} %"
+    return f"± {digits(half, 2)}"
 
 
-def _process(label: str, model: TransferFunction, note: str) -> list[str]:
+def _row(label: str, value: float, unit: str, interval: str) -> _Entry:
+    return f"  {label}", f"{digits(value):>9} {unit:<6} {interval}".rstrip()
+
+
+def _process(label: str, model: TransferFunction, note: str) -> list[_Entry]:
     """Return a transfer function with a note, on one line where it fits."""
-    whole = _line(label, f"{process_text(model)}   ({note})")
-    if len(whole) <= _WIDTH:
-        return [whole]
-    return [*_wrapped(label, process_text(model)), *_wrapped("", f"({note})")]
-
-
-def _line(label: str, text: str) -> str:
-    return f"{_INDENT}{label:<{_LABEL}} {text}".rstrip()
-
-
-def _wrapped(label: str, text: str) -> list[str]:
-    width = _WIDTH - len(_line("x", "")) - _LABEL
-    parts = textwrap.wrap(text, width) or [""]
-    return [_line(label if i == 0 else "", part) for i, part in enumerate(parts)]
+    return [(label, f"{process_text(model)}   ({note})")]

@@ -18,6 +18,7 @@ from relay_autotune.cli.design_arguments import (
     design_options,
     export_target,
 )
+from relay_autotune.cli.layout import width
 from relay_autotune.errors import SelectionError, TuningError
 
 if TYPE_CHECKING:
@@ -28,8 +29,9 @@ if TYPE_CHECKING:
 PROGRAM = "tune"
 
 _EPILOG = """\
-The model is given by flags or by a JSON document: one of `replay --json` or `identify --json`,
-or an object such as {"gain": 1.65, "time_constants": [20], "dead_time": 10}; - reads standard
+The model is given by flags or by a JSON document: one of `replay --json` or
+`identify --json`, or an object such as
+{"gain": 1.65, "time_constants": [20], "dead_time": 10}; - reads standard
 input.  Units: y of the measurement, u of the command, s.
 
 Results go to standard output, everything else to standard error.
@@ -39,8 +41,8 @@ Examples:
   tune --gain 1.65 --time-constants 20 --dead-time 10
   tune --gain 1.65 --time-constants 20 --dead-time 10 --table
   tune --gain 0.8 --time-constants 25 3 --dead-time 1 --rule simc --lambda 5
-  tune --structure integrator_inverse --gain 0.547 --zeros -0.418 --time-constants 1.06 \\
-       --dead-time 0.1 --rule luyben2003 --pid --form series
+  tune --structure integrator_inverse --gain 0.547 --zeros -0.418 \\
+       --time-constants 1.06 --dead-time 0.1 --rule luyben2003 --form series
   tune --numerator 1 --denominator 10 7 1 --dead-time 2 --ms 1.6
   replay --json bag | tune - --export pid_controller --dof heater > gains.yaml
 """
@@ -156,7 +158,7 @@ def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
 def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     from relay_autotune.cli.export import exported, write
     from relay_autotune.cli.table import gains_lines
-    from relay_autotune.cli.tune_table import form_lines, process_lines
+    from relay_autotune.cli.tune_table import further_forms, process_lines
     from relay_autotune.tuning import design
 
     gains = design(task, rule)
@@ -165,19 +167,14 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     elif options.json:
         _print_document(task, [gains], {}, 0, options.form)
     else:
-        name, isa, *rest = gains_lines(gains)
-        form = form_lines(gains, options.form)
-        print("\n".join([*process_lines(task.model), name, isa, *form, *rest]))
+        columns = width()
+        lines = gains_lines(gains, width=columns, forms=further_forms(gains, options.form))
+        print("\n".join([*process_lines(task.model, columns), *lines]))
     return DONE
 
 
 def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.tune_table import (
-        compensator_lines,
-        process_lines,
-        refusal_lines,
-        side_by_side,
-    )
+    from relay_autotune.cli.tune_table import process_lines, refusal_lines, side_by_side
     from relay_autotune.tuning import RULES, design
 
     gains: list[Gains] = []
@@ -192,9 +189,10 @@ def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> i
     if options.json:
         _print_document(task, gains, refused, recommended, options.form, inside)
     else:
-        lines = side_by_side(gains, recommended, options.form)
-        lines += [*compensator_lines(inside), *refusal_lines(refused)]
-        print("\n".join([*process_lines(task.model), *lines]))
+        columns = width()
+        lines = side_by_side(gains, recommended, options.form, inside, columns)
+        lines += refusal_lines(refused, columns)
+        print("\n".join([*process_lines(task.model, columns), *lines]))
     if not gains:
         say(PROGRAM, "no rule gives gains for this model")
         return NOTHING_FOUND

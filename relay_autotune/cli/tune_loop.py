@@ -125,7 +125,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     if options.report:
         from relay_autotune.cli.report import check_output
 
-        check_output(options.report)
+        check_output(PROGRAM, options.report)
     try:
         client = TuneClient(options.namespace, options.node, ros)
     except ParameterError as error:

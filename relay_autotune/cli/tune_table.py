@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from relay_autotune.cli.layout import in_columns, labelled
 from relay_autotune.errors import TuningError
 from relay_autotune.text import digits, process_text
 from relay_autotune.tuning.forms import series_form
@@ -19,116 +19,106 @@ if TYPE_CHECKING:
     from relay_autotune.tuning import Gains, Performance
     from relay_autotune.tuning.compensators import Compensator
 
-_WIDTH = 99
-_INDENT = 22
 _HEADINGS = ("kc", "ti", "td", "Ms", "Mt", "GM", "PM", "IAE")
+_NAMES = {"parallel": ("p", "i", "d"), "isa": _HEADINGS[:3], "series": _HEADINGS[:3]}
+_UNITS = {
+    "parallel": ("u/y", "u/(y s)", "u s/y"),
+    "isa": ("u/y", "s", "s"),
+    "series": ("u/y", "s", "s"),
+}
+_UNITS_JUDGED = ("", "", "", "deg", "y s/u")
 
 
-def process_lines(model: TransferFunction) -> list[str]:
-    """Return the process that is tuned for."""
-    return [*_wrapped("process", f"{process_text(model)}   ({model.structure})"), ""]
+def process_lines(model: TransferFunction, width: int) -> list[str]:
+    """Return the process that is tuned for.
+
+    :param model: the process.
+    :param width: columns that a line may have.
+    """
+    return [*labelled("process", f"{process_text(model)}   ({model.structure})", width), ""]
 
 
-def form_lines(gains: Gains, form: str) -> list[str]:
+def further_forms(gains: Gains, form: str) -> list[tuple[str, str]]:
     """Return gains in the form asked for, in addition to the forms that are always shown.
 
     :param gains: the gains.
     :param form: "isa", "parallel" or "series".
+    :return: name and numbers.
     :raises TuningError: if they have no series form.
     """
     if form != "series":
         return []
     series = series_form(gains)
-    return [
-        f"    {'series form':<15}kc {digits(series.kc)} u/y   ti {digits(series.ti)} s   "
+    numbers = (
+        f"kc {digits(series.kc)} u/y   ti {digits(series.ti)} s   "
         f"td {digits(series.td)} s   alpha {digits(series.alpha, 3)}"
-    ]
+    )
+    return [("series form", numbers)]
 
 
-def side_by_side(gains: Sequence[Gains], recommended: int | None, form: str) -> list[str]:
-    """Return a line for every rule that applies.
+def side_by_side(
+    gains: Sequence[Gains],
+    recommended: int | None,
+    form: str,
+    inside: Sequence[tuple[Compensator, Performance]],
+    width: int,
+) -> list[str]:
+    """Return a line for every rule that applies, and one for each controller with a model inside.
 
     :param gains: of the rules that apply.
     :param recommended: index of the recommended gains; None: there are none.
     :param form: in which they are shown.
+    :param inside: each compensator with what it does on the model.
+    :param width: columns that a line may have.
     """
-    headings = {"parallel": ("p", "i", "d"), "isa": _HEADINGS[:3], "series": _HEADINGS[:3]}[form]
-    lines = []
+    rows: list[tuple[str, ...]] = []
     if gains:
-        lines.append(_row("", (*headings, *_HEADINGS[3:])))
-    for k, each in enumerate(gains):
-        try:
-            numbers = _in_form(each, form)
-        except TuningError:
-            numbers = ("no", "series", "form")
-        mark = "* " if k == recommended else "  "
-        judged = (
-            *(digits(x, 3) for x in (each.ms, each.mt, each.gain_margin)),
-            digits(math.degrees(each.phase_margin), 3),
-            digits(each.iae_load, 3),
-        )
-        lines.append(_row(mark + each.rule, (*numbers, *judged)))
-    if gains:
-        units = {
-            "parallel": ("u/y", "u/(y s)", "u s/y"),
-            "isa": ("u/y", "s", "s"),
-            "series": ("u/y", "s", "s"),
-        }[form]
-        lines.append(_row("", (*units, "", "", "", "deg", "y s/u")))
-    return lines
+        rows.append(("", *_NAMES[form], *_HEADINGS[3:]))
+        for k, each in enumerate(gains):
+            mark = "* " if k == recommended else "  "
+            rows.append((mark + each.rule, *_in_form(each, form), *_judged(each)))
+        rows.append(("", *_UNITS[form], *_UNITS_JUDGED))
+    if inside:
+        rows.append(("",) * 9)
+        rows.append(("with a model inside", *("",) * 8))
+        rows.append(("", "lambda", "DM", "", *_HEADINGS[3:]))
+        for compensator, found in inside:
+            numbers = digits(compensator.closed_loop_time), digits(found.delay_margin, 3), ""
+            rows.append((f"  {compensator.name}", *numbers, *_judged(found)))
+        rows.append(("", "s", "s", "", *_UNITS_JUDGED))
+    return in_columns(rows, width)
 
 
-def refusal_lines(refused: Mapping[str, str]) -> list[str]:
+def refusal_lines(refused: Mapping[str, str], width: int) -> list[str]:
     """Return why rules give no gains.
 
     :param refused: by name, why a rule gives none.
+    :param width: columns that a line may have.
     """
-    lines = ["", "  no gains by"] if refused else []
-    for name, why in refused.items():
-        lines += _wrapped(f"  {name}", why, _INDENT + 4)
-    return lines
-
-
-def compensator_lines(
-    inside: Sequence[tuple[Compensator, Performance]],
-) -> list[str]:
-    """Return the controllers with a model inside, a line for each.
-
-    :param inside: each with what it does on the model.
-    """
-    if not inside:
+    if not refused:
         return []
-    headings = ("lambda", "DM", "", *_HEADINGS[3:])
-    lines = ["", "  with a model inside", _row("", headings)]
-    for each, p in inside:
-        cells = (
-            digits(each.closed_loop_time),
-            digits(p.delay_margin, 3),
-            "",
-            *(digits(x, 3) for x in (p.ms, p.mt, p.gain_margin)),
-            digits(math.degrees(p.phase_margin), 3),
-            digits(p.iae_load, 3),
-        )
-        lines.append(_row(f"  {each.name}", cells))
-    return [*lines, _row("", ("s", "s", "", "", "", "", "deg", "y s/u"))]
+    indent = max(map(len, refused)) + 6
+    told = [labelled(f"  {name}", why, width, indent=indent) for name, why in refused.items()]
+    return ["", "  no gains by", *(line for lines in told for line in lines)]
 
 
-def _in_form(gains: Gains, form: str) -> tuple[str, str, str]:
+def _judged(found: Gains | Performance) -> tuple[str, ...]:
+    return (
+        *(digits(x, 3) for x in (found.ms, found.mt, found.gain_margin)),
+        digits(math.degrees(found.phase_margin), 3),
+        digits(found.iae_load, 3),
+    )
+
+
+def _in_form(gains: Gains, form: str) -> tuple[str, ...]:
     if form == "parallel":
         found = gains.p, gains.i, gains.d
     elif form == "series":
-        series = series_form(gains)
+        try:
+            series = series_form(gains)
+        except TuningError:
+            return "no", "series", "form"
         found = series.kc, series.ti, series.td
     else:
         found = gains.kc, gains.ti, gains.td
-    first, second, third = (digits(x) for x in found)
-    return first, second, third
-
-
-def _row(label: str, cells: Sequence[str]) -> str:
-    return (f"  {label:<{_INDENT + 2}}" + "".join(f"{cell:>9}" for cell in cells)).rstrip()
-
-
-def _wrapped(label: str, text: str, indent: int = 17) -> list[str]:
-    parts = textwrap.wrap(text, _WIDTH - indent - 2) or [""]
-    return [f"  {label if i == 0 else '':<{indent}}{part}" for i, part in enumerate(parts)]
+    return tuple(digits(x) for x in found)

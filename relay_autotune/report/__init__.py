@@ -19,8 +19,18 @@ if TYPE_CHECKING:
     from relay_autotune.report.case import Case
 
 PICTURES = (".png", ".svg", ".pdf")
+# In the head of each page, before the version.
+_GENERATOR = b'<meta name="generator" content="relay_autotune '
 
-__all__ = ["PICTURES", "draw", "write_figures", "write_page", "write_picture", "write_report"]
+__all__ = [
+    "PICTURES",
+    "draw",
+    "is_ours",
+    "write_figures",
+    "write_page",
+    "write_picture",
+    "write_report",
+]
 
 
 def draw(
@@ -83,6 +93,18 @@ def write_page(cases: Sequence[Case], path: Path | str, *, title: str = "") -> N
     from relay_autotune.report.page import page
 
     Path(path).write_text(page(cases, title=title), encoding="utf-8")
+
+
+def is_ours(path: Path) -> bool:
+    """Return whether a file is a page that :func:`write_page` wrote, of any version.
+
+    :param path: the file.
+    """
+    try:
+        with path.open("rb") as file:
+            return _GENERATOR in file.read(2000)
+    except OSError:
+        return False
 
 
 def write_figures(cases: Sequence[Case], folder: Path | str, kind: str = "png") -> list[Path]:

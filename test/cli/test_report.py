@@ -148,3 +148,20 @@ def test_replay_writes_the_report_beside_its_table(capsys, tmp_path, monkeypatch
     assert "Gains to type in" in page.read_text()
     assert replay.main([str(tmp_path / "log.csv"), "--report", str(tmp_path / "page.doc")]) == 2
     assert "does not say what the report is to be" in capsys.readouterr().err
+
+
+def test_an_earlier_report_is_replaced_with_a_word_and_the_page_of_another_never(
+    capsys, tmp_path, result, monkeypatch
+) -> None:
+    only(monkeypatch, "experiment")
+    page, other = tmp_path / "page.html", tmp_path / "index.html"
+    other.write_text("<!DOCTYPE html><title>My tank</title>")
+    _, _, err = run(capsys, result, "-o", page)
+    assert "replaced" not in err
+    first = page.read_bytes()
+    _, _, err = run(capsys, result, "-o", page, "--title", "Again")
+    assert f"{page} exists and will be replaced" in err
+    assert page.read_bytes() != first
+    status, _, err = run(capsys, result, "-o", other)
+    assert (status, "name another file" in err) == (2, True)
+    assert "My tank" in other.read_text()

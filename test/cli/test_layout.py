@@ -1,0 +1,72 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the commands print fits the terminal, and no word is broken."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import sys
+
+import pytest
+from made_bags import REPOSITORY
+
+from relay_autotune.cli import arguments, layout, replay, tune
+
+COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_fits_80_columns(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        importlib.import_module(f"relay_autotune.cli.{name}").main(["--help"])
+    assert max(capsys.readouterr().out.splitlines(), key=len)[80:] == ""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        (tune, "--gain", "1.65", "--time-constants", "20", "--dead-time", "10", "--table"),
+        (replay, "--rule", "imc", str(REPOSITORY / "bags" / "step_test")),
+    ],
+    ids=["tune", "replay"],
+)
+def test_results_fit_the_terminal_and_no_word_is_broken(command, monkeypatch, capsys):
+    module, *words = command
+    printed = {}
+    for columns in (80, 99):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert module.main(words) == 0
+        printed[columns] = capsys.readouterr().out
+        longest = max((line for line in printed[columns].splitlines()), key=len)
+        assert longest[columns:] == ""
+    assert printed[80] != printed[99]
+    assert printed[80].split() == printed[99].split()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_message_is_one_line_in_a_pipe_and_is_broken_between_words_on_a_terminal(
+    monkeypatch, capsys
+):
+    monkeypatch.setenv("COLUMNS", "60")
+    text = "the file /home/somebody/recordings/of-a-tank/2026-11-20/level.csv has no column 'u'"
+    arguments.say("replay", text)
+    assert capsys.readouterr().err == f"replay: {text}\n"
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    arguments.say("replay", text)
+    lines = terminal.getvalue().splitlines()
+    assert len(lines) == 3
+    assert " ".join(lines) == f"replay: {text}"
+
+
+def test_quantities_on_a_line_stay_with_their_units():
+    text = "kc 0.6488 u/y   ti 14.99 s   td 4.140 s   tf 0.4140 s"
+    assert layout.broken(text, 99) == [text]
+    assert layout.broken(text, 30) == ["kc 0.6488 u/y   ti 14.99 s", "td 4.140 s   tf 0.4140 s"]
