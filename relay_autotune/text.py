@@ -32,6 +32,20 @@ def digits(value: float, count: int = 4) -> str:
     return f"{value:#.{count}g}".rstrip(".") if value else "0"
 
 
+def duration(seconds: float) -> str:
+    """Return a duration as text, such as "12 min 5 s".
+
+    :param seconds: the duration [s], not negative.
+    """
+    if seconds < 90.0:
+        return f"{seconds:.{1 if seconds < 10.0 else 0}f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 90:
+        return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min"
+
+
 def date_text(start: float) -> str:
     """Return a date and time in UTC.
 

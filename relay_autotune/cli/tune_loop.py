@@ -28,11 +28,11 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (
     NARROWEST,
     Paint,
     document,
-    is_news,
     live_lines,
     log_line,
     next_commands,
@@ -133,11 +133,12 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         return USAGE
     with client:
         deadline = time.monotonic() + options.wait
-        client.find(
-            options.wait,
-            needs_identifier=not (options.dry_run or options.record_only),
-            leave=lambda: bool(interrupted),
-        )
+        with Working(f"looking for {client.name}"):
+            client.find(
+                options.wait,
+                needs_identifier=not (options.dry_run or options.record_only),
+                leave=lambda: bool(interrupted),
+            )
         # Until here nothing has started. Ctrl-Z may stop this command; the tune then continues.
         heeded = ending_signals() - {signal.SIGTSTP}
         for number in heeded:
@@ -247,13 +248,14 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
     try:
         if values is None:
             say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
-        told = report_of_tune(
-            client.record(_PATIENCE),
-            values or defaults(),
-            result,
-            result.bag or client.name,
-            options.report,
-        )
+        with Working("writing the report"):
+            told = report_of_tune(
+                client.record(_PATIENCE),
+                values or defaults(),
+                result,
+                result.bag or client.name,
+                options.report,
+            )
     except RelayAutotuneError as error:
         say(PROGRAM, f"no report: {error}")
         return flags, ""
@@ -283,8 +285,11 @@ class Shown:
 
     def take(self, feedback: Any) -> None:
         """Show a feedback."""
-        if not self._live and is_news(self._last, feedback):
-            self._write(f"{log_line(feedback)}\n")
+        if not self._live:
+            self._write(f"{log_line(feedback, self._last)}\n")
+        elif self._last is not None and not feedback.transfer_function.experiment_id:
+            # A model comes only once.
+            feedback.transfer_function = self._last.transfer_function
         self._last, self._came = feedback, time.monotonic()
 
     def tick(self) -> None:

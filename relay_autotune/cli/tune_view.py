@@ -18,7 +18,7 @@ from typing import Any
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.exchange.messages import transfer_function_from_message
-from relay_autotune.text import digits, process_text
+from relay_autotune.text import digits, duration, process_text
 from relay_autotune.verdict import Verdict
 
 # By the constants of Tune.Feedback and RelayExperiment.
@@ -31,14 +31,8 @@ NARROWEST = 80
 _BAR = 16
 _TEXT = 78
 _GREEN, _YELLOW, _RED, _BOLD, _DIM, _PLAIN = "32", "33", "31", "1", "2", "0"
-_WORDS = {
-    "settling": "waits for rest",
-    "kick": "finds dead time and direction",
-    "relay": "oscillates",
-    "completed": "waits for model and gains",
-    "aborted": "ended, the safe command is out",
-    "failed": "ended, the safe command is out",
-}
+# Lines of a terminal for what the tune waits for and sees.
+_STATUS_LINES = 2
 
 
 @dataclass(frozen=True)
@@ -64,20 +58,6 @@ def wants_colour(is_terminal: bool, environment: Mapping[str, str]) -> bool:
     :param environment: the variables of the process.
     """
     return is_terminal and not environment.get("NO_COLOR") and environment.get("TERM") != "dumb"
-
-
-def duration(seconds: float) -> str:
-    """Return a duration as text, such as "12 min 5 s".
-
-    :param seconds: the duration [s], not negative.
-    """
-    if seconds < 90.0:
-        return f"{seconds:.{1 if seconds < 10.0 else 0}f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 90:
-        return f"{minutes} min {rest} s"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min"
 
 
 def estimate(feedback: Any) -> str:
@@ -107,27 +87,22 @@ def oscillation(feedback: Any) -> str:
     return text
 
 
-def is_news(before: Any, now: Any) -> bool:
-    """Return whether a feedback needs a line in a log: another state, or another cycle.
-
-    :param before: the feedback before it, None for the first.
-    :param now: a `Tune.Feedback`.
-    """
-    return before is None or (before.state, before.cycle) != (now.state, now.cycle)
-
-
-def log_line(feedback: Any) -> str:
+def log_line(feedback: Any, before: Any = None) -> str:
     """Return a feedback as one plain line, for a log.
 
     :param feedback: a `Tune.Feedback`.
+    :param before: the feedback before it, None for the first.
     """
     state = STATES[feedback.state]
-    parts = [f"cycle {feedback.cycle}" if feedback.cycle and state == "relay" else state]
-    if state in ("relay", "completed"):
-        parts += [oscillation(feedback), estimate(feedback)]
-    if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
-        parts.append(f"about {duration(feedback.remaining)} left")
-    return f"{feedback.elapsed:8.1f} s  {', '.join(filter(None, parts))}"
+    told = feedback.status or state
+    if feedback.cycle and (before is None or before.cycle != feedback.cycle):
+        parts = [f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback)]
+        if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
+            parts.append(f"about {duration(feedback.remaining)} left")
+        told = ", ".join(filter(None, parts))
+    elif state == "completed" and (before is None or before.state != feedback.state):
+        told = ", ".join(filter(None, (state, oscillation(feedback), estimate(feedback))))
+    return f"{feedback.elapsed:8.1f} s  {told}"
 
 
 def live_lines(
@@ -149,12 +124,12 @@ def live_lines(
     left = feedback.remaining - since
     if math.isfinite(left) and left > 0.0:
         times += f", about {duration(left)} left"
-    lines = [
-        f"  {paint(f'{state:<10}', _BOLD)} {bar} {100.0 * feedback.progress:3.0f} %  {times}",
-        f"  {'':<10} {paint(_WORDS.get(state, ''), _DIM)}",
-    ]
-    if feedback.cycle:
-        lines[1] = f"  {'':<10} cycle {feedback.cycle}: {oscillation(feedback)}"
+    lines = [f"  {paint(f'{state:<10}', _BOLD)} {bar} {100.0 * feedback.progress:3.0f} %  {times}"]
+    told = textwrap.wrap(feedback.status, width - 14, max_lines=_STATUS_LINES, placeholder=" ...")
+    told += [""] * (_STATUS_LINES - len(told))
+    lines += [f"  {'':<10} {line}".rstrip() for line in told]
+    cycle = f"cycle {feedback.cycle}: {oscillation(feedback)}" if feedback.cycle else ""
+    lines.append(f"  {'':<10} {cycle}".rstrip())
     lines.append(f"  {'':<10} {estimate(feedback)}".rstrip())
     model = feedback.transfer_function
     shown = process_text(transfer_function_from_message(model)) if model.experiment_id else ""

@@ -116,6 +116,16 @@ class RelayExperiment:
         return f"{told}, at the end for {silent:.3g} s: check it first"
 
     @property
+    def status(self) -> str:
+        """What it waits for and what it sees, or how it ended, a sentence for people."""
+        samples = self._samples
+        if self.finished:
+            return f"{self.outcome.name.lower()}: {self.reason}"
+        if not samples:
+            return "waiting for the first measurement"
+        return self._procedure.tell(samples.seen[-1], samples.measurement[-1])
+
+    @property
     def settings(self) -> RelaySettings | None:
         """The relay's settings; None until the measurement has settled.
 

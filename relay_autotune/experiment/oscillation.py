@@ -20,6 +20,7 @@ from relay_autotune.experiment.faults.no_return import (
 )
 from relay_autotune.experiment.faults.noise_alone import TELL, why_noise_alone
 from relay_autotune.experiment.levels import Levels, clear_swing
+from relay_autotune.experiment.narration import while_switching
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.samples import Samples
@@ -188,6 +189,26 @@ class Oscillation:
             if begins:
                 self._begin_cycle()
         return self.command
+
+    def tell(self, t: float, y: float) -> str:
+        """Say how the oscillation goes, after the sample that was answered last.
+
+        :param t: its time [s].
+        :param y: the measurement [y].
+        """
+        relay = self._relay
+        rises = relay.is_high == (self.sign > 0)
+        return while_switching(
+            self.cycles,
+            self._parameters.min_cycles,
+            level=self.command,
+            since=t - relay.since,
+            measurement=y,
+            target=self._setpoint + (self._hysteresis if rises else -self._hysteresis),
+            rises=rises,
+            limit=self._limit,
+            growing=self._levels.searching,
+        )
 
     def _runs_away(self, t: float, y: float) -> bool:
         if not self.cycles:

@@ -32,6 +32,11 @@ from relay_autotune.experiment.kick import (
     ResponseDetector,
 )
 from relay_autotune.experiment.levels import Levels
+from relay_autotune.experiment.narration import (
+    while_finding_direction,
+    while_settling,
+    while_waiting_for_response,
+)
 from relay_autotune.experiment.oscillation import Oscillation
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Relay
@@ -109,9 +114,12 @@ class Procedure:
         """Time from the kick to the last sample before the response [s]; NaN until it is seen."""
         self.kicked_at = math.nan
         """Time of the first kick [s]; NaN before."""
-        self.answer: Callable[[float, float], float] = partial(self._settle, Settling())
+        settling = Settling()
+        self.answer: Callable[[float, float], float] = partial(self._settle, settling)
         """Take the last sample, its time without gaps [s] and the measurement [y]; return the
         command [u]."""
+        self.tell: Callable[[float, float], str] = partial(self._tell_settling, settling)
+        """Say what the present state waits for and sees, after the same sample."""
 
         self._parameters = parameters
         self._samples = samples
@@ -229,6 +237,11 @@ class Procedure:
             )
         return self._baseline
 
+    def _tell_settling(self, settling: Settling, t: float, _: float) -> str:
+        p, interval = self._parameters, self._samples.interval
+        limit = p.max_duration or max(SETTLING_LIMIT, SETTLING_SAMPLES * interval)
+        return while_settling(settling, t, interval, p.settle_time, limit)
+
     def _rest_over_settle_time(self) -> RestState:
         """Accept the rest after settle_time, because the user chose that time."""
         n = len(self._samples)
@@ -259,7 +272,13 @@ class Procedure:
             _GROWTH_SETTLINGS * self._settled_at, _GROWTH_SAMPLES * self._samples.interval
         )
         self.answer = partial(self._await_response, detector, is_high, t)
+        self.tell = partial(self._tell_kick, detector.band, is_high, t)
         return self._level(is_high)
+
+    def _tell_kick(self, band: float, is_high: bool, start: float, t: float, y: float) -> str:
+        limit = self._settled_at + self._kick_limit() - start
+        level = self._level(is_high)
+        return while_waiting_for_response(level, t - start, y, self.rest.mean, band, limit)
 
     def _level(self, is_high: bool) -> float:
         return self._levels.high if is_high else self._levels.low
@@ -314,7 +333,12 @@ class Procedure:
         looks = max(LAST_LOOK * interval, LAST_LOOK_SAMPLES * self._samples.interval)
         self._probe_ends = t + _BEYOND * looks
         self.answer = partial(self._find_direction, watch, t + interval)
+        self.tell = partial(self._tell_probe, detector.side)
         return self._levels.high
+
+    def _tell_probe(self, side: int, t: float, y: float) -> str:
+        level, left = self._samples.command[-1], self._probe_ends - t
+        return while_finding_direction(self._response_time, side, level, y, left)
 
     def _find_direction(
         self, watch: DirectionWatch, pulse_end: float, t: float, y: float
@@ -346,7 +370,7 @@ class Procedure:
             first_limit=self._kick_limit(),
             until_converged=self._until_converged,
         )
-        self.answer = self._follow
+        self.answer, self.tell = self._follow, self._oscillation.tell
         return self._oscillation.command
 
     def _follow(self, t: float, y: float) -> float:

@@ -20,6 +20,9 @@ NOISE_SAMPLES = 50
 # Without noise, a transient is over when no more than this part of it is left.
 _REMAINDER = 0.01
 
+# How far ahead the end of the settling is told, as a multiple of the time so far.
+_FURTHEST = 20.0
+
 # Rounding of a constant: differences below this many units in the last place are no signal.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
@@ -62,10 +65,13 @@ class RestState:
         alone; within one standard deviation of the noise (a third of the hysteresis); or within
         1 % of the whole range since the settling began (the end of a transient without noise).
         """
-        if self.span <= 0.0:
-            return False
+        return self.span > 0.0 and self.drift <= self.tolerable
+
+    @property
+    def tolerable(self) -> float:
+        """The largest drift over the window that does not matter [y]."""
         by_chance = 3.0 * self.noise_std * math.sqrt(12.0 / self.samples)
-        return self.drift <= max(by_chance, self.noise_std, _REMAINDER * self.range_seen)
+        return max(by_chance, self.noise_std, _REMAINDER * self.range_seen)
 
 
 NOT_SETTLED = RestState(math.nan, math.nan, math.nan, 0.0, 0, 0.0)
@@ -110,7 +116,11 @@ class Settling:
     """
 
     def __init__(self) -> None:
+        self.rest = NOT_SETTLED
+        """What the last look has found."""
         self._next_look = CONSTANT_SAMPLES
+        # End of the last window [s], and the time in which the slope fell by the factor e [s].
+        self._at = self._fades_in = math.nan
 
     def is_due(self, samples: int) -> bool:
         """Return True if it is time for a test.
@@ -126,8 +136,43 @@ class Settling:
         :param measurement: the samples [y], shape (n,).
         """
         samples = len(time)
-        self._next_look = samples + max(1, samples // 4)
+        self._next_look = _look_after(samples)
         window = min(samples, max(NOISE_SAMPLES, (samples + 1) // 2))
         rest = rest_state(time, measurement, window)
+        self._compare(float(time[-1]), rest)
         known = rest.noise_std == 0.0 or samples >= NOISE_SAMPLES
         return rest, known and rest.is_steady
+
+    def _compare(self, at: float, rest: RestState) -> None:
+        """Keep how fast the slope has become smaller between the middles of two windows."""
+        ratio = self.rest.slope / rest.slope if rest.slope else math.nan
+        between = (at - 0.5 * rest.span) - (self._at - 0.5 * self.rest.span)
+        self._fades_in = between / math.log(ratio) if ratio > 1.0 else math.nan
+        self.rest, self._at = rest, at
+
+    def expected_end(self, interval: float) -> float:
+        """Return when the measurement will be steady, if its slope fades as it did [s].
+
+        :param interval: mean interval of the samples [s].
+        :returns: the time since the settling began; NaN: it cannot be told.
+        """
+        samples, rest = self._next_look, self.rest
+        while samples < NOISE_SAMPLES:
+            samples = _look_after(samples)
+        if not rest.samples or rest.is_steady:
+            return samples * interval
+        if not (self._fades_in > 0.0 and interval > 0.0):
+            return math.nan
+        middle = self._at - 0.5 * rest.span
+        while (at := samples * interval) < _FURTHEST * self._at:
+            # By then the window is the later half of all samples.
+            fades = math.exp(-(0.75 * at - middle) / self._fades_in)
+            if abs(rest.slope) * fades * 0.5 * at <= rest.tolerable:
+                return at
+            samples = _look_after(samples)
+        return math.nan
+
+
+def _look_after(samples: int) -> int:
+    """Return the number of samples at the look after one at ``samples``."""
+    return samples + max(1, samples // 4)

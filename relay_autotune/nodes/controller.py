@@ -13,6 +13,8 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
@@ -28,6 +30,7 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
+from relay_autotune.nodes.following import FOLLOW_EVERY, Following
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.gains_keeper import GainsKeeper
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -120,11 +123,20 @@ class ControllerNode(ServedNode):
             quality.COMMAND,
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
         )
-        measurement = self.create_subscription(
-            reader.kind, "measurement", self._on_measurement, quality.MEASUREMENT
+        sensor = Following(
+            self,
+            reader.kind,
+            reader.type_name,
+            "measurement",
+            self._on_measurement,
+            None if self._simulated else self.favour,
         )
+        measurement = sensor.subscription
         if not self._simulated:
-            self.favoured = measurement
+            self.favour(measurement)
+        self.create_timer(
+            FOLLOW_EVERY, sensor.follow, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)

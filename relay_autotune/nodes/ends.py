@@ -14,9 +14,11 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
 from relay_autotune.nodes import quality, signs_of_life
+from relay_autotune.nodes.following import Following
 from relay_autotune.nodes.live_types import Reader, command_setter
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
@@ -31,6 +33,7 @@ class Ends:
 
     :param node: the node.
     :param on_measurement: called with each measurement and the middleware's facts about it.
+    :param on_renewed: called with a subscription that replaces that of the measurement; None: not.
     :param on_result: called with the topic's unresolved name and each model or gains.
     :param on_status: called with each sign of life of the identifier.
     :param cycles_kept: number of cycles kept for late subscribers (depth of the latched topic).
@@ -44,6 +47,7 @@ class Ends:
         node: Node,
         *,
         on_measurement: Callable[[Any, dict[str, Any]], None],
+        on_renewed: Callable[[Subscription], None] | None,
         on_result: Callable[[str, Any], None],
         on_status: Callable[[Any], None],
         cycles_kept: int,
@@ -84,13 +88,8 @@ class Ends:
         )
         self.reader = reader
         self.command_type = command_type
-        self.measurement = node.create_subscription(
-            reader.kind,
-            "measurement",
-            on_measurement,
-            quality.MEASUREMENT,
-            event_callbacks=unheard,
-            qos_overriding_options=overridable,
+        self._sensor = Following(
+            node, reader.kind, reader.type_name, "measurement", on_measurement, on_renewed
         )
         self.models, self.gains = (
             node.create_subscription(
@@ -109,6 +108,15 @@ class Ends:
         """Called with each command before it is published."""
         # Looked up once, because it is called for each measurement.
         self._publish = self.command.publish
+
+    @property
+    def measurement(self) -> Subscription:
+        """The subscription of the measurement that is in force."""
+        return self._sensor.subscription
+
+    def follow_sensor(self) -> None:
+        """Take the measurement best effort if its publisher offers no more."""
+        self._sensor.follow()
 
     def recorded(self) -> dict[str, Any]:
         """Return the publishers and subscriptions to record, by the topics' unresolved names."""

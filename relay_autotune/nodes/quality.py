@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from difflib import SequenceMatcher
 from typing import Any
 
 from rclpy.duration import Duration
@@ -47,6 +48,9 @@ def latched(depth: int) -> QoSProfile:
 
 RESULT = latched(1)
 
+# Topics that are named where one is missing.
+_MOST_NAMED = 4
+
 # A killed process stays in the graph for some 20 s. With this liveliness lease a subscriber
 # notices its end sooner [s].
 _ALIVE_WITHIN = 1.0
@@ -73,16 +77,20 @@ def for_bag(profile: QoSProfile) -> Qos:
     )
 
 
-def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
+def why_no_publisher(
+    node: Node, topic: str, kind: str = FLOAT64_TYPE, name: str = "measurement"
+) -> str:
     """Return why nothing arrives on a topic, as far as the graph shows.
 
     :param node: the node that subscribes.
     :param topic: resolved name of the topic.
     :param kind: the expected message type.
+    :param name: its unresolved name.
     """
     ends = node.get_publishers_info_by_topic(topic)
     if not ends:
-        return f"{topic} has no publisher"
+        other = _other(node, topic, kind, name, node.get_publishers_info_by_topic)
+        return f"{topic} has no publisher{other}"
     own = _own(node, node.get_subscriptions_info_by_topic(topic))
     problems = _problems(ends, kind, lambda offered: qos_check_compatible(offered, own))
     if problems:
@@ -90,21 +98,58 @@ def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
     return f"{topic} has {_count(len(ends), 'publisher')}, but nothing arrives"
 
 
-def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
+def why_no_subscriber(
+    node: Node, topic: str, kind: str = FLOAT64_TYPE, name: str = "command"
+) -> str:
     """Return why a topic has no connected subscriber, as far as the graph shows.
 
     :param node: the node that publishes.
     :param topic: resolved name of the topic.
     :param kind: the message type that is expected.
+    :param name: its unresolved name.
     """
     ends = node.get_subscriptions_info_by_topic(topic)
     if not ends:
-        return f"{topic} has no subscriber"
+        other = _other(node, topic, kind, name, node.get_subscriptions_info_by_topic)
+        return f"{topic} has no subscriber{other}"
     own = _own(node, node.get_publishers_info_by_topic(topic))
     problems = _problems(ends, kind, lambda wanted: qos_check_compatible(own, wanted))
     if problems:
         return f"{topic} has no subscriber that can be served: {'; '.join(problems)}"
     return f"{topic} has {_count(len(ends), 'subscriber')}, but none is connected yet"
+
+
+def _other(
+    node: Node, topic: str, kind: str, name: str, ends_of: Callable[[str], Sequence[Any]]
+) -> str:
+    """Return what to type for the topic that may be meant: that of this type with like names."""
+    mine = node.get_fully_qualified_name()
+    # Both sides of a topic of this node are its own, not those of a sensor or an actuator.
+    own = {end.topic_name for end in (*node.publishers, *node.subscriptions)}
+    there = sorted(
+        (
+            other
+            for other, kinds in node.get_topic_names_and_types()
+            if kind in kinds and other not in own and any(who(e) != mine for e in ends_of(other))
+        ),
+        key=lambda other: SequenceMatcher(None, topic, other).ratio(),
+        reverse=True,
+    )
+    if not there:
+        return ""
+    more = f" (others: {', '.join(there[1:_MOST_NAMED])})" if there[1:] else ""
+    return f"; {there[0]} has one of this type: start the node with -r {name}:={there[0]}{more}"
+
+
+def who(end: Any) -> str:
+    """Return the full name of the node of a publisher or subscription."""
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+
+
+def described(end: Any) -> str:
+    """Return a publisher or subscription with its node, type and reliability."""
+    best_effort = end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    return f"{who(end)} ({end.topic_type}, {'best effort' if best_effort else 'reliable'})"
 
 
 def _own(node: Node, ends: Sequence[Any]) -> Any:
@@ -118,14 +163,13 @@ def _own(node: Node, ends: Sequence[Any]) -> Any:
 def _problems(ends: Sequence[Any], kind: str, check: Any) -> list[str]:
     problems = []
     for end in ends:
-        who = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
         if end.topic_type != kind:
-            problems.append(f"{who} has type {end.topic_type}, expected {kind}")
+            problems.append(f"{who(end)} has type {end.topic_type}, expected {kind}")
             continue
         compatibility, reason = check(end.qos_profile)
         if compatibility == QoSCompatibility.ERROR:
             told = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
-            problems.append(f"{who} has an incompatible QoS: {told}")
+            problems.append(f"{who(end)} has an incompatible QoS: {told}")
     return problems
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from rclpy.timer import Timer
 from relay_autotune.bag.writer import Topic
 from relay_autotune.nodes.quality import for_bag
 from relay_autotune.nodes.recorder import Recorder
+from relay_autotune.text import duration
 
 MESSAGES = {
     "relay_cycle": "relay_autotune_msgs/msg/RelayCycle",
@@ -31,6 +33,8 @@ RESULTS = ("transfer_function", "pi_gains")
 OPEN_WITHIN = 0.3
 # With signs of life of the identifier, the wait may take this many times the timeout.
 LONGEST = 30.0
+# The identifier works as long as its last sign of life is not older than this [s].
+HEARD_WITHIN = 2.5
 # Wait after the identifier has finished, for messages that are still on their way [s].
 ON_THE_WAY = 0.5
 
@@ -42,6 +46,7 @@ class _Recording:
         self.waiting = False
         self.timer: Timer | None = None
         self.until = 0.0
+        self.waits_since = self.heard_at = -math.inf
         self.reason = ""
         self.closed: Callable[[str], None] | None = None
 
@@ -50,17 +55,14 @@ class Recordings:
     """The recordings of a node's experiments.
 
     :param node: the node, whose timers and log are used.
-    :param ends: the publisher or subscription of each topic, by the topic's unresolved name:
-        ``measurement``, ``command`` and those of ``MESSAGES``.
+    :param ends: returns the publisher or subscription of each topic, by the topic's unresolved
+        name: ``measurement``, ``command`` and those of ``MESSAGES``.
     """
 
-    def __init__(self, node: Node, ends: dict[str, Any]) -> None:
+    def __init__(self, node: Node, ends: Callable[[], dict[str, Any]]) -> None:
         self._node = node
-        self._names = {name: end.topic_name for name, end in ends.items()}
-        self._topics = [
-            Topic(end.topic_name, MESSAGES.get(name, "std_msgs/msg/Float64"), _offered(end))
-            for name, end in ends.items()
-        ]
+        self._ends = ends
+        self._names = {name: end.topic_name for name, end in ends().items()}
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._open: dict[str, _Recording] = {}
         self._paths: dict[str, str] = {}
@@ -76,7 +78,14 @@ class Recordings:
         """
         recorder = Recorder(
             Path(directory).expanduser() / experiment_id,
-            self._topics,
+            [
+                Topic(
+                    end.topic_name,
+                    MESSAGES.get(name, "std_msgs/msg/Float64"),
+                    for_bag(end.qos_profile),
+                )
+                for name, end in self._ends().items()
+            ],
             start_ns=time.time_ns(),
             facts={name: self._names[name] for name in ("measurement", "command")}
             | {"experiment_id": experiment_id},
@@ -138,7 +147,25 @@ class Recordings:
             recording.timer.timer_period_ns = period
             recording.timer.reset()
         elif time.monotonic() < recording.until:
+            recording.heard_at = time.monotonic()
             recording.timer.reset()
+
+    def awaited(self, experiment_id: str, timeout: float) -> str:
+        """Say what a recording waits for after the end of its tune; "" if it waits for nothing.
+
+        :param experiment_id: the id of the experiment.
+        :param timeout: as of `close_with_results` [s].
+        """
+        recording = self._open.get(experiment_id)
+        if recording is None or recording.timer is None:
+            return ""
+        now = time.monotonic()
+        is_there = self._node.count_publishers(self._names["pi_gains"]) > 0
+        heard_at = max(recording.heard_at, recording.waits_since if is_there else -math.inf)
+        if heard_at > now - HEARD_WITHIN:
+            return f"computing the model, {duration(now - recording.waits_since)} so far"
+        silent = duration(now - max(recording.waits_since, recording.heard_at))
+        return f"waiting for identifier_node, {silent} of {duration(timeout)} at most"
 
     def close_with_results(
         self, experiment_id: str, timeout: float, closed: Callable[[str], None]
@@ -165,7 +192,8 @@ class Recordings:
             )
             self.close(experiment_id, f"without {missing}: {recording.reason}")
 
-        recording.until = time.monotonic() + LONGEST * timeout
+        recording.waits_since = time.monotonic()
+        recording.until = recording.waits_since + LONGEST * timeout
         recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=self._steady)
 
     def close(self, experiment_id: str, why: str) -> None:
@@ -207,7 +235,3 @@ class Recordings:
             self._node.get_logger().error(
                 f"the recording {self._last.path} could not be finished within {timeout:g} s"
             )
-
-
-def _offered(end: Any) -> Any:
-    return for_bag(end.qos_profile)

@@ -25,11 +25,13 @@ from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, SafePolicy
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.ends import Ends
+from relay_autotune.nodes.following import FOLLOW_EVERY
 from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
+from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.nodes.quality import why_no_publisher
 from relay_autotune.nodes.readiness import (
@@ -61,12 +63,15 @@ from relay_autotune.nodes.tune_parameters import (
     TUNE_PARAMETERS,
 )
 from relay_autotune.record.record import Outcome
+from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune
 
 # How long the end of the process waits for the acknowledgement of the record.
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
+# Silence of the measurement that is told during a tune [s].
+SILENT = 0.5
 # How long the end of the process may wait for the last bytes of a recording [s].
 CLOSE_WITHIN = 3.0
 
@@ -94,6 +99,8 @@ class RelayNode(ServedNode):
         self._ends = Ends(
             self,
             on_measurement=self._on_measurement,
+            # With /clock another callback delivers the time of a sample.
+            on_renewed=None if self._simulated else self.favour,
             on_result=self._on_result,
             on_status=lambda status: self._recordings.told(*said_by(status)),
             cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
@@ -110,13 +117,15 @@ class RelayNode(ServedNode):
         )
         self._hear = self._sensor.hear
         if not self._simulated:
-            # Not with /clock: there another callback delivers the time of a sample.
-            self.favoured = self._ends.measurement
-        self._recordings = Recordings(self, self._ends.recorded())
+            self.favour(self._ends.measurement)
+        self.create_timer(FOLLOW_EVERY, self._follow_sensor, clock=self._steady)
+        self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
         self.create_service(StartTune, "~/start_tune", self._on_start)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self._action = TuneAction(self, self._request, partial(self._stop_now, "cancelled"))
+        self._awaits_results: Session | None = None
+        self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
         self.add_on_set_parameters_callback(self._on_set)
         self._name = self.get_fully_qualified_name()
@@ -162,6 +171,11 @@ class RelayNode(ServedNode):
             self._defer_news(session)
         if session.experiment.finished:
             self._leave(session, command)
+
+    def _follow_sensor(self) -> None:
+        # A subscription that is replaced might miss a sample, so not during a tune.
+        if self._session is None:
+            self._ends.follow_sensor()
 
     def _answer_idle(self, value: float) -> None:
         if self._after is not None:
@@ -272,6 +286,7 @@ class RelayNode(ServedNode):
         self._session = session
         self._sensor.watch()
         self._loop.take(session.experiment, gives_back=policy.give_back)
+        self.defer(self._narrator.now)
         return identity, recorded
 
     # While a tune runs.
@@ -280,12 +295,15 @@ class RelayNode(ServedNode):
         for index in range(session.published_cycles, session.experiment.cycle_count):
             self.defer(partial(self._publish_cycle, session, index))
         session.published_cycles = session.experiment.cycle_count
+        if session.experiment.state is not session.told_state:
+            session.told_state = session.experiment.state
+            self.defer(self._narrator.now)
         if (early := session.early) is not None and early.is_due(session.experiment):
             early.look(session.experiment)
             self.defer(lambda: self._ends.progress.publish(experiment_message(session)))
 
     def _publish_cycle(self, session: Session, index: int) -> None:
-        self._action.tell(session.experiment)
+        self._tell(session.experiment.status)
         if self._on_setpoint:
             # The controller's commands are known only at the end.
             return
@@ -323,7 +341,7 @@ class RelayNode(ServedNode):
             self._recordings.message(found.experiment_id, topic, now, found)
         if running is None or not taken:
             return
-        self._action.tell(running.experiment)
+        self._tell(running.experiment.status)
         if running.early is None or not running.experiment.is_tried:
             return
         if reason := running.early.judge(running.experiment, finding_from_message(message)):
@@ -372,16 +390,19 @@ class RelayNode(ServedNode):
         if session.sample_count:
             self._results.experiment(message)
         self._recordings.message(session.id, "relay_experiment", session.now_ns(), message)
-        self._action.tell(experiment)
+        self._awaits_results = session
+        self._action.tell(experiment, experiment.status)
         self.tidy_when_idle()
 
         def closed(missing: str) -> None:
+            self._awaits_results = None
             bag = self._recordings.path_of(session.id)
             self._action.end(session.id, experiment_message(session, arrays=False), bag, missing)
 
         if completed:
             timeout = self.get_parameter("model_timeout").value
             self._recordings.close_with_results(session.id, timeout, closed)
+            self._narrator.now()
         else:
             self._recordings.close(session.id, f"after a tune that was {outcome}")
             closed("")
@@ -400,6 +421,24 @@ class RelayNode(ServedNode):
             self._recordings.close_all(f"because {reason}", CLOSE_WITHIN)
 
     # Status.
+
+    def _words(self) -> str:
+        """Say what the tune waits for and sees; empty where none runs or waits for its model."""
+        if (session := self._session) is None:
+            waiting = self._awaits_results
+            timeout = self.get_parameter("model_timeout").value
+            return "" if waiting is None else self._recordings.awaited(waiting.id, timeout)
+        told = session.experiment.status
+        if (age := self._sensor.age) > SILENT:
+            told += f"; no measurement for {duration(age)}"
+        if lost := self._lost():
+            told += f"; {lost} samples lost on the way"
+        return told
+
+    def _tell(self, status: str) -> None:
+        """Send feedback of the tune that runs, or that waits for its model."""
+        if (session := self._session or self._awaits_results) is not None:
+            self._action.tell(session.experiment, status)
 
     def _lost(self) -> int:
         # Sequence numbers of several publishers cannot be distinguished.
@@ -421,7 +460,7 @@ class RelayNode(ServedNode):
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
         running = "" if session is None else session.id
         values = state_values(self._counter, session, idle=idle, lost=self._lost())
-        summary = f"tune {running} is running" if running else self._summary
+        summary = f"tune {running}: {self._words()}" if running else self._summary
         now = int(self.get_clock().now().nanoseconds)
         message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)
         self._ends.diagnostics.publish(message)

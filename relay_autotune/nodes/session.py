@@ -17,7 +17,7 @@ import numpy.ma
 
 from relay_autotune.exchange.messages import start_seconds
 from relay_autotune.experiment.early_end import EarlyEnd
-from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.experiment.faults.sensor_watch import ClockWatch
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.record.record import Record
@@ -53,6 +53,7 @@ class Session:
         self.id = experiment_id
         self.start_ns = 0
         self.published_cycles = 0
+        self.told_state = State.SETTLING
         self.early: EarlyEnd | None = None
         """Ends the experiment once an interval is narrow enough; None: not used."""
         self.lost_samples = 0
@@ -91,9 +92,11 @@ class Session:
 
     @property
     def has_news(self) -> bool:
-        """True if a cycle is not published yet, or the early end must be checked."""
+        """True if a cycle or a state is not told yet, or the early end must be checked."""
         experiment = self.experiment
         if experiment.cycle_count != self.published_cycles:
+            return True
+        if experiment.state is not self.told_state:
             return True
         return self.early is not None and self.early.is_due(experiment)
 

@@ -17,6 +17,7 @@ from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import conclude
 from relay_autotune_msgs.action import Tune
+from relay_autotune_msgs.msg import TransferFunction
 
 _STATES = {
     State.SETTLING: Tune.Feedback.STATE_SETTLING,
@@ -36,11 +37,13 @@ class Started:
     :param accepted: True if the tune runs, or in a dry run could start.
     :param reason: the plan, or the reason for the refusal.
     :param experiment_id: id of the experiment; empty if none was started.
+    :param checks: of a dry run, a line for each check.
     """
 
     accepted: bool
     reason: str
     experiment_id: str = ""
+    checks: tuple[str, ...] = ()
 
 
 class TuneAction:
@@ -66,7 +69,8 @@ class TuneAction:
         self._goal: Any = None
         self._id = ""
         self._result = Tune.Result()
-        self._newest: Any = None
+        self._newest = TransferFunction()
+        self._ultimate_gain = self._ultimate_gain_std = math.nan
         self._server = ActionServer(
             node,
             Tune,
@@ -83,19 +87,22 @@ class TuneAction:
         if started.experiment_id:
             self._goal, self._id = goal, started.experiment_id
             self._result = Tune.Result()
-            self._newest = None
+            self._newest = TransferFunction()
+            self._ultimate_gain = self._ultimate_gain_std = math.nan
             return
-        conclude(goal, Tune.Result(reason=started.reason), succeeded=started.accepted)
+        result = Tune.Result(reason=started.reason, checks=started.checks)
+        conclude(goal, result, succeeded=started.accepted)
 
     def _on_cancel(self, goal: Any) -> CancelResponse:
         if self._goal is not None and goal.goal_id == self._goal.goal_id:
             self._node.executor.create_task(self._cancel)
         return CancelResponse.ACCEPT
 
-    def tell(self, experiment: RelayExperiment) -> None:
+    def tell(self, experiment: RelayExperiment, status: str) -> None:
         """Publish feedback, if a goal is active.
 
         :param experiment: the running experiment.
+        :param status: what it waits for and what it sees, a sentence.
         """
         if self._goal is None:
             return
@@ -107,18 +114,18 @@ class TuneAction:
             remaining=experiment.remaining,
             period=math.nan,
             amplitude=math.nan,
-            ultimate_gain=math.nan,
-            ultimate_gain_std=math.nan,
+            ultimate_gain=self._ultimate_gain,
+            ultimate_gain_std=self._ultimate_gain_std,
+            transfer_function=self._newest,
+            status=status,
         )
         if experiment.cycle_count:
             last = experiment.cycles[-1]
             feedback.period = last.period
             feedback.amplitude = 0.5 * (last.peak_max - last.peak_min)
-        if self._newest is not None:
-            feedback.transfer_function = self._newest
-            feedback.ultimate_gain = self._newest.ultimate_gain
-            feedback.ultimate_gain_std = self._newest.ultimate_gain_std
         self._goal.publish_feedback(feedback)
+        # Each model is told once, since it is long.
+        self._newest = TransferFunction()
 
     def note(self, name: str, message: Any) -> None:
         """Keep a model or gains for the result.
@@ -130,6 +137,8 @@ class TuneAction:
             return
         if name == "transfer_function":
             self._newest = message
+            self._ultimate_gain = message.ultimate_gain
+            self._ultimate_gain_std = message.ultimate_gain_std
             if message.final:
                 self._result.transfer_function = message
         elif message.final:

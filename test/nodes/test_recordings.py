@@ -40,7 +40,7 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
     results = dict(zip(RESULTS, (TransferFunction, PidGains), strict=True))
     topics = {"measurement": Float64, "command": Float64, **results}
     ends = {name: node.create_publisher(kind, name, 10) for name, kind in topics.items()}
-    recordings = Recordings(node, ends)
+    recordings = Recordings(node, lambda: ends)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     for experiment, complete in (("whole", True), ("lacking", False)):

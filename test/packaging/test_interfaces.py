@@ -56,7 +56,8 @@ PROMISED = {
         bool dry_run
         ---
         bool accepted
-        string reason experiment_id""",
+        string reason experiment_id
+        string[] checks""",
     "srv/Identify.srv": """
         RelayExperiment experiment
         string method rule
@@ -74,12 +75,14 @@ PROMISED = {
         TransferFunction transfer_function
         PidGains gains
         string bag reason
+        string[] checks
         uint8 outcome
         ---
         uint8 state
         uint32 cycle
         float64 progress elapsed remaining period amplitude ultimate_gain ultimate_gain_std
-        TransferFunction transfer_function""",
+        TransferFunction transfer_function
+        string status""",
     "action/Verify.action": """
         float64 setpoint_step load_step
         ---
@@ -88,7 +91,8 @@ PROMISED = {
         Verification[] steps
         ---
         uint8 step
-        float64 elapsed remaining""",
+        float64 elapsed remaining
+        string status""",
     "msg/Verification.msg": """
         std_msgs/Header header
         uint8 kind

@@ -1,0 +1,45 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tell each second what a running tune waits for and what it sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+
+# Interval of what is told [s]: with what a busy machine adds it stays below a second.
+EVERY = 0.8
+
+
+class Narrator:
+    """Log a sentence at once when it is asked for, and each second as long as there is one.
+
+    The first sentence of a tune, and that of each new state, come at once by `now`.
+
+    :param node: the node, whose log and timer are used.
+    :param words: returns the present sentence; empty: there is nothing to tell any more.
+    :param tell: called with each sentence.
+    """
+
+    def __init__(
+        self, node: Any, words: Callable[[], str], tell: Callable[[str], None]
+    ) -> None:
+        self._node = node
+        self._words = words
+        self._tell = tell
+        self._timer = node.create_timer(
+            EVERY, self.now, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
+        )
+
+    def now(self) -> None:
+        """Tell the present sentence, and the next one a second later."""
+        if not (words := self._words()):
+            self._timer.cancel()
+            return
+        self._timer.reset()
+        self._node.get_logger().info(words)
+        self._tell(words)
