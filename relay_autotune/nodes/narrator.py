@@ -25,9 +25,7 @@ class Narrator:
     :param tell: called with each sentence.
     """
 
-    def __init__(
-        self, node: Any, words: Callable[[], str], tell: Callable[[str], None]
-    ) -> None:
+    def __init__(self, node: Any, words: Callable[[], str], tell: Callable[[str], None]) -> None:
         self._node = node
         self._words = words
         self._tell = tell

@@ -23,10 +23,13 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, SafePolicy
+from relay_autotune.experiment.narration import how_long
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.following import FOLLOW_EVERY
 from relay_autotune.nodes.health import diagnostics
+from relay_autotune.nodes.last_samples import LastSamples
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
@@ -49,6 +52,7 @@ from relay_autotune.nodes.reports import (
     Counter,
     cycle_message,
     experiment_message,
+    losses,
     state_values,
 )
 from relay_autotune.nodes.results import OwnResults
@@ -70,6 +74,8 @@ from relay_autotune_msgs.srv import StartTune
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
+# Where a tune that was started by the service is seen.
+WATCH = "the log of {}, or ros2 topic echo /diagnostics, which tell each second how it goes"
 # Silence of the measurement that is told during a tune [s].
 SILENT = 0.5
 # How long the end of the process may wait for the last bytes of a recording [s].
@@ -91,6 +97,7 @@ class RelayNode(ServedNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._counter = Counter()
+        self._last_samples = LastSamples()
         self._ahead = 0
         self._summary = "no tune yet"
         self._alarm = ""
@@ -151,8 +158,10 @@ class RelayNode(ServedNode):
                 self._respond(session, command)
             elif session.may_be_no_repeat:
                 self._answer_later(session)
-        elif not self._loop.is_driven:
-            self._answer_idle(value)
+        else:
+            if not self._loop.is_driven:
+                self._answer_idle(value)
+            self._last_samples.add(value)
         self._counter.add(info["publication_sequence_number"])
 
     def _on_silence(self, value: float, ago: float) -> None:
@@ -211,12 +220,13 @@ class RelayNode(ServedNode):
             return Started(False, str(error))
         from_small = self._from_small(parameters, baseline)
         plan = plan_of(parameters, baseline, policy, from_small=from_small)
+        takes = how_long(parameters, self._last_samples.interval, SETTLING_LIMIT)
         if dry_run:
-            return Started(True, f"a tune could start: {plan}")
+            return Started(True, f"a tune could start: {plan}; {takes}")
         identity, recorded = self._start(parameters, baseline, policy, from_small)
-        reason = f"{plan}; {recorded}"
+        reason = f"{plan}; {recorded}; {takes}"
         self.get_logger().info(f"tune {identity} started: {reason}")
-        return Started(True, reason, identity)
+        return Started(True, f"{reason}; watch {WATCH.format(self._name)}", identity)
 
     def _ready(self, amplitude: float) -> tuple[ExperimentParameters, float, SafePolicy]:
         if self._session is not None:
@@ -282,6 +292,7 @@ class RelayNode(ServedNode):
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
         self._counter.begin()
+        self._last_samples.forget()
         self._alarm = ""
         self._session = session
         self._sensor.watch()
@@ -385,7 +396,9 @@ class RelayNode(ServedNode):
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
         completed = experiment.outcome == Outcome.COMPLETED
         self._alarm = "" if completed else self._summary
-        self.get_logger().info(f"tune {session.id} {outcome}: {experiment.reason}")
+        lost = losses(session.lost_samples)
+        told = "; ".join(filter(None, (experiment.reason, lost)))
+        self.get_logger().info(f"tune {session.id} {outcome}: {told}")
         self._publish_diagnostics()
         if session.sample_count:
             self._results.experiment(message)
@@ -397,7 +410,8 @@ class RelayNode(ServedNode):
         def closed(missing: str) -> None:
             self._awaits_results = None
             bag = self._recordings.path_of(session.id)
-            self._action.end(session.id, experiment_message(session, arrays=False), bag, missing)
+            summary = experiment_message(session, arrays=False)
+            self._action.end(session.id, summary, bag, "; ".join(filter(None, (lost, missing))))
 
         if completed:
             timeout = self.get_parameter("model_timeout").value
@@ -431,9 +445,7 @@ class RelayNode(ServedNode):
         told = session.experiment.status
         if (age := self._sensor.age) > SILENT:
             told += f"; no measurement for {duration(age)}"
-        if lost := self._lost():
-            told += f"; {lost} samples lost on the way"
-        return told
+        return "; ".join(filter(None, (told, losses(self._lost()))))
 
     def _tell(self, status: str) -> None:
         """Send feedback of the tune that runs, or that waits for its model."""

@@ -64,6 +64,11 @@ def experiment_message(session: Session, *, arrays: bool = True) -> Any:
     return message
 
 
+def losses(count: int) -> str:
+    """Say how many samples were lost on the way; "" for none."""
+    return f"{count} {'sample' if count == 1 else 'samples'} lost on the way" if count else ""
+
+
 class Counter:
     """Count arrivals: their number, the time since the last, and losses in the middleware."""
 

@@ -150,7 +150,7 @@ class TuneAction:
         :param experiment_id: the id of the experiment.
         :param summary: its message, without arrays.
         :param bag: folder of the recording; empty: no recording.
-        :param missing: a sentence on missing results; empty: nothing is missing.
+        :param missing: a sentence on samples or results that are missing; empty: none are.
         """
         goal = self._goal
         if goal is None or experiment_id != self._id:

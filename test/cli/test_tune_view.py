@@ -23,9 +23,7 @@ from relay_autotune.cli.tune_view import (
     STATES,
     Paint,
     document,
-    duration,
     estimate,
-    is_news,
     live_lines,
     log_line,
     next_commands,
@@ -33,6 +31,7 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.nodes.identifier_parameters import known_from, options_from
+from relay_autotune.text import duration
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
@@ -148,26 +147,35 @@ def test_an_interval_is_that_of_two_standard_deviations() -> None:
     assert estimate(feedback()) == ""
 
 
-def test_a_log_has_a_line_for_each_state_and_cycle() -> None:
-    first = feedback(state=1, elapsed=0.5)
-    assert log_line(first) == "     0.5 s  settling"
-    assert log_line(cycle()) == (
+def test_a_log_has_a_line_for_each_feedback() -> None:
+    first = feedback(state=1, elapsed=0.5, status="settling, 0.5 s of about 10 s")
+    assert log_line(first) == "     0.5 s  settling, 0.5 s of about 10 s"
+    assert log_line(feedback(state=1, elapsed=0.5)) == "     0.5 s  settling"
+    told = (
         "    61.0 s  cycle 2, period 38.43 s, amplitude 0.7031 y, "
         "K_u 2.300 u/y (95 %: 2.280 to 2.320), about 35 s left"
     )
-    assert is_news(None, first)
-    assert not is_news(cycle(), cycle(elapsed=62.0))
-    assert is_news(cycle(), cycle(cycle=3))
-    assert is_news(first, feedback(state=2))
+    assert log_line(cycle()) == told
+    assert log_line(cycle(status="at 3.3"), cycle(cycle=1)) == told
+    assert log_line(cycle(status="at 3.3"), cycle()) == "    61.0 s  at 3.3"
+    ended = dict(state=Tune.Feedback.STATE_COMPLETED, remaining=0.0)
+    assert log_line(cycle(**ended), cycle()).startswith("    61.0 s  completed, period 38.43 s")
+    computing = cycle(**ended, status="computing the model, 1.6 s so far")
+    assert log_line(computing, cycle(**ended)) == "    61.0 s  computing the model, 1.6 s so far"
 
 
 def test_a_terminal_shows_the_same_number_of_lines_at_any_time() -> None:
     """Else what is written again would leave something behind."""
-    shown = [live_lines(f, Paint()) for f in (feedback(state=1), cycle(), feedback(state=6))]
-    assert {len(lines) for lines in shown} == {4}
-    assert "[" not in "".join(shown[1]).replace("\x1b[", "")
-    assert "#" * 8 + "-" * 8 in shown[1][0]
-    assert "61 s so far, about 35 s left" in shown[1][0]
+    long = feedback(state=2, status="stepped to 3.3, no response after 6.0 s: " * 9)
+    all_states = (feedback(state=1), long, cycle(status="at 3.3"), feedback(state=6))
+    shown = [live_lines(f, Paint()) for f in all_states]
+    assert {len(lines) for lines in shown} == {6}
+    assert "[" not in "".join(shown[2]).replace("\x1b[", "")
+    assert "#" * 8 + "-" * 8 in shown[2][0]
+    assert "61 s so far, about 35 s left" in shown[2][0]
+    assert shown[1][1].strip().startswith("stepped to 3.3, no response after 6.0 s")
+    assert shown[1][2].endswith(" ...")
+    assert shown[2][1].strip() == "at 3.3"
 
 
 def test_times_advance_between_feedbacks() -> None:
@@ -178,18 +186,18 @@ def test_times_advance_between_feedbacks() -> None:
 
 def test_no_line_is_wider_than_the_terminal() -> None:
     many = model()
-    many.denominator = [float(k + 1) for k in range(30)]
+    many.denominator = [float(30 - k) for k in range(30)]
     widest = feedback(
         state=5, cycle=12, progress=1.0, elapsed=86399.0, remaining=86399.0, period=1.234e-5,
         amplitude=1.234e-5, ultimate_gain=-1.234e-5, ultimate_gain_std=1e-6,
-        transfer_function=many,
+        transfer_function=many, status="word " * 60,
     )  # fmt: skip
     for shown in (widest, cycle()):
         assert max(map(len, live_lines(shown, Paint(), width=80))) <= 80
 
 
 def test_the_newest_model_is_shown() -> None:
-    assert "2.000 e^(-1.500 s)" in live_lines(cycle(transfer_function=model()), Paint())[3]
+    assert "2.000 e^(-1.500 s)" in live_lines(cycle(transfer_function=model()), Paint())[5]
 
 
 def test_colours_are_for_a_terminal_that_wants_them() -> None:

@@ -56,7 +56,7 @@ def wait_for_the_graph(rig: Rig) -> None:
 
 def test_an_action_gives_feedback_model_gains_and_bag(rig: Rig) -> None:
     rig.plant(**LOOP, noise_std=0.005, seed=3)
-    rig.relay(amplitude=0.5, baseline=1.0, sample_period=0.1)
+    relay = rig.relay(amplitude=0.5, baseline=1.0, sample_period=0.1)
     rig.identifier()
     wait_for_the_graph(rig)
     dry = Goal(rig, dry_run=True)
@@ -83,6 +83,13 @@ def test_an_action_gives_feedback_model_gains_and_bag(rig: Rig) -> None:
     counts = [f.cycle for f in goal.feedback]
     assert counts == sorted(counts)
     assert set(range(1, len(record.cycle_start))) <= set(counts)
+    told = " | ".join(f.status for f in goal.feedback)
+    assert "is to rise to " in told
+    for words in ("stepped to 1.65, ", "computing the model, "):
+        assert words in told
+        assert words in relay.log
+    models = [f.transfer_function.experiment_id for f in goal.feedback]
+    assert models.count("") > len(models) // 2
     last = goal.feedback[-1]
     assert last.state == Tune.Feedback.STATE_COMPLETED
     assert last.remaining == 0.0

@@ -106,12 +106,6 @@ def test_a_measurement_of_another_type(idle: Rig) -> None:
         refused(idle, "/onlooker has type std_msgs/msg/Float32, expected std_msgs/msg/Float64")
 
 
-def test_a_measurement_with_incompatible_qos(idle: Rig) -> None:
-    with Ends(idle, measurement=(Float64, BEST_EFFORT)):
-        reason = refused(idle, "/onlooker has an incompatible QoS")
-        assert "reliab" in reason.lower()
-
-
 def test_no_subscriber_on_the_command(idle: Rig) -> None:
     with Ends(idle, command=None):
         refused(idle, "no command would arrive: /command has no subscriber")
@@ -272,14 +266,39 @@ def test_while_a_tune_runs(rig: Rig) -> None:
         assert relay.running
 
 
-def test_a_best_effort_sensor_is_heard_if_the_relay_is_told_so(rig: Rig) -> None:
-    rig.relay(
-        amplitude=1.0,
-        baseline=0.5,
-        **{"qos_overrides./measurement.subscription.reliability": "best_effort"},
-    )
+def test_a_best_effort_sensor_is_taken_as_it_comes(rig: Rig) -> None:
+    relay = rig.relay(amplitude=1.0, baseline=0.5, settle_time=60.0)
     with Ends(rig, measurement=(Float64, BEST_EFFORT)):
         assert rig.tune(dry_run=True).accepted
+        said = "/measurement is taken best effort, as /onlooker offers it"
+        rig.until(lambda: said in relay.log, said)
+        answer = rig.tune()
+        rig.until(lambda: "settling, " in relay.log, "the first words")
+    rig.until(lambda: "is closed" in relay.log, "the bag")
+    metadata = (rig.bag(answer) / "metadata.yaml").read_text()
+    assert "best_effort" in metadata
+
+
+def test_a_reliability_that_the_user_gives_is_kept(rig: Rig) -> None:
+    override = "qos_overrides./measurement.subscription.reliability"
+    rig.relay(amplitude=1.0, baseline=0.5, **{override: "reliable"})
+    with Ends(rig, measurement=(Float64, BEST_EFFORT)):
+        reason = refused(rig, "/onlooker has an incompatible QoS")
+        assert "reliab" in reason.lower()
+
+
+def test_a_wrong_topic_is_told_with_the_nearest_of_its_type(idle: Rig) -> None:
+    tank = idle.node.create_publisher(Float64, "/tank/measurement", RELIABLE)
+    level = idle.node.create_publisher(Float64, "/other", RELIABLE)
+    fan = idle.node.create_publisher(Float32, "/fan/measurement", RELIABLE)
+    try:
+        with Ends(idle, measurement=None):
+            reason = refused(idle, "start the node with -r measurement:=/tank/measurement")
+            reason = refused(idle, "(others: /other)")
+            assert "/fan" not in reason
+    finally:
+        for publisher in (tank, level, fan):
+            idle.node.destroy_publisher(publisher)
 
 
 def test_a_folder_that_cannot_be_written_is_said_and_the_tune_goes_on(rig: Rig) -> None:
