@@ -95,13 +95,13 @@ def log_line(feedback: Any, before: Any = None) -> str:
     """
     state = STATES[feedback.state]
     told = feedback.status or state
-    if feedback.cycle and (before is None or before.cycle != feedback.cycle):
+    if state == "completed" and (before is None or before.state != feedback.state):
+        told = ", ".join(filter(None, (state, oscillation(feedback), estimate(feedback))))
+    elif feedback.cycle and (before is None or before.cycle != feedback.cycle):
         parts = [f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback)]
         if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
             parts.append(f"about {duration(feedback.remaining)} left")
         told = ", ".join(filter(None, parts))
-    elif state == "completed" and (before is None or before.state != feedback.state):
-        told = ", ".join(filter(None, (state, oscillation(feedback), estimate(feedback))))
     return f"{feedback.elapsed:8.1f} s  {told}"
 
 

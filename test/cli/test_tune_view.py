@@ -159,7 +159,9 @@ def test_a_log_has_a_line_for_each_feedback() -> None:
     assert log_line(cycle(status="at 3.3"), cycle(cycle=1)) == told
     assert log_line(cycle(status="at 3.3"), cycle()) == "    61.0 s  at 3.3"
     ended = dict(state=Tune.Feedback.STATE_COMPLETED, remaining=0.0)
-    assert log_line(cycle(**ended), cycle()).startswith("    61.0 s  completed, period 38.43 s")
+    for before in (cycle(), cycle(cycle=1)):
+        told = log_line(cycle(**ended), before)
+        assert told.startswith("    61.0 s  completed, period 38.43 s")
     computing = cycle(**ended, status="computing the model, 1.6 s so far")
     assert log_line(computing, cycle(**ended)) == "    61.0 s  computing the model, 1.6 s so far"
 
