@@ -29,7 +29,6 @@ from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.quality import is_far_off
 from relay_autotune.identification.judgement.table import LOOP_CHECKS, MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING
-from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
@@ -46,6 +45,8 @@ from relay_autotune.tuning import (
     ensemble,
     rule_named,
 )
+from relay_autotune.tuning.ensemble import ensemble_peaks
+from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.tuning.prediction import PredictedMs, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge
@@ -390,7 +391,9 @@ def _judged(
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
     loop = Loop(
         controller=gains,
-        ms_on=lambda model: ms_on(gains, task.in_loop(model)),
+        ms_of=lambda models: (
+            ensemble_peaks(gains, ModelSet([task.in_loop(model) for model in models])).ms
+        ),
         ms=gains.ms,
         ms_95=gains.ms_95,
         added_delay=task.options.added_delay,

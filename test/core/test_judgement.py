@@ -49,7 +49,7 @@ def other_model(found, model):
 
 def findings(record, model, gains, **more):
     found = other_model(identify(record, "waveform"), model)
-    loop = Loop(gains, lambda m: ms_on(gains, m), gains.ms, gains.ms_95)
+    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms, gains.ms_95)
     evidence = Evidence(record, found, loop=loop, **more)
     return {f.name: f for f in judge(CHECKS, evidence)}
 
@@ -177,7 +177,7 @@ def fitted_as(model, record):
 
 
 def of_checks(record, found, gains, **more):
-    loop = Loop(gains, lambda m: ms_on(gains, m), gains.ms, gains.ms_95)
+    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms, gains.ms_95)
     evidence = Evidence(record, found, loop=loop, **more)
     return {f.name: f for f in judge(CHECKS, evidence)}
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,6 +27,7 @@ MOST_GROWTH = 7.0
 _AS_WELL = 1.1
 _WORTH_HEARING = 0.01
 
+FloatArray = NDArray[np.floating]
 ComplexArray = NDArray[np.complexfloating]
 
 
@@ -35,14 +36,14 @@ class Loop:
     """The gains that are to be judged, as far as checks need them.
 
     :param controller: -command per measurement at complex frequencies s [u/y].
-    :param ms_on: Ms of the loop that these gains make with a model; inf: it is unstable.
+    :param ms_of: Ms of the loops that these gains make with models; inf: unstable.
     :param ms: Ms on the model that counts.
     :param ms_95: Ms that 95 % of the models within its uncertainty stay below.
     :param added_delay: dead time of the loop beside the process's own [s].
     """
 
     controller: Callable[[ComplexArray], ComplexArray]
-    ms_on: Callable[[TransferFunction], float]
+    ms_of: Callable[[Sequence[TransferFunction]], FloatArray]
     ms: float
     ms_95: float
     added_delay: float = 0.0

@@ -62,6 +62,11 @@ class Part:
     end: float
     models: tuple[TransferFunction, ...]
 
+    @property
+    def span(self) -> str:
+        """Its times, for people."""
+        return f"{self.begin:.4g} s to {self.end:.4g} s"
+
 
 def halves(found: Identification, record: Record) -> tuple[Part, ...]:
     """Return what either half of a record tells of the process in the chosen structure.

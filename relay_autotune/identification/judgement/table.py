@@ -11,14 +11,16 @@ by benchmarks/verdicts.py and shown in docs/verdict.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.judgement.checks import lost_effect
-from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
+from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.identification.judgement.refits import other_sign
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import process_text
 from relay_autotune.verdict import Check, Measured
 
@@ -108,12 +110,25 @@ def _visible(evidence: Evidence) -> Measured | None:
     return Measured(float(share[at]), f"{w[at]:.3g} rad/s")
 
 
+def _worst(
+    loop: Loop, models: Sequence[TransferFunction], sign: int = 0
+) -> tuple[float, TransferFunction]:
+    """Return the largest Ms of the gains on models, and its model.
+
+    :param sign: on a process of another sign Ms is infinite; 0: whatever it is.
+    """
+    ms = loop.ms_of(models)
+    if sign:
+        ms = np.where([m.process_sign == sign for m in models], ms, math.inf)
+    at = int(np.argmax(ms))
+    return float(ms[at]), models[at]
+
+
 def _rivals(evidence: Evidence) -> Measured | None:
     loop = evidence.loop
     if loop is None or not evidence.rivals:
         return None
-    found = [(loop.ms_on(model), model) for model in evidence.rivals]
-    ms, model = max(found, key=lambda pair: pair[0])
+    ms, model = _worst(loop, evidence.rivals)
     return Measured(ms / loop.ms, process_text(model))
 
 
@@ -123,11 +138,11 @@ def _halves(evidence: Evidence) -> Measured | None:
         return None
     # Most of what a half allows has to object, so that one which tells little is not heard.
     found = [
-        (float(np.quantile([loop.ms_on(m) for m in part.models], _BUT_FEW, method="lower")), part)
+        (float(np.quantile(loop.ms_of(part.models), _BUT_FEW, method="lower")), part)
         for part in evidence.halves
     ]
     ms, part = max(found, key=lambda pair: pair[0])
-    return Measured(ms / loop.ms, f"{part.begin:.4g} s to {part.end:.4g} s")
+    return Measured(ms / loop.ms, part.span)
 
 
 def _halves_direction(evidence: Evidence) -> Measured | None:
@@ -136,15 +151,14 @@ def _halves_direction(evidence: Evidence) -> Measured | None:
     if not found:
         return None
     share, part = max(found, key=lambda pair: pair[0])
-    return Measured(share, f"{part.begin:.4g} s to {part.end:.4g} s")
+    return Measured(share, part.span)
 
 
 def _plain(evidence: Evidence) -> Measured | None:
     loop, sign = evidence.loop, evidence.found.model.process_sign
     if loop is None or not evidence.plain:
         return None
-    found = [(loop.ms_on(m) if m.process_sign == sign else math.inf, m) for m in evidence.plain]
-    ms, model = max(found, key=lambda pair: pair[0])
+    ms, model = _worst(loop, evidence.plain, sign)
     return Measured(ms / loop.ms, process_text(model))
 
 

@@ -42,11 +42,12 @@ class Colour:
         :param rows: shape (..., n).
         """
         p = min(self.order, rows.shape[-1])
-        from scipy.signal import lfilter  # loaded only where noise has a colour
-
-        white = lfilter(np.concatenate(([1.0], -self.coefficients)), [1.0], rows, axis=-1)
+        # Lag by lag: that is quicker than a filter's routine for each row.
+        white = rows.copy()
+        for lag, a in enumerate(self.coefficients[:p].tolist(), start=1):
+            white[..., lag:] -= a * rows[..., :-lag]
         white[..., :p] = rows[..., :p] @ self.begin[:p, :p].T
-        return np.asarray(white)
+        return white
 
     @property
     def log_determinant(self) -> float:

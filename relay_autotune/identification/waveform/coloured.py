@@ -40,6 +40,8 @@ _WHITE = 1e-3
 _FEW, _MOST = 1200, 6000
 _A_RESPONSE = 5.0
 _MOST_TIMES = 4
+# A structure whose criterion is larger by this in one colour is not tried in the next one.
+_HOPELESS = 30.0
 # Of a slow disturbance that is tried as a beginning, times that the record lasts its correlation.
 _SLOWEST = 10.0
 _ALIKE = 0.01
@@ -211,7 +213,8 @@ def _converged(found: list[Candidate], ground: Ground) -> list[Candidate]:
         if not found:
             return []
         best = found[0]
-        found = _in(_colour(best.problem, best.state), found, ground)
+        near = [c for c in found if c.criterion <= best.criterion + _HOPELESS]
+        found = _in(_colour(best.problem, best.state), near, ground)
         if found and found[0].structure == best.structure:
             scale = unit_steps(best.structure, best.state.theta)
             change = np.abs(found[0].state.theta - best.state.theta) / scale

@@ -22,12 +22,17 @@ Parameter = Callable[[FloatArray, FloatArray], float]
 # Steps outward, and trials of one fit on the way.
 _MOST_STEPS = 20
 _MOST_TRIALS = 12
+# Fits that fail in a row before the profile counts as one that cannot be followed.
+_MOST_LOST = 5
+# Of the quantile: the least rise at the end of a search that did not settle.
+_FAR_ENOUGH = 0.5
 _CLOSE = 0.02
 _SETTLED = 1e-2
 _FAR = 8.0
 # Logarithm of a gain beyond which products of it are no numbers.
 _LARGEST = 300.0
 _FURTHER = 4.0
+_WEAK = 1e-11
 _NARROW = 0.3
 # Of the way to a place far above, a straight line says nothing.
 _SMALL = 0.2
@@ -96,10 +101,14 @@ def _end(problem: Problem, state: Trial, parameter: Parameter, search: _Search) 
     place = (state.theta, state.coefficients)
     inside, outside = (0.0, 0.0), (math.inf, math.inf)
     reach = search.quantile * search.std
+    lost = 0
     for _ in range(_MOST_STEPS):
         target = max(search.centre + search.side * reach, search.least)
         held = _hold(problem, *place, parameter, target)
         if held is None:
+            lost += 1
+            if lost == _MOST_LOST and inside[1] == 0.0:
+                return math.nan
             outside = (math.inf, reach)
             reach = 0.5 * (inside[1] + reach)
             continue
@@ -125,8 +134,9 @@ def _end(problem: Problem, state: Trial, parameter: Parameter, search: _Search) 
             share = (search.quantile - inside[0]) / (outside[0] - inside[0])
             share = min(share, 0.9) if share > _SMALL else 0.5
             reach = inside[1] + share * (outside[1] - inside[1])
-    # Where no fit could be held apart from the estimate, its end is not known.
-    return search.centre + search.side * reach if inside[1] > 0.0 else math.nan
+    # Where no fit could be held far enough from the estimate, its end is not known.
+    far = inside[0] >= _FAR_ENOUGH * search.quantile
+    return search.centre + search.side * reach if far else math.nan
 
 
 def _hold(
@@ -200,7 +210,7 @@ def _constrained(
     # The directions in which the parameter stays: all but the first of an orthonormal basis.
     along = np.linalg.qr(slope[:, None], mode="complete")[0][:, 1:]
     rest = residual - onto @ scaled
-    solved = np.linalg.lstsq((along.T @ scaled).T, rest, rcond=1e-14)[0]
+    solved = np.linalg.lstsq((along.T @ scaled).T, rest, rcond=_WEAK)[0]
     with np.errstate(over="ignore"):
         step = np.asarray((onto + along @ solved) / size)
     # A direction that the samples hardly show may ask for more than numbers hold.

@@ -37,7 +37,7 @@ _MOST_DAMPING = 1e12
 _GROWTH = 4.0
 # In lengths of the record: a slower lag answers as an integrator does, to a thousandth.
 _LONGEST = 1e3
-_WEAK = 1e-13
+_WEAK = 1e-11
 
 
 @dataclass(frozen=True)
