@@ -5,12 +5,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "benchmarks.md").read_text()
@@ -66,3 +72,39 @@ def test_it_prints_its_table(name: str) -> None:
 def test_the_page_has_its_command_and_its_place(name: str) -> None:
     assert f"python3 benchmarks/{name}.py" in PAGE
     assert f"<!-- results of {name} -->" in PAGE
+
+
+JUDGE = """
+import json, subprocess, sys
+
+
+def one(name, reference):
+    done = subprocess.run(["replay"], capture_output=True, text=True)
+    found = json.loads(done.stdout)["experiments"][0]
+    assert reference["gain"] == 2.0
+    return ("good" if found["gains"] else "refused"), "", 0.0
+"""
+
+
+def test_recordings_in_a_folder_are_judged_by_the_judge_in_it(tmp_path: Path) -> None:
+    time = np.arange(0.0, 60.0, 0.25)
+    command = np.where(time < 5.0, 0.0, np.where(time < 30.0, 1.0, -1.0))
+    record = Record(time=time, measurement=np.zeros(time.size), command=command)
+    y = response(TransferFunction.fopdt(2.0, 5.0, 2.0), time, record.input())
+    y = y + np.random.default_rng(0).normal(0.0, 0.01, time.size)
+    columns = np.stack((time, command, y), axis=1)
+    np.savetxt(tmp_path / "made.csv", columns, delimiter=",", header="time,u,y", comments="")
+    reference = {"made": {"verdict": "identifiable", "gain": 2.0}}
+    (tmp_path / "reference.json").write_text(json.dumps(reference))
+    (tmp_path / "judge.py").write_text(JUDGE)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "real_recordings.py"), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    cells = [[c.strip() for c in line.split("|")[1:-1]] for line in done.stdout.splitlines()]
+    assert ["made", "identifiable", "good", "trusted", "fopdt", "-"] in [c[:6] for c in cells]
+    assert ["good, of the identifiable", "1 of 1"] in cells
+    assert ["all gains of a half, Ms at most 2 on the other half's model", "2 of 2"] in cells

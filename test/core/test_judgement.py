@@ -285,6 +285,17 @@ def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
 
 
 @pytest.mark.long
+def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
+    # A heater that warms faster than it cools: but for 0 and 10, its command has two levels.
+    time = np.arange(0.0, 600.0, 1.0)
+    command = np.select([time < 10, time < 200, time < 400], [0.0, 150.0, 10.0], 150.0)
+    record = Record(time=time, measurement=np.zeros(time.size), command=command)
+    heater = TransferFunction.fopdt(0.3, 110.0, 15.0)
+    warm = response(heater, time, record.input())
+    record = replace(record, measurement=warm - 0.004 * warm**2)
+    assert lost_effect(record, heater) is None
+
+
 def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse_alone(clipped_steps(9.0)).verdict is Verdict.TRUSTED
     assert analyse_alone(clipped_steps(0.7)).verdict is not Verdict.TRUSTED

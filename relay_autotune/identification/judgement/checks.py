@@ -33,6 +33,8 @@ _LEAST_SAMPLES = 24
 # Of a command's range, where its effect may end; beside the level that it starts from.
 _SHARES = (0.25, 0.5, 0.75)
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
+# Of the command's range, the least range of the levels on one side.
+_OWN = 0.2
 
 
 def unequal_gains(record: Record, model: TransferFunction) -> str | None:
@@ -104,6 +106,10 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
     found = []
     for level in (*inner, u.initial):
         if not levels[0] < level < levels[-1]:
+            continue
+        own = max(float(np.ptp(levels[side])) for side in (levels >= level, levels <= level))
+        if own < _OWN * float(np.ptp(levels)):
+            # Where no side has moves of its own, either part is the other one scaled and moved.
             continue
         parts = [
             response(

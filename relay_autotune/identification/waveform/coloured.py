@@ -40,8 +40,10 @@ _WHITE = 1e-3
 _FEW, _MOST = 1200, 6000
 _A_RESPONSE = 5.0
 _MOST_TIMES = 4
-# A structure whose criterion is larger by this in one colour is not tried in the next one.
+# A structure whose criterion is larger by this in one colour is not tried in the next one, but
+# for the plain ones, on whose models gains have to hold, too.
 _HOPELESS = 30.0
+PLAIN = ("fopdt", "sopdt")
 # Of a slow disturbance that is tried as a beginning, times that the record lasts its correlation.
 _SLOWEST = 10.0
 _ALIKE = 0.01
@@ -165,25 +167,33 @@ def _compared(
         for relaxation, past in (_PASTS[:1] if _rests(problem) else _PASTS)
         if problem.past_is_open or not past
     ]
-    first = [c for g in grounds for name in names or _FIRST for c in g.fit((name,), order)]
-    if not first:
+    # Each past in the colour of what it leaves itself, and a richer one has to earn its place.
+    begun = [[c for name in names or _FIRST for c in g.fit((name,), order)] for g in grounds]
+    found = [
+        (_in_its_own(first, g), first, g) for first, g in zip(begun, grounds, strict=True) if first
+    ]
+    found = [(c, first, g) for c, first, g in found if c]
+    if not found:
         return []
-    best = min(first, key=lambda c: c.criterion)
-    in_one = _in(_colour(best.problem, best.state), first, grounds[0])
-    if not in_one:
-        return []
-    past = nuisances_of(in_one[0].problem)
-    asked = next(g for g in grounds if nuisances_of(g.problem) == past)
-    # Of what was looked at first, that with the past which the best one asks for.
-    simulated = [c for c in first if nuisances_of(c.problem) == past]
+    _, simulated, asked = min(found, key=lambda f: _joint(f[0]) + _unasked(f[2].problem))
     if not names:
         tried = (*_OTHERS, *_INTEGRATING, *(_UNSTABLE if held else ()))
         simulated += [c for name, n in tried for c in asked.fit((name,), n)]
-    best = min(simulated, key=lambda c: c.criterion)
-    once = _in(_colour(best.problem, best.state), simulated, asked)
+    once = _in_its_own(simulated, asked)
     slow = slow_colour(1.0 - _SLOWEST / problem.time.size)
     ends = [_converged(once, asked), _converged(_in(slow, simulated, asked), asked)]
     return _ordered(min(ends, key=_joint))
+
+
+def _in_its_own(found: list[Candidate], ground: Ground) -> list[Candidate]:
+    """Return candidates in the colour of what the best of them leaves, the best first."""
+    best = min(found, key=lambda c: c.criterion)
+    return _in(_colour(best.problem, best.state), found, ground)
+
+
+def _unasked(problem: Problem) -> float:
+    """Return what an unknown past has to earn: like a drift, it bends to what is slow."""
+    return _EARNED * sum(nuisances_of(problem))
 
 
 def _ground(problem: Problem, sign: int) -> Ground:
@@ -213,7 +223,11 @@ def _converged(found: list[Candidate], ground: Ground) -> list[Candidate]:
         if not found:
             return []
         best = found[0]
-        near = [c for c in found if c.criterion <= best.criterion + _HOPELESS]
+        near = [
+            c
+            for c in found
+            if c.criterion <= best.criterion + _HOPELESS or c.structure.name in PLAIN
+        ]
         found = _in(_colour(best.problem, best.state), near, ground)
         if found and found[0].structure == best.structure:
             scale = unit_steps(best.structure, best.state.theta)

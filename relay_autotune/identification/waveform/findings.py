@@ -23,6 +23,7 @@ from relay_autotune.identification.result import (
     identified,
 )
 from relay_autotune.identification.waveform.averaging import averaged_point
+from relay_autotune.identification.waveform.coloured import PLAIN
 from relay_autotune.identification.waveform.determination import with_what_is_determined
 from relay_autotune.identification.waveform.fit_covariance import (
     NEGLIGIBLE,
@@ -51,7 +52,6 @@ _MOST_COUNTED = 6
 _OPEN = 0.01
 _PREDICTED = 1e-6
 # Plain structures are beside a richer one where they leave so much more of the spread at most.
-_PLAIN = ("fopdt", "sopdt")
 _AS_WELL = 0.02
 
 
@@ -129,7 +129,7 @@ def _plain(fit: Fit, rms: float, spread: float) -> list[TransferFunction]:
     """
     found = []
     for candidate in fit.candidates:
-        if candidate.structure.name not in _PLAIN:
+        if candidate.structure.name not in PLAIN:
             continue
         problem = replace(candidate.problem, colour=None)
         state = refine(problem, candidate.state.theta, tolerance=_PREDICTED)

@@ -130,7 +130,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     clear = not held and known.loss == LOSSES[0] and is_clearly_coloured(problem, sign)
     if clear:
         coloured = in_colour(problem, scale, known, sign, held=held)
-        if coloured is not None:
+        if coloured is not None and _responds(coloured.problem, coloured.state, _SEARCHED):
             return coloured
     fit = _fit(problem, known, sign, scale)
     fit = _by_noise(problem, fit, known, sign)
