@@ -32,6 +32,7 @@ from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (
     NARROWEST,
     Paint,
+    check_lines,
     document,
     live_lines,
     log_line,
@@ -220,11 +221,13 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
     """Print the result of a dry run, or why the node refuses."""
-    reason = client.result.reason
+    reason, checks = client.result.reason, list(client.result.checks)
     if options.json:
-        print(json.dumps({"node": client.name, "accepted": client.succeeded, "reason": reason}))
-    elif client.succeeded:
-        print(reason)
+        told = {"accepted": client.succeeded, "reason": reason, "checks": checks}
+        print(json.dumps({"node": client.name} | told))
+    elif checks:
+        print("\n".join(check_lines(checks, shutil.get_terminal_size().columns)))
+    if client.succeeded and not options.json:
         again = [word for word in options.typed if word != "--dry-run"]
         print(f"\nNext:\n  {'start it':<26} {_prefix()}{shlex.join((PROGRAM, *again))}")
     if not client.succeeded:

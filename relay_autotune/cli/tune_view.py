@@ -31,6 +31,8 @@ NARROWEST = 80
 _BAR = 16
 _TEXT = 78
 _GREEN, _YELLOW, _RED, _BOLD, _DIM, _PLAIN = "32", "33", "31", "1", "2", "0"
+# Where the text of a check begins: after its mark and its name.
+_CHECK_INDENT = 20
 # Lines of a terminal for what the tune waits for and sees.
 _STATUS_LINES = 2
 
@@ -135,6 +137,25 @@ def live_lines(
     shown = process_text(transfer_function_from_message(model)) if model.experiment_id else ""
     lines.append(f"  {'':<10} {paint(shown[: width - 14], _DIM)}".rstrip())
     return lines
+
+
+def check_lines(checks: Sequence[str], width: int) -> list[str]:
+    """Return the checklist of a dry run, each check with its further lines indented.
+
+    :param checks: a line for each check, its text from column `_CHECK_INDENT` on.
+    :param width: columns of the terminal.
+    """
+    return [
+        line
+        for check in checks
+        for line in textwrap.wrap(
+            check,
+            max(width - 1, 2 * _CHECK_INDENT),
+            subsequent_indent=" " * _CHECK_INDENT,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    ]
 
 
 def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
@@ -27,11 +28,35 @@ _FAR = 10.0
 
 
 class NotReadyError(RelayAutotuneError):
-    """A tune that cannot start."""
+    """A tune that cannot start.
+
+    :param message: the reason.
+    :param typed: the parameter to set, and a value or what it stands for; empty: another remedy.
+    """
+
+    def __init__(self, message: str, typed: str = "") -> None:
+        super().__init__(message)
+        self.typed = typed
 
 
-def require_connections(node: Node, ends: Ends, sensor: Sensor, timeout: float) -> None:
-    """Refuse a start without measurements, or without a subscriber to the commands.
+@dataclass(frozen=True)
+class Ready:
+    """What a tune will do.
+
+    :param parameters: the experiment's parameters, valid.
+    :param baseline: command of the operating point [u].
+    :param policy: how the process will be left.
+    :param from_small: True if a given amplitude is not put on at once.
+    """
+
+    parameters: ExperimentParameters
+    baseline: float
+    policy: SafePolicy
+    from_small: bool
+
+
+def require_measurement(node: Node, ends: Ends, sensor: Sensor, timeout: float) -> None:
+    """Refuse a start without measurements.
 
     :param node: the node that would tune.
     :param ends: its topics.
@@ -47,11 +72,38 @@ def require_connections(node: Node, ends: Ends, sensor: Sensor, timeout: float) 
         when = "yet" if math.isinf(age) else f"for {age:.3g} s"
         why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
         raise NotReadyError(f"no measurement has come {when}: {why}")
+
+
+def require_actuator(node: Node, ends: Ends) -> None:
+    """Refuse a start without a subscriber to the commands.
+
+    :param node: the node that would tune.
+    :param ends: its topics.
+    :raises NotReadyError: with the reason, as far as the graph shows it.
+    """
     # In takeover one of the subscriptions is the node's own.
     own = sum(s.topic_name == ends.command.topic_name for s in node.subscriptions)
     if ends.command.get_subscription_count() <= own:
         why = why_no_subscriber(node, ends.command.topic_name, ends.command_type)
         raise NotReadyError(f"no command would arrive: {why}")
+
+
+def require_within_limits(parameters: ExperimentParameters, newest: float | None) -> None:
+    """Refuse a start whose first sample would end the tune.
+
+    :param parameters: the experiment's parameters.
+    :param newest: the newest measurement [y]; None: not known.
+    :raises NotReadyError: with the limit to change.
+    """
+    low, high = parameters.measurement_min, parameters.measurement_max
+    if newest is None or low <= newest <= high:
+        return
+    limit, way = ("measurement_min", "lower") if newest < low else ("measurement_max", "higher")
+    raise NotReadyError(
+        f"the measurement is {newest:.6g}, outside of its limits, measurement_min {low:g} to "
+        f"measurement_max {high:g}: the first sample would end the tune; give a {way} {limit}",
+        typed=f"{limit} LIMIT",
+    )
 
 
 def baseline_from(parameter: float, mean: float, held: float | None) -> float:
@@ -69,7 +121,8 @@ def baseline_from(parameter: float, mean: float, held: float | None) -> float:
     if held is None:
         raise NotReadyError(
             "the baseline is not known: set the parameter baseline, or initial_command at the "
-            "node's start, to the command of the operating point"
+            "node's start, to the command of the operating point",
+            typed="baseline COMMAND",
         )
     return held
 
@@ -125,7 +178,8 @@ def require_known_range(parameters: ExperimentParameters, baseline: float) -> No
                 f"a level of the relay is {level:g}, more than {_FAR:g} times the baseline "
                 f"{baseline:g}, and {name} is not given: if the actuator does not go so far, the "
                 f"gains become too large; give command_min and command_max, the ends of the "
-                f"actuator, or a smaller amplitude"
+                f"actuator, or a smaller amplitude",
+                typed=f"{name} LIMIT",
             )
 
 

@@ -22,10 +22,18 @@ from std_srvs.srv import Trigger
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message
 from relay_autotune.experiment.early_end import EarlyEnd
-from relay_autotune.experiment.experiment import RelayExperiment, SafePolicy
+from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.narration import how_long
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
+from relay_autotune.nodes.checklist import (
+    Checklist,
+    expected,
+    look_at_identifier,
+    look_at_limits,
+    look_at_recording,
+    look_at_rest,
+)
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.following import FOLLOW_EVERY
 from relay_autotune.nodes.health import diagnostics
@@ -36,15 +44,18 @@ from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
 from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.nodes.parameters import declare, values_of
-from relay_autotune.nodes.quality import why_no_publisher
+from relay_autotune.nodes.quality import described, who, why_no_publisher
 from relay_autotune.nodes.readiness import (
     NotReadyError,
+    Ready,
     baseline_from,
     is_beyond_known,
     plan_of,
     policy_from,
-    require_connections,
+    require_actuator,
     require_known_range,
+    require_measurement,
+    require_within_limits,
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
@@ -66,7 +77,7 @@ from relay_autotune.nodes.tune_parameters import (
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )
-from relay_autotune.record.record import Outcome
+from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune
 
@@ -98,6 +109,8 @@ class RelayNode(ServedNode):
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._counter = Counter()
         self._last_samples = LastSamples()
+        # Amplitude and last cycle of the last tune.
+        self._last_cycle: tuple[float, Cycle] | None = None
         self._ahead = 0
         self._summary = "no tune yet"
         self._alarm = ""
@@ -210,25 +223,30 @@ class RelayNode(ServedNode):
         started = self._request(request.amplitude, request.dry_run)
         response.accepted, response.reason = started.accepted, started.reason
         response.experiment_id = started.experiment_id
+        response.checks = list(started.checks)
         return response
 
     def _request(self, amplitude: float, dry_run: bool) -> Started:
+        checks = Checklist(self._name, stops=not dry_run)
         try:
-            parameters, baseline, policy = self._ready(amplitude)
+            ready = self._ready(amplitude, checks)
         except RelayAutotuneError as error:
             self.get_logger().warning(f"start refused: {error}")
             return Started(False, str(error))
-        from_small = self._from_small(parameters, baseline)
-        plan = plan_of(parameters, baseline, policy, from_small=from_small)
-        takes = how_long(parameters, self._last_samples.interval, SETTLING_LIMIT)
+        lines = tuple(checks.lines)
+        if ready is None:
+            return Started(False, str(checks.refusal), checks=lines)
+        plan = plan_of(ready.parameters, ready.baseline, ready.policy, from_small=ready.from_small)
+        takes = how_long(ready.parameters, self._last_samples.interval, SETTLING_LIMIT)
         if dry_run:
-            return Started(True, f"a tune could start: {plan}; {takes}")
-        identity, recorded = self._start(parameters, baseline, policy, from_small)
+            return Started(True, f"a tune could start: {plan}; {takes}", checks=lines)
+        identity, recorded = self._start(ready)
         reason = f"{plan}; {recorded}; {takes}"
         self.get_logger().info(f"tune {identity} started: {reason}")
         return Started(True, f"{reason}; watch {WATCH.format(self._name)}", identity)
 
-    def _ready(self, amplitude: float) -> tuple[ExperimentParameters, float, SafePolicy]:
+    def _ready(self, amplitude: float, checks: Checklist) -> Ready | None:
+        """Make the checks before a start; return None where one of them failed."""
         if self._session is not None:
             raise NotReadyError(
                 f"tune {self._session.id} is running; wait for its end or call {self._name}/abort"
@@ -238,6 +256,40 @@ class RelayNode(ServedNode):
         if amplitude != 0.0:
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
+        ready = checks.do(
+            "levels",
+            partial(self._planned, values, parameters),
+            lambda r: plan_of(r.parameters, r.baseline, r.policy, from_small=r.from_small),
+        )
+        ends, timeout = self._ends, values["measurement_timeout"]
+        checks.do(
+            "measurement",
+            partial(require_measurement, self, ends, self._sensor, timeout),
+            lambda _: self._heard(),
+        )
+        checks.do("command", partial(require_actuator, self, ends), lambda _: self._served())
+        checks.do(
+            "alone",
+            partial(self._require_alone, values["sample_period"]),
+            lambda _: "no other node commands, measures, or has this name",
+        )
+        checks.do(
+            "present",
+            partial(require_within_limits, parameters, self._last_samples.newest),
+            lambda _: "the measurement is within its limits",
+        )
+        if checks.stops:
+            return ready
+        look_at_limits(checks, parameters)
+        look_at_rest(checks, self._last_samples)
+        look_at_recording(checks, values["record_directory"])
+        look_at_identifier(checks, self, self._ends.gains.topic_name)
+        checks.tell("expected", expected(parameters, self._last_cycle))
+        checks.tell("time", how_long(parameters, self._last_samples.interval, SETTLING_LIMIT))
+        return ready if checks.refusal is None else None
+
+    def _planned(self, values: dict[str, Any], parameters: ExperimentParameters) -> Ready:
+        """Return what a tune would do; raise the reason where that is not possible."""
         parameters.validate()
         if self._on_setpoint:
             parameters, baseline = on_setpoint(parameters)
@@ -247,23 +299,33 @@ class RelayNode(ServedNode):
             require_known_range(parameters, values["baseline"])
         parameters.validate(baseline)
         policy = policy_from(values, connected=self._loop.is_connected)
-        require_connections(self, self._ends, self._sensor, values["measurement_timeout"])
-        require_own_time(parameters.sample_period, self._sensor.repeat_period)
+        return Ready(parameters, baseline, policy, self._from_small(parameters, baseline))
+
+    def _require_alone(self, sample_period: float) -> None:
+        require_own_time(sample_period, self._sensor.repeat_period)
         self._loop.require_alone()
-        return parameters, baseline, policy
+
+    def _heard(self) -> str:
+        """Say who measures, and how."""
+        topic, last = self._ends.measurement.topic_name, self._last_samples
+        rate = f"{1.0 / last.interval:.3g} per second" if last.interval > 0.0 else "rate not known"
+        newest = "" if last.newest is None else f", newest {last.newest:.6g} y"
+        who = ", ".join(map(described, self.get_publishers_info_by_topic(topic)))
+        return f"{topic} from {who}, {rate}{newest}"
+
+    def _served(self) -> str:
+        """Say who takes the commands."""
+        topic = self._ends.command.topic_name
+        there = self.get_subscriptions_info_by_topic(topic)
+        return f"{topic} to {', '.join(described(e) for e in there if who(e) != self._name)}"
 
     def _from_small(self, parameters: ExperimentParameters, baseline: float) -> bool:
         # Who tells where the actuator is, tells of its ends, too.
         told = self._on_setpoint or self.count_publishers("command_feedback") > 0
         return not told and is_beyond_known(parameters, baseline)
 
-    def _start(
-        self,
-        parameters: ExperimentParameters,
-        baseline: float,
-        policy: SafePolicy,
-        from_small: bool,
-    ) -> tuple[str, str]:
+    def _start(self, ready: Ready) -> tuple[str, str]:
+        parameters, policy = ready.parameters, ready.policy
         identity = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{secrets.token_hex(4)}"
         clock = self.get_clock()
         converged = self.get_parameter("stop_when").value == "converged"
@@ -273,11 +335,11 @@ class RelayNode(ServedNode):
         session = kind(
             RelayExperiment(
                 parameters,
-                baseline,
+                ready.baseline,
                 identity,
                 policy=policy,
                 until_converged=converged,
-                from_small=from_small,
+                from_small=ready.from_small,
             ),
             identity,
             sample_period=parameters.sample_period,
@@ -395,6 +457,8 @@ class RelayNode(ServedNode):
         outcome = experiment.outcome.name.lower()
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
         completed = experiment.outcome == Outcome.COMPLETED
+        if experiment.cycles and experiment.settings is not None:
+            self._last_cycle = experiment.settings.amplitude, experiment.cycles[-1]
         self._alarm = "" if completed else self._summary
         lost = losses(session.lost_samples)
         told = "; ".join(filter(None, (experiment.reason, lost)))

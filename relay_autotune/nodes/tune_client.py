@@ -36,7 +36,7 @@ from relay_autotune_msgs.msg import RelayExperiment
 _GONE = 1.0
 # States of an ended goal; the safe command was sent before.
 _ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
-# Beginnings of the refusals that nodes give after their start, until discovery is complete.
+# Parts of the refusals that nodes give after their start, until discovery is complete.
 _NOT_YET = (
     "no measurement has come yet",
     "no command would arrive",
@@ -200,7 +200,8 @@ class TuneClient:
     def not_ready_yet(self) -> bool:
         """Whether the reason for the refusal may disappear without action."""
         refused = not self.succeeded and not self.result.experiment.experiment_id
-        return refused and self.result.reason.startswith(_NOT_YET)
+        said = (self.result.reason, *self.result.checks)
+        return refused and any(reason in text for text in said for reason in _NOT_YET)
 
     @property
     def cancelled(self) -> bool:

@@ -22,6 +22,7 @@ from relay_autotune.cli.tune_view import (
     OUTCOMES,
     STATES,
     Paint,
+    check_lines,
     document,
     estimate,
     live_lines,
@@ -178,6 +179,16 @@ def test_a_terminal_shows_the_same_number_of_lines_at_any_time() -> None:
     assert shown[1][1].strip().startswith("stepped to 3.3, no response after 6.0 s")
     assert shown[1][2].endswith(" ...")
     assert shown[2][1].strip() == "at 3.3"
+
+
+def test_a_checklist_is_as_wide_as_the_terminal_and_breaks_no_word() -> None:
+    check = "NO    limits        " + "a-word " * 20 + "/a/very/long/path" * 4
+    lines = check_lines([check, "ok    time          10 s"], 60)
+    assert lines[0].startswith("NO    limits        a-word")
+    assert all(line.startswith(" " * 20 + "a-word") for line in lines[1:-2])
+    assert max(map(len, lines[:-2])) < 60
+    assert lines[-2].strip() == "/a/very/long/path" * 4
+    assert lines[-1] == "ok    time          10 s"
 
 
 def test_times_advance_between_feedbacks() -> None:

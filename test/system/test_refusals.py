@@ -187,6 +187,22 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
         assert answer.experiment_id == ""
         idle.run_for(0.2)
         assert not ends.commands
+        marks = {line[6:18].strip(): line[:4].strip() for line in answer.checks}
+        found = "\n".join(answer.checks)
+        good = ("levels", "measurement", "command", "alone", "present", "recording", "time")
+        assert {marks[name] for name in good} == {"ok"}
+        assert (marks["limits"], marks["model"]) == ("note", "note")
+        assert "/measurement from /onlooker (std_msgs/msg/Float64, reliable), " in found
+        assert "type: ros2 param set /relay_node measurement_min LIMIT" in found
+        assert set_parameter(idle, "measurement_max", -1.0).successful
+        try:
+            reason = refused(idle, "the measurement is 0, outside of its limits")
+            assert "give a higher measurement_max" in reason
+            checks = idle.ask_for_tune(dry_run=True).checks
+            (failed,) = (line for line in checks if line.startswith("NO"))
+            assert failed.endswith("; type: ros2 param set /relay_node measurement_max LIMIT")
+        finally:
+            assert set_parameter(idle, "measurement_max", math.inf).successful
 
 
 @pytest.mark.parametrize(
