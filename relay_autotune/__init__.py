@@ -11,6 +11,14 @@ use, so that nodes and commands load only the parts that they need::
     found = analyse(read_records("log.csv")[0])
     print(found.model.model, found.best_gains.kc, found.best_gains.ti)
     draw(found, "tune.png", title="Tank 7")
+
+``METHODS``, ``STRUCTURES`` and ``RULES`` hold what can be chosen, by name:
+
+    >>> import relay_autotune
+    >>> "waveform" in relay_autotune.METHODS, "fopdt" in relay_autotune.STRUCTURES
+    (True, True)
+    >>> sorted(relay_autotune.RULES)[:3]
+    ['amigo', 'imc', 'imc_chang']
 """
 
 from __future__ import annotations
@@ -21,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis, analyse
+    from relay_autotune.analysis import Analysis, analyse, analyse_jointly
     from relay_autotune.bag.records import read_records
     from relay_autotune.errors import RelayAutotuneError
     from relay_autotune.exchange.python_control import to_control
@@ -35,10 +43,10 @@ if TYPE_CHECKING:
     from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
     from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
     from relay_autotune.report import draw, write_report
-    from relay_autotune.tuning import RULES, Controller, Gains, tune
+    from relay_autotune.tuning import RULES, Controller, DesignOptions, Gains, tune
 
 _HOMES = {
-    "analysis": ("Analysis", "analyse"),
+    "analysis": ("Analysis", "analyse", "analyse_jointly"),
     "bag.records": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification": ("METHODS", "Identification", "Known", "identify"),
@@ -49,7 +57,7 @@ _HOMES = {
     "experiment.experiment": ("RelayExperiment",),
     "experiment.parameters": ("ExperimentParameters",),
     "report": ("draw", "write_report"),
-    "tuning": ("RULES", "Controller", "Gains", "tune"),
+    "tuning": ("RULES", "Controller", "DesignOptions", "Gains", "tune"),
     "loop.closed_loop": ("simulate_closed_loop",),
     "process.ultimate": ("ultimate_point",),
     "process.virtual_process": ("Disturbances", "VirtualProcess"),
@@ -59,6 +67,7 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = [  # noqa: RUF022  in the order in which one meets them
     "read_records",
     "analyse",
+    "analyse_jointly",
     "Analysis",
     "draw",
     "write_report",
@@ -74,6 +83,7 @@ __all__ = [  # noqa: RUF022  in the order in which one meets them
     "STRUCTURES",
     "ultimate_point",
     "tune",
+    "DesignOptions",
     "Gains",
     "Controller",
     "RULES",

@@ -33,7 +33,7 @@ from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
-from relay_autotune.record.record import Cycle, Outcome, Record
+from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
 from relay_autotune.tuning import (
     DEFAULT_RULE,
@@ -59,9 +59,20 @@ _NO_GAINS = {
 _LOAD = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Analysis:
     """Result of the analysis of one record.
+
+    >>> from relay_autotune import analyse, read_records
+    >>> found = analyse(read_records("bags/heater.csv")[0])
+    >>> found                                                       # doctest: +ELLIPSIS
+    <Analysis of <Record: 450 samples over 898 s, recorded elsewhere>
+      process   0.6204 e^(-15.89 s) / (1 + 110.2 s)   (fopdt, waveform)
+    ...
+      verdict   trusted
+    ...
+    >>> found.verdict.name, found.best_gains.rule, len(found.gains) > 5
+    ('TRUSTED', 'robust', True)
 
     :param record: the record.
     :param cycles: its whole cycles.
@@ -112,6 +123,13 @@ class Analysis:
         found = Finding(model.ultimate_gain, model.ultimate_gain_std)
         return found if ms is None else replace(found, ms=ms.ms, ms_low=ms.low, ms_high=ms.high)
 
+    def __repr__(self) -> str:
+        """Return model, verdict and gains on ten lines at most; the fields have the rest."""
+        # Imported here, because only notebooks and interpreters need it.
+        from relay_autotune.exchange.notebook import analysis_text
+
+        return analysis_text(self)
+
     def _repr_html_(self) -> str:
         """Return model and gains as a table, as notebooks show it."""
         # Imported here, because only notebooks need it.
@@ -140,6 +158,14 @@ def analyse(
 ) -> Analysis:
     """Identify a record and, where the experiment was completed, tune: by all methods and rules.
 
+    >>> from relay_autotune import analyse, read_records
+    >>> (record,) = read_records("bags/heater.csv")
+    >>> found = analyse(record)
+    >>> print(found.model.model)
+    0.6204 e^(-15.89 s) / (1 + 110.2 s)
+    >>> print(found.best_gains)
+    kc = 4.994, ti = 43.34 s, td = 7.297 s
+
     Data without a usable model are a result, not an exception: the reason says what was found and
     what to do. Only a completed experiment, or data without any outcome, yield gains, and only if
     no check of the table in ``identification.judgement`` failed. The verdict says whether the
@@ -153,8 +179,9 @@ def analyse(
         they are not given.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
-    :raises RelayAutotuneError: if method or rule are unknown.
+    :raises RelayAutotuneError: if method or rule are unknown, or the record is none.
     """
+    record = one_record(record, "analyse")
     check_names(method, rule)
     chosen = _chosen(record, method, known)
     if isinstance(chosen, Analysis):
@@ -184,8 +211,9 @@ def analyse_alone(
     :param known: known values of the process.
     :param options: as for :func:`analyse`.
     :param rng: as for :func:`analyse`.
-    :raises RelayAutotuneError: if method or rule are unknown.
+    :raises RelayAutotuneError: if method or rule are unknown, or the record is none.
     """
+    record = one_record(record, "analyse_alone")
     check_names(method, rule)
     chosen = _chosen(record, method, known)
     if isinstance(chosen, Analysis):
@@ -329,13 +357,20 @@ def _assessed(
 def analyse_jointly(
     records: Sequence[Record],
     *,
-    method: str,
+    method: str = DEFAULT_METHOD,
     rule: str = DEFAULT_RULE,
     known: Known = NOTHING,
     options: DesignOptions | None = None,
     rng: np.random.Generator | None = None,
 ) -> Analysis:
     """Identify one model from several records of a process and, where all were completed, tune.
+
+    >>> from relay_autotune import Known, analyse_jointly, read_records
+    >>> tests = [read_records(f"bags/{name}_relay{more}")[0]
+    ...          for name, more in (("biased", ""), ("unbiased", "_with_noise"))]
+    >>> found = analyse_jointly(tests, rule="simc", known=Known(structure="fopdt"))
+    >>> found.model.model.structure, round(found.model.model.gain, 2)
+    ('fopdt', 1.65)
 
     :param records: the experiments, at least one; the first represents all in the result.
     :param method: one of ``JOINT_METHODS``.

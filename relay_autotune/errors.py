@@ -12,7 +12,15 @@ from typing import TypeVar
 
 
 class RelayAutotuneError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base of every error that the package raises on purpose.
+
+    >>> from relay_autotune import RelayAutotuneError, TransferFunction
+    >>> try:
+    ...     TransferFunction.fopdt(0.0, 20.0, 10.0)
+    ... except RelayAutotuneError as error:
+    ...     print(error)
+    the gain of a transfer function must not be zero
+    """
 
 
 class ModelError(RelayAutotuneError, ValueError):

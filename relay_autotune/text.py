@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _MINUS, _TIMES = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}"
 _SPACE = r" \, "
+# Half a unit of the fourth digit of 9999, the finest of four digits.
+_FINEST = 5e-5
 
 # Coefficients of 1, s, s^2 of one factor.
 _Polynomial = tuple[float, ...]
@@ -44,6 +46,21 @@ def duration(seconds: float) -> str:
         return f"{minutes} min {rest} s" if rest else f"{minutes} min"
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min"
+
+
+def plus_minus(value: float, half: float) -> str:
+    """Return the half width of an interval, such as ``± 0.12``; empty if it is not known.
+
+    Below the digits that are shown of the value it would tell of rounding, not of accuracy.
+
+    :param value: in the middle.
+    :param half: half the width.
+    """
+    if not math.isfinite(half):
+        return ""
+    if half < _FINEST * abs(value):
+        return f"± less than {100.0 * _FINEST:g} %"
+    return f"± {digits(half, 2)}"
 
 
 def date_text(start: float) -> str:

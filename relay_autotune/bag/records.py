@@ -22,6 +22,12 @@ def read_records(
 ) -> tuple[Record, ...]:
     """Return the experiments in a recording.
 
+    >>> from relay_autotune import read_records
+    >>> read_records("bags/heater.csv")
+    (<Record: 450 samples over 898 s, recorded elsewhere>,)
+    >>> (record,) = read_records("bags/step_test", measurement="/reactor/temperature",
+    ...                          command="/reactor/heater")
+
     :param path: a rosbag2 directory, an MCAP file, or a CSV file with a header line.
     :param measurement: topic or column of the measurement; None: found.
     :param command: topic or column of the command; None: found.

@@ -15,7 +15,7 @@ from relay_autotune.cli.layout import WIDEST, labelled
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.text import date_text, digits, process_text
+from relay_autotune.text import date_text, digits, plus_minus, process_text
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 # Rivals beyond these are told in the JSON document alone.
 _RIVALS = 3
-# An interval is told as a number down to this share of its value; below it all digits shown hold.
-_FINEST = 5e-5
 
 # What stands beside each other on a line: a label and a text, whose parts are three blanks apart.
 _Entry = tuple[str, str]
@@ -171,7 +169,7 @@ def _identification(found: Identification) -> list[_Entry]:
         ("ultimate freq.", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
     ):
         if math.isfinite(value):
-            lines.append(_row(label, value, unit, _plus_minus(value, NORMAL_95 * std)))
+            lines.append(_row(label, value, unit, plus_minus(value, NORMAL_95 * std)))
     lines += _known_all_the_same(found)
     lines.append(("fit", _fit(found)))
     if found.validation is not None:
@@ -293,15 +291,6 @@ def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
     for warning in gains.warnings:
         lines.append(("  warning", warning))
     return lines
-
-
-def _plus_minus(value: float, half: float) -> str:
-    """Return the half width of an interval; what no digit shows is rounding, not accuracy."""
-    if not math.isfinite(half):
-        return ""
-    if half < _FINEST * abs(value):
-        return f"± less than {100.0 * _FINEST:g} %"
-    return f"± {digits(half, 2)}"
 
 
 def _row(label: str, value: float, unit: str, interval: str) -> _Entry:

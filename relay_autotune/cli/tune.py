@@ -22,8 +22,7 @@ from relay_autotune.cli.layout import width
 from relay_autotune.errors import SelectionError, TuningError
 
 if TYPE_CHECKING:
-    from relay_autotune.process.transfer_function import TransferFunction
-    from relay_autotune.tuning import DesignOptions, DesignTask, Gains, Performance
+    from relay_autotune.tuning import DesignTask, Gains, Performance
     from relay_autotune.tuning.compensators import Compensator
 
 PROGRAM = "tune"
@@ -121,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace) -> int:
     from relay_autotune.cli.tune_model import model_of
-    from relay_autotune.tuning import DEFAULT_RULE, RULES
+    from relay_autotune.tuning import DEFAULT_RULE, RULES, task_of_model
 
     if options.output is not None and options.export is None:
         raise SelectionError("--output is for --export: say what to write")
@@ -130,29 +129,10 @@ def _run(options: argparse.Namespace) -> int:
     rule = options.rule or DEFAULT_RULE
     if rule not in RULES:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
-    task = _task(model_of(options), design_options(options))
+    task = task_of_model(model_of(options), design_options(options))
     if options.table:
         return _side_by_side(task, rule, options)
     return _one(task, rule, options)
-
-
-def _task(model: TransferFunction, asked: DesignOptions) -> DesignTask:
-    """Return the task; what a record would add to the model is computed from the model."""
-    from relay_autotune.tuning import DesignTask
-    from relay_autotune.tuning.rules.applicability import is_first_order
-    from relay_autotune.tuning.rules.limit_cycle import describing_point_of
-    from relay_autotune.tuning.rules.step_response import two_point_fopdt
-
-    simple = None
-    if not is_first_order(model):
-        try:
-            simple = two_point_fopdt(model)
-        except TuningError:
-            # Rules for FOPDT will then say that the model is not one.
-            simple = None
-    return DesignTask(
-        model=model, options=asked, simple=simple, describing=describing_point_of(model)
-    )
 
 
 def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a notebook shows of an analysis that stands at the end of a cell."""
+"""What a notebook or an interpreter shows of an analysis that stands at the end of a cell."""
 
 from __future__ import annotations
 
@@ -10,12 +10,34 @@ import math
 from typing import TYPE_CHECKING
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.text import digits, process_mathml
+from relay_autotune.text import digits, plus_minus, process_mathml, process_text
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
     from relay_autotune.identification import Identification
     from relay_autotune.loop.gains import Gains
+
+
+def analysis_text(analysis: Analysis) -> str:
+    """Return model, verdict and gains on ten lines at most.
+
+    :param analysis: of a record.
+    """
+    rows: list[tuple[str, str]] = []
+    found = analysis.model
+    if found is not None:
+        name = f"{found.structure}, {found.method}"
+        rows += [("process", f"{process_text(found.model)}   ({name})"), *_accuracy(found)]
+        if found.warnings:
+            rows.append(("warnings", f"{len(found.warnings)}, in .model.warnings"))
+    if analysis.judgement.judged:
+        rows.append(("verdict", analysis.verdict.name.lower()))
+    if analysis.best_gains is not None:
+        rows += [row for row in _gains_rows(analysis.best_gains) if row[0] != "parallel form"]
+    if analysis.reason:
+        rows.append(("reason", analysis.reason))
+    lines = [f"  {label:<9} {text}" for label, text in rows]
+    return "\n".join([f"<Analysis of {analysis.record!r}", *lines]) + ">"
 
 
 def analysis_html(analysis: Analysis) -> str:
@@ -24,8 +46,11 @@ def analysis_html(analysis: Analysis) -> str:
     :param analysis: of a record; what a record says, such as a reason, is escaped.
     """
     rows = []
-    if analysis.model is not None:
-        rows += _model_rows(analysis.model)
+    found = analysis.model
+    if found is not None:
+        name = html.escape(f"{found.structure}, {found.method}")
+        rows += [("process", f"{process_mathml(found.model)} {name}"), *_accuracy(found)]
+        rows += [("warning", html.escape(text)) for text in found.warnings]
     if analysis.best_gains is not None:
         rows += _gains_rows(analysis.best_gains)
     if analysis.reason:
@@ -38,17 +63,16 @@ def analysis_html(analysis: Analysis) -> str:
     return f"<table>{cells}</table>"
 
 
-def _model_rows(found: Identification) -> list[tuple[str, str]]:
-    name = html.escape(f"{found.structure}, {found.method}")
-    rows = [("process", f"{process_mathml(found.model)} {name}")]
+def _accuracy(found: Identification) -> list[tuple[str, str]]:
+    """Return K_u and w_u with half the widths of their 95 % intervals."""
+    rows = []
     for title, value, std, unit in (
         ("K_u", found.ultimate_gain, found.ultimate_gain_std, "u/y"),
         ("w_u", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
     ):
         if math.isfinite(value):
-            interval = f" ± {digits(NORMAL_95 * std, 2)}" if math.isfinite(std) else ""
-            rows.append((title, f"{digits(value)}{interval} {unit}"))
-    rows += [("warning", html.escape(text)) for text in found.warnings]
+            interval = plus_minus(value, NORMAL_95 * std)
+            rows.append((title, f"{digits(value)} {unit} {interval}".rstrip()))
     return rows
 
 

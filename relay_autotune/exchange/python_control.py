@@ -20,6 +20,12 @@ PADE_ORDER = 5
 def to_control(system: TransferFunction | Controller, *, pade_order: int = PADE_ORDER) -> Any:
     """Return a model, or a controller from error to command, as `control.TransferFunction`.
 
+    >>> from relay_autotune import Controller, TransferFunction, to_control
+    >>> loop = to_control(TransferFunction.fopdt(1.65, 20.0, 10.0))
+    >>> loop = loop * to_control(Controller(kc=0.6, ti=20.0))
+    >>> loop.ninputs, loop.noutputs
+    (1, 1)
+
     A rational function cannot hold a dead time D: it becomes a Pade approximation, all-pass, whose
     phase is that of the dead time up to about ``w = n/D`` rad/s for the order n (within 0.03 rad
     for n = 2, 0.003 rad for n = 5). A controller's set-point weight has no place in it.

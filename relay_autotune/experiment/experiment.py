@@ -40,6 +40,19 @@ _BASELINE = SafePolicy()
 class RelayExperiment:
     """Run one relay experiment: call :meth:`step` for each measurement and send its command.
 
+    >>> from relay_autotune import (
+    ...     ExperimentParameters, RelayExperiment, TransferFunction, VirtualProcess)
+    >>> oven = VirtualProcess(
+    ...     TransferFunction.fopdt(1.65, 20.0, 10.0), rest_measurement=40.0, rest_command=2.0)
+    >>> test = RelayExperiment(ExperimentParameters(amplitude=1.0), baseline=2.0)
+    >>> t = 0.0
+    >>> while not test.finished:
+    ...     oven.command(test.step(t, oven.measure(t)))
+    ...     t += 0.2
+    >>> test.outcome.name, test.cycle_count
+    ('COMPLETED', 3)
+    >>> record = test.record()
+
     :mod:`relay_autotune.experiment.procedure` has the states. In any state, :meth:`abort` and a
     measurement outside its limits end the experiment as ABORTED; an unusable sample, a frozen
     sensor and max_duration end it as FAILED. Bad data raise no exception: :attr:`reason` says why

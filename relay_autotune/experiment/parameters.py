@@ -14,7 +14,12 @@ from relay_autotune.quantities import check, declared, quantity
 
 @dataclass(frozen=True)
 class ExperimentParameters:
-    """What the user may set of a relay experiment."""
+    """What the user may set of a relay experiment.
+
+    >>> from relay_autotune import ExperimentParameters
+    >>> ExperimentParameters(amplitude=1.0, measurement_min=30.0, measurement_max=50.0).bias_ratio
+    0.3
+    """
 
     amplitude: float = quantity(
         0.0,

@@ -22,7 +22,7 @@ from relay_autotune.identification.waveform.method import (
     identify_waveform,
     identify_waveform_jointly,
 )
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import Record, one_record
 
 Method = Callable[[Record, Known], Identification]
 JointMethod = Callable[[Sequence[Record], Known], Identification]
@@ -75,12 +75,19 @@ def identify(
 ) -> Identification:
     """Identify a model from a record.
 
+    >>> from relay_autotune import Known, identify, read_records
+    >>> (record,) = read_records("bags/heater.csv")
+    >>> found = identify(record, known=Known(structure="fopdt"))
+    >>> dict(zip(found.parameters, found.values.round(1).tolist()))
+    {'gain': 0.6, 'time_constant': 110.2, 'dead_time': 15.9}
+
     :param record: the experiment.
     :param method: one of ``METHODS``.
     :param known: what is known of the process beforehand.
     :raises IdentificationError: if the method is unknown or the record does not tell a model.
+    :raises RecordError: if the record is none.
     """
-    return method_named(method)(record, known)
+    return method_named(method)(one_record(record, "identify"), known)
 
 
 def identify_jointly(

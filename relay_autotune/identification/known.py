@@ -20,6 +20,11 @@ _MOST_LAGS = 20
 class Known:
     """Facts about the process that a method may need and a record may not tell.
 
+    >>> from relay_autotune import Known
+    >>> facts = Known(gain=1.65, structure="fopdt")
+    >>> facts.gain, facts.structure
+    (1.65, 'fopdt')
+
     :raises ParameterError: if a value is out of its range, or the gain is zero.
     """
 

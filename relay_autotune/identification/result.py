@@ -20,6 +20,7 @@ from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import told
+from relay_autotune.text import process_text
 
 FloatArray = NDArray[np.float64]
 
@@ -73,9 +74,16 @@ class Rival:
         return self.estimate.model
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identification:
     """A model identified by one method, with what is known of its accuracy.
+
+    >>> from relay_autotune import Known, identify, read_records
+    >>> found = identify(read_records("bags/heater.csv")[0], known=Known(structure="fopdt"))
+    >>> found
+    <Identification: 0.6204 e^(-15.89 s) / (1 + 110.2 s)   (fopdt, waveform)>
+    >>> found.parameters, found.undetermined
+    (('gain', 'time_constant', 'dead_time'), ())
 
     The integrated error is ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the model
     that counts (Thyagarajan and Yu 2003, eqs 29 and 30).
@@ -146,6 +154,10 @@ class Identification:
     # Models on which gains have to hold, too: of the halves of the record where they differ by
     # more than chance, and plain ones that simulate it nearly as well.
     parts: tuple[TransferFunction, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the model on one line; the fields have the rest."""
+        return f"<Identification: {process_text(self.model)}   ({self.structure}, {self.method})>"
 
     @property
     def model(self) -> TransferFunction:

@@ -48,6 +48,13 @@ def simulate_closed_loop(
 ) -> ClosedLoop:
     """Run a controller at its sampling period; the process is exact between samples.
 
+    >>> from relay_autotune import Controller, TransferFunction, simulate_closed_loop
+    >>> oven = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    >>> run = simulate_closed_loop(
+    ...     Controller(kc=0.6, ti=20.0), oven, period=0.5, duration=300.0, setpoint=1.0)
+    >>> print(f"{run.measurement[-1]:.3f} y, {run.command[-1]:.3f} u")
+    1.000 y, 0.606 u
+
     :param controller: PI or PID gains, which :class:`SampledPid` runs, or any other controller of
         this period, at rest.
     :param model: the process, at rest, without the half period that a design adds to it.

@@ -24,6 +24,13 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 class Controller:
     r"""A PI or PID controller in ISA form with a second-order filter on the measurement.
 
+    >>> from relay_autotune import Controller
+    >>> controller = Controller(kc=0.6, ti=20.0, td=4.0)
+    >>> print(controller)
+    kc = 0.6, ti = 20 s, td = 4 s
+    >>> print(f"p {controller.p:g} u/y, i {controller.i:g} u/(y s), d {controller.d:g} u s/y")
+    p 0.6 u/y, i 0.03 u/(y s), d 2.4 u s/y
+
     ``u = kc (b r - yf + (1/ti) int (r - yf) dt - td dyf/dt)``, with
     ``yf = y/(1 + tf s + (tf s)^2/2)``; error = set-point - measurement.
 
@@ -203,7 +210,15 @@ class Performance:
 
 @dataclass(frozen=True, kw_only=True)
 class Gains(Performance, Controller):
-    """The controller that one rule gives, with what it does on the identified model."""
+    """The controller that one rule gives, with what it does on the identified model.
+
+    >>> from relay_autotune import TransferFunction, tune
+    >>> gains = tune(TransferFunction.fopdt(1.65, 20.0, 10.0), rule="imc")
+    >>> print(gains)
+    kc = 0.8913, ti = 25 s
+    >>> print(f"Ms {gains.ms:.2f}, gain margin {gains.gain_margin:.2f}")
+    Ms 1.95, gain margin 2.25
+    """
 
     rule: str = told("", "Name in the registry.", after="", word=True, column=1)
     form: str = told("", "Form in which the rule is stated.", "isa", after="rule")

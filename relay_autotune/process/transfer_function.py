@@ -47,6 +47,12 @@ def _real_product(constants: Sequence[complex]) -> NDArray[np.float64]:
 class TransferFunction:
     r"""A process in time-constant form.
 
+    >>> from relay_autotune import TransferFunction
+    >>> print(TransferFunction.fopdt(gain=1.65, time_constant=20.0, dead_time=10.0))
+    1.650 e^(-10.00 s) / (1 + 20.00 s)
+    >>> print(TransferFunction(0.5, time_constants=(3.0,), integrators=1, dead_time=1.0))
+    0.5000 e^(-1.000 s) / (s (1 + 3.000 s))
+
     ``G(s) = gain prod(1 + z s) / (s^integrators prod(1 + T s)) exp(-dead_time s)``.
 
     Right-half-plane zeros and poles have constants with a negative real part; complex ones come

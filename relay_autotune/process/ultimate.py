@@ -48,6 +48,11 @@ class _Crossing:
 def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
     """Return the gain at which stability ends; None if it never ends, or no gain stabilises.
 
+    >>> from relay_autotune import TransferFunction, ultimate_point
+    >>> point = ultimate_point(TransferFunction.fopdt(1.65, 20.0, 10.0))
+    >>> print(f"K_u {point.gain:.4g} u/y at w_u {point.frequency:.4g} rad/s")
+    K_u 2.307 u/y at w_u 0.1837 rad/s
+
     All frequencies at which the phase is an odd multiple of -180 degrees follow from the
     continuous phase, so that neither a large dead time nor a resonance hides one. Raising the
     gain through such a point moves a pair of closed-loop poles to the right if the phase falls

@@ -20,6 +20,10 @@ from relay_autotune.process.transfer_function import TransferFunction
 class Disturbances:
     """Disturbances of a process.
 
+    >>> from relay_autotune import Disturbances
+    >>> Disturbances(noise_std=0.02, load_time=60.0, load_size=0.5).load_size
+    0.5
+
     :param noise_std: standard deviation of white Gaussian noise on each sample [y], >= 0.
     :param quantisation: step of the sensor's resolution [y], >= 0; 0: none.
     :param load_time: instant of a load step, which adds to the actuator's position [s], >= 0.
@@ -46,6 +50,12 @@ class Disturbances:
 
 class VirtualProcess:
     """A process that rests at its operating point until it is commanded.
+
+    >>> from relay_autotune import TransferFunction, VirtualProcess
+    >>> tank = VirtualProcess(TransferFunction.fopdt(0.8, 12.0, 3.0), rest_measurement=61.0)
+    >>> tank.command(10.0)
+    >>> [round(tank.measure(t), 2) for t in (3.0, 15.0, 100.0)]
+    [61.0, 66.06, 69.0]
 
     :param model: the process.
     :param rest_measurement: measurement at the operating point, y0 [y].

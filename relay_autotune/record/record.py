@@ -31,6 +31,26 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
+def one_record(given: object, caller: str) -> Record:
+    """Return what was given, if it is a record.
+
+    :param given: to a function for one record.
+    :param caller: name of that function, for the message.
+    :raises RecordError: if it is something else, such as the tuple of ``read_records``.
+    """
+    if isinstance(given, Record):
+        return given
+    if isinstance(given, tuple | list) and all(isinstance(each, Record) for each in given):
+        raise RecordError(
+            f"{caller} takes one record, found a {type(given).__name__} of {len(given)}: give "
+            f"one of them, such as records[0], or all tests of one process to analyse_jointly"
+        )
+    raise RecordError(
+        f"{caller} takes a Record, found {type(given).__name__}: make one with read_records, or "
+        "with Record(time=..., measurement=..., command=...)"
+    )
+
+
 def asked_once(
     question: Callable[Concatenate[Record, _P], _T],
 ) -> Callable[Concatenate[Record, _P], _T]:
@@ -62,7 +82,12 @@ def roughness(y: FloatArray) -> float:
 
 
 class Outcome(enum.IntEnum):
-    """How an experiment ended; the values are those of RelayExperiment.msg."""
+    """How an experiment ended; the values are those of RelayExperiment.msg.
+
+    >>> from relay_autotune import Outcome
+    >>> [outcome.name for outcome in Outcome]
+    ['UNKNOWN', 'COMPLETED', 'ABORTED', 'FAILED']
+    """
 
     UNKNOWN = 0
     COMPLETED = 1
@@ -73,6 +98,11 @@ class Outcome(enum.IntEnum):
 @dataclass(frozen=True)
 class RelaySettings:
     """The relay's settings in an experiment.
+
+    >>> from relay_autotune import RelaySettings
+    >>> relay = RelaySettings(setpoint=40.0, baseline=2.0, amplitude=1.0, bias=0.5)
+    >>> relay.low, relay.high
+    (1.5, 3.5)
 
     The command is ``baseline + bias + amplitude`` (high) or ``baseline + bias - amplitude``
     (low); a direct-acting relay goes low when the measurement rises to
@@ -148,6 +178,11 @@ class Cycle(CycleFeatures):
 @dataclass(frozen=True)
 class PiecewiseConstant:
     """A signal that holds ``values[k]`` from ``times[k]`` on, and ``initial`` before ``times[0]``.
+
+    >>> from relay_autotune import PiecewiseConstant
+    >>> valve = PiecewiseConstant(times=[10.0, 20.0], values=[3.0, 1.0], initial=2.0)
+    >>> valve([0.0, 10.0, 25.0]).tolist()
+    [2.0, 3.0, 1.0]
 
     :param times: instants of change, strictly increasing [s], shape (m,).
     :param values: level from each instant on, shape (m,).
@@ -260,9 +295,13 @@ class Unthinned:
     remark: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Record:
     """The immutable record of one experiment.
+
+    >>> from relay_autotune import Record
+    >>> Record(time=[0.0, 0.5, 1.0], measurement=[40.0, 40.2, 40.1], command=[2.0, 3.0, 3.0])
+    <Record: 3 samples over 1 s, recorded elsewhere>
 
     ``command[i]`` is the answer to ``measurement[i]``; it was sent at ``command_time[i]`` and
     held until the next one.
@@ -362,6 +401,14 @@ class Record:
 
     def __len__(self) -> int:
         return int(self.time.size)
+
+    def __repr__(self) -> str:
+        """Return what the record is, on one line; its samples are in its fields."""
+        name = f" of {self.experiment_id}" if self.experiment_id else ""
+        how = (
+            "recorded elsewhere" if self.outcome is Outcome.UNKNOWN else self.outcome.name.lower()
+        )
+        return f"<Record{name}: {len(self)} samples over {self.duration:.4g} s, {how}>"
 
     @property
     def duration(self) -> float:

@@ -38,6 +38,10 @@ def draw(
 ) -> None:
     """Draw an experiment, the fit over it and the predicted closed loop, in one picture.
 
+    >>> from relay_autotune import analyse, draw, read_records
+    >>> (record,) = read_records("bags/heater.csv")
+    >>> draw(analyse(record), "heater.png", title="Heater")
+
     :param analysis: of the record.
     :param path: the picture; its ending says the format (.png, .svg, .pdf).
     :param title: title of the picture.
@@ -68,6 +72,10 @@ def write_report(
     truth: TransferFunction | None = None,
 ) -> None:
     """Write the report of one or several analysed records as one HTML file.
+
+    >>> from relay_autotune import analyse, read_records, write_report
+    >>> (record,) = read_records("bags/heater.csv")
+    >>> write_report(analyse(record), "heater.html", title="Heater")
 
     :param analyses: at least one.
     :param path: the file.

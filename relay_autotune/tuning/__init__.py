@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from relay_autotune.errors import TuningError, look_up
 from relay_autotune.identification.result import Identification
@@ -16,6 +17,9 @@ from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
+from relay_autotune.tuning.rules.applicability import is_first_order
+from relay_autotune.tuning.rules.limit_cycle import describing_point_of
+from relay_autotune.tuning.rules.step_response import two_point_fopdt
 from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
@@ -35,6 +39,7 @@ __all__ = [
     "ensemble",
     "is_stable",
     "rule_named",
+    "task_of_model",
     "tune",
 ]
 
@@ -48,8 +53,8 @@ def rule_named(name: str) -> Rule:
 
 
 def tune(
-    identification: Identification,
-    rule: str,
+    identification: Identification | TransferFunction,
+    rule: str = DEFAULT_RULE,
     models: Sequence[TransferFunction] = (),
     simple: TransferFunction | None = None,
     options: DesignOptions | None = None,
@@ -57,7 +62,17 @@ def tune(
 ) -> Gains:
     """Return the gains of a rule, judged on the model and on models within its uncertainty.
 
-    :param identification: the model and its uncertainty.
+    >>> from relay_autotune import DesignOptions, TransferFunction, tune
+    >>> oven = TransferFunction.fopdt(gain=1.65, time_constant=20.0, dead_time=10.0)
+    >>> gains = tune(oven, rule="simc")
+    >>> print(gains)
+    kc = 0.6061, ti = 20 s
+    >>> f"Ms {gains.ms:.2f}"
+    'Ms 1.59'
+    >>> print(tune(oven, options=DesignOptions(ms=1.6, controller="pi")))
+    kc = 0.571, ti = 17.61 s
+
+    :param identification: the model, as it was identified, or a transfer function.
     :param rule: one of ``RULES``.
     :param models: models within the uncertainty, from :func:`ensemble`.
     :param simple: the FOPDT that fits best; a rule for FOPDT designs on it if the model has
@@ -67,14 +82,38 @@ def tune(
     :raises TuningError: if the rule does not apply, or its loop is unstable on the model or on
         more than 5 % of ``models``.
     """
-    task = DesignTask(
-        model=identification.model,
-        options=options or DesignOptions(),
-        simple=simple,
+    if isinstance(identification, TransferFunction):
+        task = task_of_model(identification, options)
+    else:
+        task = DesignTask(model=identification.model, options=options or DesignOptions())
+    task = replace(
+        task,
+        simple=simple or task.simple,
         models=tuple(models),
-        describing=describing,
+        describing=describing or task.describing,
     )
     return design(task, rule)
+
+
+def task_of_model(model: TransferFunction, options: DesignOptions | None = None) -> DesignTask:
+    """Return the design task for a model alone; what a record would add is computed from it.
+
+    :param model: the process.
+    :param options: what is asked of the controller.
+    """
+    simple = None
+    if not is_first_order(model):
+        try:
+            simple = two_point_fopdt(model)
+        except TuningError:
+            # Rules for FOPDT will then say that the model is not one.
+            simple = None
+    return DesignTask(
+        model=model,
+        options=options or DesignOptions(),
+        simple=simple,
+        describing=describing_point_of(model),
+    )
 
 
 def design(task: DesignTask, rule: str) -> Gains:

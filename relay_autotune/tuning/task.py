@@ -28,6 +28,11 @@ MT_SELF_REGULATING, MT_INTEGRATING = 1.4, 1.26
 class DesignOptions:
     """Options of a design, the same for every rule; each rule reads what it needs.
 
+    >>> from relay_autotune import DesignOptions
+    >>> options = DesignOptions(controller="pi", ms=1.6, sample_period=0.1)
+    >>> options.ms, options.added_delay
+    (1.6, 0.05)
+
     :raises TuningError: if a value is out of its range.
     """
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 import importlib
 import io
 import sys
+from dataclasses import replace
 
 import pytest
-from made_bags import REPOSITORY
+from analysed import completed
 
-from relay_autotune.cli import arguments, layout, replay, tune
+from relay_autotune.cli import arguments, layout, tune
+from relay_autotune.cli.table import table
 
 COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag")
 
@@ -25,25 +27,26 @@ def test_the_help_of_a_command_fits_80_columns(name, monkeypatch, capsys):
     assert max(capsys.readouterr().out.splitlines(), key=len)[80:] == ""
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        (tune, "--gain", "1.65", "--time-constants", "20", "--dead-time", "10", "--table"),
-        (replay, "--rule", "imc", str(REPOSITORY / "bags" / "step_test")),
-    ],
-    ids=["tune", "replay"],
-)
-def test_results_fit_the_terminal_and_no_word_is_broken(command, monkeypatch, capsys):
-    module, *words = command
+def check_widths(printed):
+    """See that text for 80 and for 99 columns has these widths, and the same words."""
+    for columns, text in printed.items():
+        assert max(text.splitlines(), key=len)[columns:] == ""
+    assert printed[80] != printed[99]
+    assert printed[80].split() == printed[99].split()
+
+
+def test_the_result_of_a_recording_fits_the_terminal_and_no_word_is_broken():
+    found = replace(completed(), reason="the file /home/somebody/of-a-tank.csv says so " * 3)
+    check_widths({columns: table("bag", [found], columns) for columns in (80, 99)})
+
+
+def test_the_rules_side_by_side_fit_the_terminal(monkeypatch, capsys):
     printed = {}
     for columns in (80, 99):
         monkeypatch.setenv("COLUMNS", str(columns))
-        assert module.main(words) == 0
+        assert tune.main(["--gain", "1.65", "--time-constants", "20", "--table"]) == 0
         printed[columns] = capsys.readouterr().out
-        longest = max((line for line in printed[columns].splitlines()), key=len)
-        assert longest[columns:] == ""
-    assert printed[80] != printed[99]
-    assert printed[80].split() == printed[99].split()
+    check_widths(printed)
 
 
 class Terminal(io.StringIO):
