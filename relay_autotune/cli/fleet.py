@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import multiprocessing
 import os
-import signal
+import threading
 import uuid
 from asyncio import CancelledError as TaskCancelledError
 from collections.abc import Callable, Iterator, Sequence
@@ -21,8 +20,6 @@ from relay_autotune.cli.replay_bag import Done, Job, died, work
 from relay_autotune.errors import BagError
 
 _CONNECT_S = 10.0
-# Option of Linux's prctl: the signal that a process gets when its parent ends.
-_PR_SET_PDEATHSIG = 1
 _PRELOADED = [
     f"relay_autotune.{name}"
     for name in ("threads", "analysis", "bag.reader", "cli.replay_bag", "exchange.document")
@@ -76,16 +73,18 @@ def _pool(count: int) -> ProcessPoolExecutor:
 
 
 def _end_with_the_command() -> None:
-    """Let the kernel end this process when its parent ends.
+    """Let this process end when the command ends, whichever signal ended that.
 
-    The parent ends with the command, whichever signal ended that; without it a worker would wait
-    for work forever.
+    Without it a worker would go on, or wait for work forever.
     """
-    parent = os.getppid()
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0 or os.getppid() != parent:
-        # The parent has ended already, or the system does not support this.
+    command = multiprocessing.parent_process()
+    assert command is not None, "this is a worker"
+
+    def watch() -> None:
+        command.join()
         os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[tuple[int, Done]]:

@@ -1,10 +1,14 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Each benchmark runs and prints its table; what it measures is not judged here."""
+"""Each benchmark runs and prints its table; what it measures is not judged here.
+
+The runs are nightly ones: they take minutes and prove the benchmarks, not the package.
+"""
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import subprocess
@@ -49,6 +53,13 @@ QUICK = {
 }
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
+def test_it_finds_what_it_imports(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(path.parent)
+    importlib.import_module(path.stem)
+
+
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", QUICK)
 def test_it_prints_its_table(name: str) -> None:
     done = subprocess.run(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import importlib.util
 import json
 import os
 import signal
@@ -21,7 +22,7 @@ from fleet_work import die_of_bag_3, die_once, mark, wait_for_ever
 from made_bags import REPOSITORY
 
 from relay_autotune.bag.reader import Selection
-from relay_autotune.cli import replay
+from relay_autotune.cli import fleet, replay
 from relay_autotune.cli.fleet import in_processes, on_cluster
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.cli.results import COLUMNS, Results, rows
@@ -299,3 +300,8 @@ def test_a_table_of_somebody_else_is_not_overwritten(tmp_path, capsys):
     assert "name another file" in err
     assert output.read_text() == "my,own,table\n"
     assert not Path(f"{output}.jsonl").exists()
+
+
+def test_what_is_loaded_before_the_first_job_exists():
+    # The standard library passes over a name that cannot be imported.
+    assert all(importlib.util.find_spec(name) for name in fleet._PRELOADED)
