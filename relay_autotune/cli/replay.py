@@ -19,6 +19,13 @@ from relay_autotune.cli.design_arguments import add_export, export_target
 from relay_autotune.cli.layout import width
 from relay_autotune.cli.progress import ProgressLine
 from relay_autotune.cli.replay_bag import Done, Job, replay
+from relay_autotune.cli.report import (
+    add_present,
+    as_asked,
+    check_output,
+    command_line,
+    write_report,
+)
 from relay_autotune.errors import SelectionError
 
 if TYPE_CHECKING:
@@ -58,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     options = _parser().parse_args(arguments)
+    options.command_line = command_line(PROGRAM, arguments)
     import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
 
     return guarded(PROGRAM, lambda: _run(options))
@@ -76,6 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--report", metavar="FILE", help="also write a report: .html, or a .png, .svg or .pdf"
     )
+    add_present(parser)
     parser.add_argument(
         "--output", metavar="FILE",
         help="write results as they come to a .jsonl, .csv or .parquet file instead; "
@@ -102,8 +111,6 @@ def _count(text: str) -> int:
 def _run(options: argparse.Namespace) -> int:
     jobs = _jobs(options)
     if options.report:
-        from relay_autotune.cli.report import check_output
-
         check_output(PROGRAM, options.report)
         if options.output or options.scheduler or options.jobs > 1:
             raise SelectionError("--report cannot be had with --output, --jobs or --scheduler")
@@ -118,10 +125,10 @@ def _run(options: argparse.Namespace) -> int:
         status = worst(status, done.status)
         analyses += [(done.name, analysis) for analysis in found]
     if options.report and analyses:
-        from relay_autotune.cli.report import write_report
         from relay_autotune.report.case import case_of
 
-        write_report([case_of(analysis, name) for name, analysis in analyses], options.report)
+        cases = [case_of(analysis, name) for name, analysis in analyses]
+        write_report(as_asked(cases, options), options.report)
     return status
 
 

@@ -6,16 +6,19 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, guarded, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
 from relay_autotune.cli.replay_bag import Job, analysed
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 
 if TYPE_CHECKING:
@@ -48,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     options = _parser().parse_args(arguments)
+    options.command_line = command_line(PROGRAM, arguments)
     import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
 
     return guarded(PROGRAM, lambda: _run(options))
@@ -70,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         "--format", choices=("png", "svg"), default="png", help="of these figures (%(default)s)"
     )
     parser.add_argument("--title", metavar="TEXT", default="", help="title of the report")
+    add_present(parser)
     add_analysis(parser)
     return parser
 
@@ -93,7 +98,7 @@ def _run(options: argparse.Namespace) -> int:
         if case.model is None:
             say(PROGRAM, f"{case.source}: nothing identified: {case.reason}")
             status = NOTHING_FOUND
-    write_report(cases, options.output, title=options.title)
+    write_report(as_asked(cases, options), options.output, title=options.title)
     print(options.output)
     if options.figures:
         try:
@@ -109,6 +114,43 @@ def _announce_figures(folder: str, kind: str) -> None:
     there = sorted(path.name for path in Path(folder).glob(f"*.{kind}"))
     if there:
         say(PROGRAM, f"{folder} has figures already; those of the same name are replaced")
+
+
+def add_present(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the gains that a report compares with the new ones.
+
+    :param parser: of the command.
+    """
+    parser.add_argument(
+        "--present", nargs=3, type=finite, metavar=("KC", "TI", "TD"),
+        help="gains in the controller now, for comparison in the report [u/y, s, s]; TI 0: P",
+    )  # fmt: skip
+
+
+def command_line(program: str, arguments: Sequence[str] | None) -> str:
+    """Return a command as it can be typed again.
+
+    :param program: name of the command.
+    :param arguments: what was given to its main function.
+    """
+    return shlex.join([program, *(sys.argv[1:] if arguments is None else arguments)])
+
+
+def as_asked(cases: Sequence[Case], options: argparse.Namespace) -> list[Case]:
+    """Return cases with what only the command line knows: present gains, and itself.
+
+    :param cases: of the report.
+    :param options: with those of :func:`add_present`, and the command line.
+    :raises SelectionError: if the present gains cannot be.
+    """
+    present = None
+    if options.present is not None:
+        kc, ti, td = options.present
+        try:
+            present = Controller(kc, ti, td)
+        except RelayAutotuneError as error:
+            raise SelectionError(f"--present: {error}") from error
+    return [replace(case, present=present, command=options.command_line) for case in cases]
 
 
 def check_output(program: str, output: str) -> None:

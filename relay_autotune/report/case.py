@@ -23,7 +23,7 @@ from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
-from relay_autotune.tuning import Gains, ensemble
+from relay_autotune.tuning import Controller, Gains, ensemble
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 FloatArray = NDArray[np.float64]
@@ -118,6 +118,8 @@ class Case:
     :param points: of the frequency response, by Fourier integrals over the cycles.
     :param added_delay: dead time that the controller's loop adds to the process [s].
     :param judgement: what the checks found, and the verdict.
+    :param present: the gains that are in the controller now; None: not known.
+    :param command: the command line that made the report; empty: not known.
     """
 
     source: str
@@ -140,6 +142,8 @@ class Case:
     points: tuple[FrequencyPoint, ...] = ()
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
+    present: Controller | None = None
+    command: str = ""
 
     @property
     def model(self) -> ModelCase | None:

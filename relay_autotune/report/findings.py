@@ -9,9 +9,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from relay_autotune.errors import TuningError
 from relay_autotune.record.record import Outcome
-from relay_autotune.report.case import Case
+from relay_autotune.report.case import Case, in_loop
 from relay_autotune.text import date_text, digits
+from relay_autotune.tuning import analyse_loop
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
@@ -79,6 +81,22 @@ class Number:
     text: str
 
 
+@dataclass(frozen=True)
+class Row:
+    """A number of the present gains beside that of the new ones.
+
+    :param name: what it is, with its unit.
+    :param present: of the present gains, as text.
+    :param new: of the new gains.
+    :param meaning: what to make of it.
+    """
+
+    name: str
+    present: str
+    new: str
+    meaning: str
+
+
 def verdict_of(case: Case) -> Chip:
     """Return the verdict on an experiment.
 
@@ -106,6 +124,93 @@ def facts_of(case: Case, *, with_id: bool) -> tuple[str, ...]:
         if case.lost_samples:
             length += f", {case.lost_samples} lost"
     return (*found, length)
+
+
+def steps_of(case: Case) -> tuple[str, ...]:
+    """Return what the reader is to do, in order.
+
+    :param case: the experiment.
+    """
+    gains = case.best_gains
+    if gains is None:
+        return (case.reason or "No gains were given, and no reason was recorded.",)
+    watch = "Make a small step of the set-point"
+    if math.isfinite(gains.overshoot) and math.isfinite(gains.settling_time):
+        watch += (
+            f": the measurement should overshoot by about {digits(100.0 * gains.overshoot, 2)} % "
+            f"and settle within {digits(gains.settling_time, 2)} s"
+        )
+    steps = (
+        "Write down the gains that the controller has now.",
+        "Type in the new gains, in the form that your controller has.",
+        f"{watch}.",
+        "If the loop swings, go back to the gains that you wrote down.",
+    )
+    if case.judgement.verdict is Verdict.DOUBTFUL:
+        return ('Check the points under "Read this first" before you use these gains.', *steps)
+    return steps
+
+
+def beside_present(case: Case) -> tuple[Row, ...]:
+    """Return the present gains beside the new ones, with what both do on the model.
+
+    :param case: the experiment; no rows where a model, gains or the present gains are missing.
+    """
+    new, present = case.best_gains, case.present
+    if case.model is None or new is None or present is None:
+        return ()
+    rows = [
+        Row("kc [u/y]", digits(present.kc), digits(new.kc), ""),
+        Row("ti [s]", digits(present.ti), digits(new.ti), ""),
+        Row("td [s]", digits(present.td), digits(new.td), ""),
+    ]
+    try:
+        now = analyse_loop(present, in_loop(case, case.model.model))
+    except TuningError:
+        unstable = "the present gains make the loop unstable on the model"
+        return (*rows, Row("Ms", "-", digits(new.ms, 3), unstable))
+    degrees = math.degrees
+    return (
+        *rows,
+        Row("Ms", digits(now.ms, 3), digits(new.ms, 3), "below 1.4 careful, above 2 risky"),
+        Row(
+            "phase margin [deg]",
+            digits(degrees(now.phase_margin), 3),
+            digits(degrees(new.phase_margin), 3),
+            "the larger, the calmer",
+        ),
+        Row(
+            "IAE after a load step [y s/u]",
+            digits(now.iae_load, 3),
+            digits(new.iae_load, 3),
+            "the smaller, the faster a load is compensated",
+        ),
+    )
+
+
+def repeats_of(case: Case) -> tuple[Number, ...]:
+    """Return how to make the same report, and the same test, again: names and commands.
+
+    :param case: the experiment.
+    """
+    found = [Number("The same report:", case.command)] if case.command else []
+    relay = case.settings
+    if relay is not None and relay.amplitude > 0.0:
+        values = {
+            "amplitude": relay.amplitude,
+            "baseline": relay.baseline,
+            "bias": relay.bias,
+            "hysteresis": relay.hysteresis,
+        }
+        # ROS reads 1 as an integer, and refuses it for a number
+        given = " ".join(
+            f"-p {name}:={float(f'{value:.6g}')!r}"
+            for name, value in values.items()
+            if value and math.isfinite(value)
+        )
+        command = f"ros2 run relay_autotune relay_node --ros-args {given}"
+        found.append(Number("The same relay in a live loop:", command))
+    return tuple(found)
 
 
 def warnings_of(case: Case) -> tuple[str, ...]:

@@ -21,15 +21,19 @@ from relay_autotune.report.findings import (
     Check,
     Chip,
     Number,
+    Row,
+    beside_present,
     checks_of,
     doubts_of,
     facts_of,
     numbers_of,
+    repeats_of,
+    steps_of,
     verdict_of,
     warnings_of,
 )
 from relay_autotune.report.style import COLOURS, inline
-from relay_autotune.text import digits, process_mathml, process_text
+from relay_autotune.text import digits, plus_minus, process_mathml, process_text
 
 # Colours of the page in dark mode; those of the figures come from COLOURS.
 _NIGHT = (
@@ -71,10 +75,13 @@ class _Section:
     verdict: str
     tone: str
     facts: tuple[str, ...]
+    steps: tuple[str, ...]
+    beside: tuple[Row, ...]
     warnings: tuple[str, ...]
     checks: tuple[Check, ...]
     numbers: tuple[Number, ...]
     doubts: tuple[str, ...]
+    repeats: tuple[Number, ...]
     plates: tuple[_Drawn, ...]
     left_out: tuple[str, ...]
 
@@ -100,6 +107,7 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
         "signed": lambda value: f"{value:+.2f}",
         "percent": lambda share: digits(100.0 * share, 2) if share * 100.0 >= 0.05 else "0",
         "known": math.isfinite,
+        "plus_minus": plus_minus,
         "process_text": process_text,
         "mathml": lambda model: Markup(process_mathml(model)),
     }
@@ -129,10 +137,13 @@ def _section(case: Case, number: int, many: bool) -> _Section:
         verdict=verdict.text,
         tone=verdict.tone,
         facts=facts_of(case, with_id=not many and not known),
+        steps=steps_of(case),
+        beside=beside_present(case),
         warnings=warnings_of(case),
         checks=checks_of(case),
         numbers=numbers_of(case),
         doubts=doubts_of(case),
+        repeats=repeats_of(case),
         plates=tuple(_drawn(p, case, f"e{number}", alone=alone) for p in present),
         left_out=tuple(f"{p.title}: {why}" for p in PLATES if (why := p.missing(case))),
     )

@@ -165,3 +165,16 @@ def test_an_earlier_report_is_replaced_with_a_word_and_the_page_of_another_never
     status, _, err = run(capsys, result, "-o", other)
     assert (status, "name another file" in err) == (2, True)
     assert "My tank" in other.read_text()
+
+
+def test_present_gains_and_the_command_are_in_the_report(
+    capsys, tmp_path, result, monkeypatch
+) -> None:
+    only(monkeypatch, "experiment")
+    page = tmp_path / "page.html"
+    run(capsys, result, "-o", page, "--present", "0.3", "20", "0")
+    text = page.read_text()
+    assert "Beside the present gains" in text
+    assert f"report {result} -o {page} --present 0.3 20 0" in text
+    status, _, err = run(capsys, result, "-o", page, "--present", "0", "20", "0")
+    assert (status, "--present" in err) == (2, True)

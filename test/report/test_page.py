@@ -21,10 +21,13 @@ from relay_autotune.exchange.models import model_fields
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Rival, identified
+from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import FOPDT, GivenModel, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.report.case import Case, case_of, true_value
+from relay_autotune.report.case import Case, case_of, in_loop, true_value
 from relay_autotune.report.figures import PLATES
+from relay_autotune.report.findings import beside_present
 from relay_autotune.report.from_document import cases_of_document, read_documents
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
@@ -129,6 +132,10 @@ def test_the_summary_has_the_gains_the_model_and_how_sure_they_are(whole: str) -
     assert f"kc {gains.kc:#.4g}" in text
     assert f"ti {gains.ti:#.4g}" in text
     assert f"Ms {gains.ms:.2f}" in text
+    assert "y stands for the unit of your measurement, u for that of your command" in text
+    order = ("What to do", "stands for the unit", "u/y", "Why", "Figures", "How to repeat it")
+    places = [text.index(part) for part in order]
+    assert places == sorted(places)
     for analysis_model in completed().models:
         assert analysis_model.method in text
     for each in completed().gains:
@@ -298,3 +305,40 @@ def test_the_truth_is_in_the_terms_of_the_structure() -> None:
     assert found[:3] == [2.0, 5.0, 0.5]
     assert np.isnan(found[3])
     assert np.isnan(true_value("gain", unstable, MODEL))
+
+
+def test_what_a_controller_may_lack_may_be_left_out(monkeypatch) -> None:
+    only(monkeypatch)
+    found = completed()
+    gains = replace(found.best_gains, kc=-2.814e-05, tf=0.01234, b=0.5)
+    text = read(page([case_of(replace(found, gains=(gains,), recommended=0), "tank")])).text
+    for told in ("kc -2.814e-05 u/y", "tf 0.01234 s", "b 0.5000"):
+        assert told in text
+    assert text.count("leave out where your controller has none") == 2
+    plain = replace(gains, tf=0.0, b=1.0)
+    text = read(page([case_of(replace(found, gains=(plain,), recommended=0), "tank")])).text
+    assert "leave out" not in text
+
+
+def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypatch) -> None:
+    only(monkeypatch)
+    case = case_of(completed(), "tank")
+    assert "Beside the present gains" not in read(page([case])).text
+    weak = Controller(0.5 * case.best_gains.kc, case.best_gains.ti)
+    rows = {row.name: row for row in beside_present(replace(case, present=weak))}
+    assert float(rows["kc [u/y]"].present) == pytest.approx(weak.kc, rel=1e-3)
+    expected = analyse_loop(weak, in_loop(case, case.model.model))
+    assert float(rows["Ms"].present) == pytest.approx(expected.ms, rel=1e-2)
+    assert float(rows["Ms"].new) == pytest.approx(case.best_gains.ms, rel=1e-2)
+    assert "Beside the present gains" in read(page([replace(case, present=weak)])).text
+    wild = replace(case, present=Controller(10.0 * case.best_gains.kc, 1.0))
+    assert "unstable" in beside_present(wild)[-1].meaning
+
+
+def test_it_says_how_to_repeat_the_report_and_the_test(monkeypatch) -> None:
+    only(monkeypatch)
+    case = replace(case_of(completed(), "tank"), command="report 'my bag' -o tune.html")
+    text = read(page([case])).text
+    assert "report 'my bag' -o tune.html" in text
+    relay = completed().record.settings
+    assert f"-p amplitude:={relay.amplitude!r} -p baseline:={relay.baseline!r}" in text
