@@ -47,6 +47,7 @@ setup(
             "plant_node = relay_autotune.start:plant_node",
             "controller_node = relay_autotune.start:controller_node",
             "tune_loop = relay_autotune.start:tune_loop",
+            "apply_gains = relay_autotune.start:apply_gains",
             "replay = relay_autotune.start:replay",
             "identify = relay_autotune.start:identify",
             "tune = relay_autotune.start:tune",

@@ -250,20 +250,12 @@ def next_commands(
         steps.append(("see every method and rule", f"{prefix}replay {bag}"))
     if result.gains.experiment_id:
         for name in controllers:
-            if result.verdict != Verdict.TRUSTED:
-                steps.append(
-                    (
-                        "allow doubtful gains",
-                        f"ros2 param set {name} accept_doubtful true",
-                    )
-                )
-            steps += [
-                ("put the gains in force", f"ros2 service call {name}/apply std_srvs/srv/Trigger"),
-                (
-                    "prove them with a step",
-                    f"ros2 action send_goal {name}/verify relay_autotune_msgs/action/Verify {{}}",
-                ),
-            ]
+            namespace, _, node = name.rpartition("/")
+            words = [f"{prefix}apply_gains"]
+            words += ["--namespace", namespace] if namespace else []
+            words += ["--node", node] if node != "controller_node" else []
+            words += ["--accept-doubtful"] if result.verdict != Verdict.TRUSTED else []
+            steps.append(("apply and verify the gains", " ".join(words)))
     return steps
 
 

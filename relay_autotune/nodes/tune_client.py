@@ -7,26 +7,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
+from contextlib import suppress
 from typing import Any
 
-import rclpy
 from action_msgs.msg import GoalStatus, GoalStatusArray
-from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
-from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
-from rclpy.signals import SignalHandlerOptions
-from rclpy.validate_namespace import validate_namespace
-from rclpy.validate_topic_name import validate_topic_name
 
-from relay_autotune.errors import LoopError, ParameterError
+from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import record_from_message, without_impossible
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayExperiment
@@ -44,7 +35,7 @@ _NOT_YET = (
 )
 
 
-class TuneClient:
+class TuneClient(LoopClient):
     """Ask one relay_node for one tune.
 
     :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
@@ -54,17 +45,7 @@ class TuneClient:
     """
 
     def __init__(self, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
-        try:
-            validate_namespace(f"/{namespace.strip('/')}")
-            validate_topic_name(f"{node}/tune")
-        except (InvalidNamespaceException, InvalidTopicNameException) as error:
-            text = str(error).splitlines()[0].rstrip(":")
-            raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
-        self._context = Context()
-        rclpy.init(
-            context=self._context, args=list(ros), signal_handler_options=SignalHandlerOptions.NO
-        )
-        self._node = Node("tune_loop", namespace=namespace or None, context=self._context)
+        super().__init__("tune_loop", namespace, node, ros)
         self._client = ActionClient(self._node, Tune, f"{node}/tune")
         self._alive = True
         self._node.create_subscription(
@@ -76,9 +57,6 @@ class TuneClient:
                 liveliness=self._on_liveliness, use_default_callbacks=False
             ),
         )
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self.name = self._node.resolve_service_name(node)
         self._feedback: list[Any] = []
         self._goal: Any = None
         self._answer: Any = None
@@ -86,19 +64,10 @@ class TuneClient:
         self.refused: set[str] = set()
         """Sentences on results that were received and refused."""
 
-    def __enter__(self) -> TuneClient:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Leave the graph."""
         self._client.destroy()
-        self._executor.shutdown(timeout_sec=0.0)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        super().close()
 
     def find(self, patience: float, *, needs_identifier: bool, leave: Callable[[], bool]) -> None:
         """Wait for the relay_node, and for the identifier_node if it is needed.
@@ -220,14 +189,12 @@ class TuneClient:
         :raises RelayAutotuneError: if they are no record.
         """
         wanted = self.result.experiment.experiment_id
-        came: list[Any] = []
-        self._node.create_subscription(
-            RelayExperiment, self._resolved("relay_experiment"), came.append, quality.latched(10)
+        found = self.latched(
+            RelayExperiment, "relay_experiment", lambda m: m.experiment_id == wanted, patience
         )
-        deadline = time.monotonic() + patience
-        if not self._wait(lambda: any(m.experiment_id == wanted for m in came), deadline):
+        if found is None:
             raise LoopError(f"the samples of {wanted} have not come within {patience:g} s")
-        return record_from_message(next(m for m in came if m.experiment_id == wanted))
+        return record_from_message(found)
 
     def identifier_values(self, patience: float) -> dict[str, Any] | None:
         """Return the parameters of the identifier_node by name; None: it did not answer.
@@ -239,34 +206,6 @@ class TuneClient:
 
         names = [entry.name for entry in PARAMETERS]
         for end in self._node.get_publishers_info_by_topic(self._resolved("pi_gains")):
-            name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
-            client = self._node.create_client(GetParameters, f"{name}/get_parameters")
-            deadline = time.monotonic() + patience
-            if self._wait(client.service_is_ready, deadline):
-                answer = client.call_async(GetParameters.Request(names=names))
-                if self._wait(answer.done, deadline):
-                    values = map(parameter_value_to_python, answer.result().values)
-                    found = dict(zip(names, values, strict=False))
-                    if len(found) == len(names) and None not in found.values():
-                        return found
+            with suppress(LoopError):
+                return self.values(quality.who(end), names, patience)
         return None
-
-    def _is_here(self, name: str) -> bool:
-        return name.rpartition("/")[0] == self.name.rpartition("/")[0]
-
-    def _owners(self, ending: str) -> list[str]:
-        """Return the full names of the nodes with a service that has this ending."""
-        services = self._node.get_service_names_and_types()
-        goals = [name.removesuffix("/_action/send_goal") for name, _ in services]
-        return sorted({name.removesuffix(ending) for name in goals if name.endswith(ending)})
-
-    def _resolved(self, topic: str) -> str:
-        return str(self._node.resolve_topic_name(topic))
-
-    def _wait(self, condition: Callable[[], bool], deadline: float) -> bool:
-        while not condition():
-            left = deadline - time.monotonic()
-            if left <= 0.0:
-                return False
-            self._executor.spin_once(timeout_sec=min(left, 0.05))
-        return True

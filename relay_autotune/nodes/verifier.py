@@ -18,6 +18,7 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
 
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import RelayAutotuneError
@@ -25,9 +26,12 @@ from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
+from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import conclude
 from relay_autotune.nodes.lifetime import ServedNode
+from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.text import duration
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import Verification
 
@@ -42,6 +46,8 @@ _LOOK_EVERY = 0.2
 _IN_A_ROW = 2
 # A gap in the samples of this part of a step leaves too little to judge.
 _LARGEST_HOLE = 0.25
+# Steps whose samples are kept for late subscribers: those of a verification.
+_STEPS_KEPT = 2
 # Limits on the steady clock: the preparation [s]; the steps as a multiple of the planned time,
 # plus a reserve [s].
 _PREPARED_WITHIN = 60.0
@@ -141,6 +147,13 @@ class Verifier:
         self._watch = node.create_timer(
             _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
         )
+        self._narrator = Narrator(node, self._words, self._tell)
+        self._full = node.create_publisher(
+            Verification,
+            "verification",
+            quality.latched(_STEPS_KEPT),
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+        )
         self._server = ActionServer(
             node,
             Verify,
@@ -181,6 +194,7 @@ class Verifier:
         self._goal, self._phase, self._found = goal, _Phase.PREPARING, []
         self._until = time.monotonic() + _PREPARED_WITHIN
         self._watch.reset()
+        self._node.defer(self._narrator.now)
         self._node.executor.create_task(self._prepare, goal)
 
     async def _prepare(self, goal: Any) -> None:
@@ -253,7 +267,7 @@ class Verifier:
         self._phase, self._samples = _Phase.STEPPING, []
         step = self._steps[self._number]
         self._move(step.setpoint, step.load)
-        self._tell()
+        self._node.defer(self._narrator.now)
 
     # While it runs.
 
@@ -325,6 +339,7 @@ class Verifier:
             self.interrupt(f"the step could not be judged: {_said(message)}")
             return
         self._found.append(message)
+        self._full.publish(message)
         if not message.passed:
             self._end(False, message.reason)
         elif len(self._found) == len(self._steps):
@@ -340,12 +355,35 @@ class Verifier:
         self._number += 1
         self._begin_step()
 
-    def _tell(self) -> None:
-        elapsed = self._recent[-1][0] - self._begun
-        whole = 2.0 * sum(p.duration for p in self._plans)
+    def _words(self) -> str:
+        """Say what the verification waits for and sees; empty where none runs."""
+        if self._phase is _Phase.PREPARING:
+            return "computing what the step will do"
+        if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
+            return ""
+        samples, wanted = self._samples, self._plans[self._number]
+        done = duration(samples[-1][0] - samples[0][0] if samples else 0.0)
+        now = (
+            f"{done} of {duration(wanted.duration)}: the measurement is {self._recent[-1][1]:.6g}"
+        )
+        step = self._steps[self._number]
+        if self._phase is _Phase.RETURNING:
+            return f"back without the step, {now}"
+        what = f"set-point {step.setpoint:+g} y" if step.setpoint else f"load {step.load:+g} u"
+        return f"step {self._number + 1} of {len(self._steps)}, {what}, {now}"
+
+    def _tell(self, status: str) -> None:
+        if self._goal is None:
+            return
+        planned = self._phase is not _Phase.PREPARING
+        elapsed = self._recent[-1][0] - self._begun if planned else 0.0
+        whole = 2.0 * sum(p.duration for p in self._plans) if planned else 0.0
         self._goal.publish_feedback(
             Verify.Feedback(
-                step=self._number + 1, elapsed=elapsed, remaining=max(whole - elapsed, 0.0)
+                step=self._number + 1 if planned else 1,
+                elapsed=elapsed,
+                remaining=max(whole - elapsed, 0.0),
+                status=status,
             )
         )
 
@@ -386,7 +424,8 @@ class Verifier:
     async def _conclude(self, passed: bool | None, reason: str) -> None:
         reason = await self._ended(passed, reason)
         goal, self._goal, self._phase = self._goal, None, _Phase.IDLE
-        result = Verify.Result(passed=passed is True, reason=reason, steps=self._found)
+        steps = [without_arrays(message) for message in self._found]
+        result = Verify.Result(passed=passed is True, reason=reason, steps=steps)
         self._found = []
         conclude(goal, result, succeeded=True)
 
@@ -436,6 +475,15 @@ def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Re
     )
     set_stamp(message.header.stamp, round(float(t[0]) * 1e9))
     return message
+
+
+def without_arrays(message: Any) -> Any:
+    """Return a `Verification` without its samples, which the topic has."""
+    summary = Verification()
+    for name, kind in message.get_fields_and_field_types().items():
+        if not kind.startswith("sequence"):
+            setattr(summary, name, getattr(message, name))
+    return summary
 
 
 def _refuse(goal: Any, error: Exception) -> None:

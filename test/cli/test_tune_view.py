@@ -113,7 +113,7 @@ def test_doubtful_gains_are_marked_and_need_a_parameter_to_be_applied() -> None:
     assert "the cycles differ: look at the valve" in text
     assert "DOUBTFUL: see the verdict" in text
     commands = [c for _, c in next_commands(doubtful(), ["/controller_node"])]
-    assert "ros2 param set /controller_node accept_doubtful true" in commands
+    assert commands[-1] == "apply_gains --accept-doubtful"
     assert document(doubtful(), "/relay_node", False)["verdict"] == "doubtful"
     trusted = "\n".join(result_lines(completed(), False, Paint()))
     assert "verdict          trusted" in trusted
@@ -236,18 +236,16 @@ def test_a_result_has_model_gains_recording_and_what_to_type_next() -> None:
         "/records/x y",
     ):
         assert part in text
-    controllers = (
-        "ros2 service call /a/controller_node/apply std_srvs/srv/Trigger",
-        "ros2 action send_goal /a/controller_node/verify relay_autotune_msgs/action/Verify {}",
-    )
-    commands = [c for _, c in next_commands(completed(), ["/a/controller_node"])]
+    controllers = ("apply_gains --namespace /a", "apply_gains --namespace /b --node pid")
+    named = ["/a/controller_node", "/b/pid"]
+    commands = [c for _, c in next_commands(completed(), named)]
     assert commands == [
         "report '/records/x y' -o report.html",
         "replay '/records/x y'",
         *controllers,
     ]
     told = {"flags": "--rule imc", "report": "my page.html"}
-    commands = [c for _, c in next_commands(completed(), ["/a/controller_node"], **told)]
+    commands = [c for _, c in next_commands(completed(), named, **told)]
     assert commands == [
         "xdg-open 'my page.html'",
         "replay '/records/x y' --rule imc",

@@ -18,7 +18,7 @@ from parameter_values import check_parameter_file, check_value
 
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
-from relay_autotune.cli import csv_to_bag, replay, tune_loop
+from relay_autotune.cli import apply_gains, csv_to_bag, replay, tune_loop
 from relay_autotune.exchange.document import document
 from relay_autotune.identification import METHODS
 from relay_autotune.nodes.plant import MODES
@@ -188,6 +188,7 @@ def test_remapped_names_are_those_of_the_loop() -> None:
         (replay, "docs/replay.md", "flag"),
         (csv_to_bag, "docs/replay.md", "flag of `csv_to_bag`"),
         (tune_loop, "docs/live.md", "flag of `tune_loop`"),
+        (apply_gains, "docs/controller.md", "flag of `apply_gains`"),
     ],
 )
 def test_the_guide_has_the_flags_of_a_command(

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import math
+import shutil
 import signal
+import subprocess
 from typing import Any
 
 import pytest
@@ -22,8 +24,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.process.transfer_function import TransferFunction as Process
+from relay_autotune.text import digits
 from relay_autotune_msgs.action import Verify
-from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
+from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction, Verification
 
 PLANT = {
     "mode": "clock",
@@ -105,16 +108,24 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     assert max(abs(m.data - 1.0) for m in commands[before:]) < 0.25
     # Gains are applied only on request.
     assert "wait: kc" in controller.log
-    applied = trigger(rig, "apply")
-    assert applied.success, applied.message
-    assert f"kc {gains[-1].kc:.6g}" in applied.message
+    done = subprocess.run(
+        [shutil.which("apply_gains"), "--yes", "--step", "0.2", "--load", "0.1"],
+        env=rig.environment, capture_output=True, text=True, timeout=90.0,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    *shown, verdict, first, second, _, last = done.stdout.splitlines()
+    assert "passed: the loop does what the model predicts" in verdict
+    assert "+0.2 y: overshoot" in first and "+0.1 u: overshoot" in second
+    assert f"kc {digits(gains[-1].kc)}" in last
+    for part in ("0.3000", digits(gains[-1].kc), digits(gains[-1].ti)):
+        assert part in "\n".join(shown)
+    assert "step 1 of 2, set-point +0.2 y, " in done.stderr
+    assert "step 2 of 2, load +0.1 u, " in controller.log
     assert parameters_of(rig) == [gains[-1].kc, gains[-1].ti]
-    rig.run_for(1.0)
-    status, result = verify(rig, setpoint_step=0.2, load_step=0.1)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert result.passed, result.reason
-    assert [s.kind for s in result.steps] == [1, 2]
-    for step in result.steps:
+    full = rig.listen("verification", Verification)
+    rig.until(lambda: len(full) == 2, "the samples of both steps")
+    assert [s.kind for s in full] == [1, 2]
+    for step in full:
         assert len(step.time) == len(step.measurement) == len(step.predicted) > 20
         assert step.gain_ratio == pytest.approx(1.0, abs=0.3)
     # A load that is larger than allowed is refused.

@@ -1,0 +1,304 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""apply_gains: show new gains beside those in force, apply them, and verify them with a step.
+
+The gains are those of the last tune, and go to the loop's controller_node; with --file they are
+written for ros2_controllers' pid_controller instead. Nothing is changed before you answer yes, or
+give --yes. The height of the step is --step, else verify_step of the node, else half of the swing
+that the tune made. If the step fails, the node takes the gains before back by itself.
+
+Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
+command line is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.layout import in_columns, labelled, width
+from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.text import digits, duration
+
+if TYPE_CHECKING:
+    from relay_autotune.loop.gains import Controller, Gains, Performance
+    from relay_autotune.nodes.gains_client import GainsClient
+    from relay_autotune.process.transfer_function import TransferFunction
+
+PROGRAM = "apply_gains"
+
+_FIGURES = (
+    ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
+)  # fmt: skip
+# Relative difference of equal gains, since another node may round them.
+_SAME = 1e-9
+# What a loop does, by the fields of `Performance`.
+_EFFECTS = (
+    ("Ms", "ms", ""),
+    ("error after a load step", "iae_load", "y s/u"),
+    ("overshoot", "overshoot", ""),
+    ("settling time", "settling_time", "s"),
+)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    given = list(sys.argv[1:] if args is None else args)
+    options = _parser().parse_args(given)
+    import relay_autotune.nodes.gains_client  # noqa: F401  see guarded
+
+    return guarded(PROGRAM, lambda: _work(options))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="Example:\n  apply_gains --namespace tank --step 0.5",
+    )
+    parser.add_argument("--namespace", default="", metavar="NS", help="namespace of the loop")
+    parser.add_argument(
+        "--node", default="controller_node", metavar="NAME",
+        help="name of the controller_node (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--step", type=finite, default=0.0, metavar="Y", help="step of the set-point [y]"
+    )
+    parser.add_argument(
+        "--load", type=finite, default=0.0, metavar="U",
+        help="a second step, added to the command [u]; the node's verify_load_max must allow it",
+    )  # fmt: skip
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    parser.add_argument(
+        "--accept-doubtful", action="store_true", help="also gains whose verdict is not trusted"
+    )
+    parser.add_argument(
+        "--verify-only", action="store_true", help="verify the gains that are in force"
+    )
+    parser.add_argument("--no-verify", action="store_true", help="apply them without a step")
+    parser.add_argument("--revert", action="store_true", help="take the gains before back")
+    parser.add_argument(
+        "--file", metavar="FILE",
+        help="write the gains for ros2_controllers' pid_controller, and apply nothing",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wait", type=finite, default=60.0, metavar="S",
+        help="how long to wait until the loop is at rest [s] (%(default)s)",
+    )  # fmt: skip
+    return parser
+
+
+def _work(options: argparse.Namespace) -> int:
+    from relay_autotune.nodes.gains_client import GainsClient
+
+    try:
+        client = GainsClient(options.namespace, options.node)
+    except ParameterError as error:
+        say(PROGRAM, str(error))
+        return USAGE
+    with client:
+        if options.file:
+            return _write(client, options)
+        client.find(5.0)
+        if options.revert:
+            print(client.ask("revert"))
+            return DONE
+        return apply_and_verify(client, options)
+
+
+def _write(client: GainsClient, options: argparse.Namespace) -> int:
+    from relay_autotune.cli.export import Target, exported, write
+
+    gains, doubt = client.waiting()
+    _require_trust(doubt, options)
+    write(exported(gains, "pid_controller", Target(), doubt=doubt), options.file)
+    print(f"written: {options.file}; load it with ros2 param load /pid_controller {options.file}")
+    return DONE
+
+
+def _require_trust(doubt: str, options: argparse.Namespace) -> None:
+    if doubt and not options.accept_doubtful:
+        raise TuningError(
+            f"the gains are doubtful: {doubt}; give --accept-doubtful to have them all the same"
+        )
+
+
+def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
+    """Show the gains, ask, apply and verify them; return the exit status.
+
+    :param client: of the controller_node, which was found.
+    :param options: as the command line gives them.
+    """
+    present, model = client.in_force(), client.model()
+    if not options.verify_only:
+        gains, doubt = client.waiting()
+        _require_trust(doubt, options)
+        if present is not None and _are_equal(present, gains):
+            raise TuningError("the new gains are in force already: give --verify-only for a step")
+        print("\n".join(beside(present, gains, model)))
+    step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
+    if not (options.yes or _agrees(_question(options, step))):
+        say(PROGRAM, "nothing was changed")
+        return NOTHING_FOUND
+    if options.accept_doubtful:
+        client.set_values(client.name, {"accept_doubtful": True})
+    if not options.verify_only:
+        client.ask("apply")
+    if options.no_verify:
+        print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
+        return DONE
+    result = _verified(client, step, options)
+    print("\n".join(verdict_lines(result, client.in_force(), width())))
+    return DONE if result.passed else NOTHING_FOUND
+
+
+def _are_equal(present: Controller, gains: Controller) -> bool:
+    return all(
+        math.isclose(getattr(present, name), getattr(gains, name), rel_tol=_SAME)
+        for name, _ in _FIGURES
+    )
+
+
+def _usual_step(client: GainsClient, options: argparse.Namespace) -> float:
+    """Return the step of the node, else half of the swing of the tune, in two digits [y]."""
+    if given := client.values(client.name, ["verify_step"])["verify_step"]:
+        return float(given)
+    if options.load:
+        return 0.0
+    swing = client.swing()
+    if not swing:
+        raise LoopError("the height of the step is not known: give --step")
+    return float(f"{0.5 * swing:.2g}")
+
+
+def _question(options: argparse.Namespace, step: float) -> str:
+    steps = [f"a step of the set-point by {step:g} y"] if step else []
+    if options.load:
+        steps.append(f"a step of the load by {options.load:g} u")
+    what = "verify those in force" if options.verify_only else "apply the new gains"
+    if options.no_verify:
+        return f"{what}?".capitalize()
+    joined = " and ".join(steps)
+    return (f"{what} with {joined}?" if options.verify_only else f"{what}, and verify them with "
+            f"{joined}?").capitalize()  # fmt: skip
+
+
+def _agrees(question: str) -> bool:
+    if not sys.stdin.isatty():
+        raise LoopError("nobody can be asked here: give --yes to apply the gains")
+    try:
+        return input(f"\n{question} [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False
+
+
+def _verified(client: GainsClient, step: float, options: argparse.Namespace) -> Any:
+    """Verify with a step that the user has agreed to, whatever the node allows otherwise."""
+    names = ("verify_step", "verify_step_max")
+    before = client.values(client.name, names)
+    more = abs(step) > max(map(abs, before.values()))
+    if more:
+        client.set_values(client.name, {"verify_step_max": abs(step)})
+    shown = StatusLine()
+    try:
+        return client.verify(step, options.load, options.wait, shown)
+    finally:
+        shown.clear()
+        if more:
+            client.set_values(client.name, {"verify_step_max": before["verify_step_max"]})
+
+
+class StatusLine:
+    """What is waited for, on standard error: in place on a terminal, else line by line."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+
+    def __call__(self, status: str) -> None:
+        """Show a sentence."""
+        text = f"\r\x1b[K{status[: width() - 1]}" if self._live else f"{status}\n"
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+    def clear(self) -> None:
+        """Remove the line."""
+        if self._live:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+
+def beside(present: Controller | None, gains: Gains, model: TransferFunction) -> list[str]:
+    """Return the gains in force and the new ones, with what each does on the model.
+
+    :param present: the gains in force; None: there are none.
+    :param gains: the new ones.
+    :param model: the process as identified.
+    """
+    now = _performance(present, model)
+    rows = [["", "in force", "new", ""]]
+    for name, unit in _FIGURES:
+        old = "none" if present is None else digits(getattr(present, name))
+        rows.append([name, old, digits(getattr(gains, name)), unit])
+    for label, name, unit in _EFFECTS:
+        told = "-" if present is None else "unstable" if now is None else _number(now, name)
+        rows.append([label, told, _number(gains, name), unit])
+    return in_columns(rows, width())
+
+
+def _number(found: Performance, name: str) -> str:
+    value = getattr(found, name)
+    return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
+
+
+def _performance(present: Controller | None, model: TransferFunction) -> Performance | None:
+    from relay_autotune.loop.analysis import analyse_loop
+
+    if present is None:
+        return None
+    try:
+        return analyse_loop(present, model)
+    except RelayAutotuneError:
+        return None
+
+
+def verdict_lines(result: Any, present: Controller | None, columns: int) -> list[str]:
+    """Return what a verification has found, in a line for each step and three more.
+
+    :param result: the `Verify.Result`.
+    :param present: the gains in force after it.
+    :param columns: that a line may have.
+    """
+    told = "passed: the loop does what the model predicts" if result.passed else result.reason
+    lines = labelled("verdict", told, columns)
+    for step in result.steps:
+        setpoint = step.kind == step.SETPOINT
+        lines += labelled(
+            "set-point step" if setpoint else "load step",
+            f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot {100.0 * step.overshoot:.0f} % "
+            f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled after "
+            f"{duration(step.settling_time)} ({duration(step.settling_time_predicted)})",
+            columns,
+        )
+    if result.steps:
+        gain, ms = (
+            " and ".join(f"{getattr(step, name):.2f}" for step in result.steps)
+            for name in ("gain_ratio", "ms")
+        )
+        predicted = result.steps[0].ms_predicted
+        told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
+        lines += labelled("process", told, columns)
+    now = "none, the command is held"
+    if present is not None:
+        now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
+    after = f"; {PROGRAM} --revert takes those before" if result.passed else ""
+    return lines + labelled("gains in force", f"{now}{after}", columns)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A client of the nodes of one loop: it finds them, calls them and hears their latched topics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import rclpy
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.context import Context
+from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_namespace import validate_namespace
+from rclpy.validate_topic_name import validate_topic_name
+
+from relay_autotune.errors import LoopError, ParameterError
+from relay_autotune.nodes import quality
+
+# How long a node may take to answer [s].
+ANSWER_WITHIN = 10.0
+
+
+class LoopClient:
+    """Call the nodes of one loop.
+
+    :param own: name of the client's own node.
+    :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
+    :param node: name of the node that is called most.
+    :param ros: arguments for ROS.
+    :raises ParameterError: if the name is not valid.
+    """
+
+    def __init__(self, own: str, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
+        try:
+            validate_namespace(f"/{namespace.strip('/')}")
+            validate_topic_name(f"{node}/tune")
+        except (InvalidNamespaceException, InvalidTopicNameException) as error:
+            text = str(error).splitlines()[0].rstrip(":")
+            raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
+        self._context = Context()
+        rclpy.init(
+            context=self._context, args=list(ros), signal_handler_options=SignalHandlerOptions.NO
+        )
+        self._node = Node(own, namespace=namespace or None, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.name = self._node.resolve_service_name(node)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown(timeout_sec=0.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def latched(
+        self, kind: Any, topic: str, wanted: Callable[[Any], bool], patience: float
+    ) -> Any | None:
+        """Return the newest wanted message of a latched topic; None: none came.
+
+        :param kind: the message class.
+        :param topic: its unresolved name.
+        :param wanted: tells whether a message is one of them.
+        :param patience: how long to wait for it [s].
+        """
+        came: list[Any] = []
+        ear = self._node.create_subscription(
+            kind, self._resolved(topic), came.append, quality.latched(10)
+        )
+        self._wait(lambda: any(map(wanted, came)), time.monotonic() + patience)
+        self._node.destroy_subscription(ear)
+        return next((message for message in reversed(came) if wanted(message)), None)
+
+    def call(self, kind: Any, service: str, request: Any, patience: float = ANSWER_WITHIN) -> Any:
+        """Return the answer of a service.
+
+        :param kind: the service class.
+        :param service: its full name.
+        :param request: what is asked.
+        :param patience: how long to wait for it [s].
+        :raises LoopError: if it does not answer.
+        """
+        client = self._node.create_client(kind, service)
+        deadline = time.monotonic() + patience
+        if self._wait(client.service_is_ready, deadline):
+            answer = client.call_async(request)
+            if self._wait(answer.done, deadline):
+                return answer.result()
+        raise LoopError(f"{service} has not answered within {patience:g} s")
+
+    def values(
+        self, node: str, names: Sequence[str], patience: float = ANSWER_WITHIN
+    ) -> dict[str, Any]:
+        """Return parameters of a node by name.
+
+        :param node: its full name.
+        :param names: the parameters.
+        :param patience: how long to wait for them [s].
+        :raises LoopError: if it does not answer, or does not have one of them.
+        """
+        request = GetParameters.Request(names=list(names))
+        answer = self.call(GetParameters, f"{node}/get_parameters", request, patience)
+        found = [parameter_value_to_python(value) for value in answer.values]
+        lacking = [n for n, value in zip(names, found, strict=False) if value is None]
+        if len(found) != len(names) or lacking:
+            raise LoopError(f"{node} does not have the parameters {', '.join(lacking or names)}")
+        return dict(zip(names, found, strict=True))
+
+    def set_values(self, node: str, values: Mapping[str, float | bool]) -> None:
+        """Set parameters of a node, all of them or none.
+
+        :param node: its full name.
+        :param values: the values by name.
+        :raises LoopError: if the node refuses or does not answer.
+        """
+        request = SetParametersAtomically.Request(
+            parameters=[
+                Parameter(name=name, value=_parameter_value(value))
+                for name, value in values.items()
+            ]
+        )
+        result = self.call(
+            SetParametersAtomically, f"{node}/set_parameters_atomically", request
+        ).result
+        if not result.successful:
+            raise LoopError(f"{node} refuses {', '.join(values)}: {result.reason}")
+
+    def _is_here(self, name: str) -> bool:
+        return name.rpartition("/")[0] == self.name.rpartition("/")[0]
+
+    def _owners(self, ending: str) -> list[str]:
+        """Return the full names of the nodes with a service that has this ending."""
+        services = self._node.get_service_names_and_types()
+        goals = [name.removesuffix("/_action/send_goal") for name, _ in services]
+        return sorted({name.removesuffix(ending) for name in goals if name.endswith(ending)})
+
+    def _resolved(self, topic: str) -> str:
+        return str(self._node.resolve_topic_name(topic))
+
+    def _wait(self, condition: Callable[[], bool], deadline: float) -> bool:
+        while not condition():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+        return True
+
+
+def _parameter_value(value: float | bool) -> ParameterValue:
+    if isinstance(value, bool):
+        return ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=value)
+    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)

@@ -1,0 +1,84 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What apply_gains shows: gains side by side, and a verdict in few lines."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from relay_autotune.cli import apply_gains
+from relay_autotune.cli.apply_gains import beside, verdict_lines
+from relay_autotune.loop.gains import Controller
+from relay_autotune.nodes.verifier import without_arrays
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.msg import Verification
+
+MODEL = TransferFunction.fopdt(1.65, 1.0, 0.5)
+GAINS = design(DesignTask(model=MODEL, options=DesignOptions()), "imc")
+
+
+def step(**values: Any) -> Any:
+    known = dict(
+        kind=Verification.SETPOINT, step=0.5, passed=True, reason="as predicted",
+        overshoot=0.1, overshoot_predicted=0.11, settling_time=3.8, settling_time_predicted=4.2,
+        gain_ratio=0.96, ms=1.37, ms_predicted=1.39, time=[0.0, 1.0], measurement=[1.0, 2.0],
+        command=[0.0, 0.0], predicted=[1.0, 2.0],
+    )  # fmt: skip
+    return Verification(**(known | values))
+
+
+def test_old_and_new_gains_stand_side_by_side_with_what_they_do() -> None:
+    slow = Controller(0.1, 3.0)
+    lines = beside(slow, GAINS, MODEL)
+    text = "\n".join(lines)
+    assert f"{GAINS.kc:.4g}"[:5] in text and "0.1000" in text
+    # The error after a unit load step is ti/kc where the loop does not overshoot.
+    error = next(line for line in lines if "error after a load step" in line)
+    assert float(error.split()[5]) == pytest.approx(3.0 / 0.1, rel=1e-3)
+    assert float(error.split()[6]) == pytest.approx(GAINS.iae_load, rel=1e-2)
+
+
+def test_gains_that_are_missing_or_unstable_are_told_as_such() -> None:
+    assert "none" in "\n".join(beside(None, GAINS, MODEL))
+    wild = "\n".join(beside(Controller(50.0, 0.1), GAINS, MODEL))
+    assert wild.count("unstable") == 4
+
+
+def test_a_verdict_has_five_lines() -> None:
+    load = step(kind=Verification.LOAD, step=0.3, gain_ratio=1.01)
+    result = Verify.Result(passed=True, reason="long numbers", steps=[step(), load])
+    lines = verdict_lines(result, Controller(0.6, 0.75, 0.2, 0.02), 99)
+    assert len(lines) == 5
+    assert "passed: the loop does what the model predicts" in lines[0]
+    assert "+0.5 y: overshoot 10 % (predicted 11 %), settled after 3.8 s (4.2 s)" in lines[1]
+    assert "+0.3 u" in lines[2]
+    assert "gain 0.96 and 1.01 times the model's, Ms 1.37 and 1.37 (predicted 1.39)" in lines[3]
+    assert "kc 0.6000, ti 0.7500, td 0.2000; apply_gains --revert" in lines[4]
+
+
+def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
+    failed = Verify.Result(passed=False, reason="it settles later; kc 0.1 in force again")
+    text = "\n".join(verdict_lines(failed, Controller(0.1, 3.0), 60))
+    assert "it settles later" in text
+    assert "kc 0.1000" in text and "--revert" not in text
+    assert "the command is held" in "\n".join(verdict_lines(failed, None, 60))
+
+
+def test_the_result_of_a_step_carries_no_samples() -> None:
+    whole = step(ms=math.inf)
+    summary = without_arrays(whole)
+    assert not (summary.time or summary.measurement or summary.command or summary.predicted)
+    assert (summary.kind, summary.step, summary.ms) == (whole.kind, whole.step, whole.ms)
+    assert (summary.reason, summary.passed) == (whole.reason, True)
+
+
+def test_a_command_line_that_does_not_fit_ends_with_two() -> None:
+    with pytest.raises(SystemExit) as end:
+        apply_gains.main(["--step", "nan"])
+    assert end.value.code == 2
