@@ -41,6 +41,8 @@ _SWITCH_INTERVAL = 5e-5
 _FINISH_WITHIN = 0.2
 # Byte that ends the thread at the pipe of signals.
 _NO_SIGNAL = 0
+# After these ROS expects NAME:=VALUE.
+_FLAGS_OF_RULES = ("-p", "--param", "-r", "--remap")
 
 
 class ServedNode(Node):
@@ -132,7 +134,7 @@ def run(
     :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
     """
     words = sys.argv[1:] if args is None else list(args)
-    own = _outside_of_ros(words)
+    own, ros = _apart(words)
     if {"-h", "--help"} & set(own):
         # A pager may have been closed early.
         with contextlib.suppress(BrokenPipeError):
@@ -144,6 +146,12 @@ def run(
             name,
             f"{' '.join(own)} has no effect outside of --ros-args; expected such as "
             f"{name} --ros-args -p NAME:=VALUE; --help lists the names",
+        )
+    for word in _without_flag(ros):
+        return _refuse(
+            name,
+            f"{word} has no flag before it; type -p {word} for a parameter, -r {word} to rename "
+            "a topic",
         )
     for unknown in unknown_parameters(_typed_parameters(words), parameters):
         return _refuse(name, unknown)
@@ -181,17 +189,28 @@ def _refuse(name: str, why: str) -> int:
     return 2
 
 
-def _outside_of_ros(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line that are not between ``--ros-args`` and ``--``."""
-    own, ros = [], False
+def _apart(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return what stands outside of ``--ros-args`` ... ``--``, and what within."""
+    own: list[str] = []
+    ros: list[str] = []
+    within = False
     for word in words:
         if word == "--ros-args":
-            ros = True
-        elif ros:
-            ros = word != "--"
+            within = True
+        elif within and word == "--":
+            within = False
         else:
-            own.append(word)
-    return own
+            (ros if within else own).append(word)
+    return own, ros
+
+
+def _without_flag(ros: Sequence[str]) -> list[str]:
+    """Return the words that look like NAME:=VALUE and follow no flag that takes one.
+
+    :param ros: what stands between ``--ros-args`` and ``--``.
+    """
+    pairs = itertools.pairwise(("", *ros))
+    return [word for before, word in pairs if ":=" in word and before not in _FLAGS_OF_RULES]
 
 
 def _typed_parameters(words: Sequence[str]) -> list[str]:

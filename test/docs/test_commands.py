@@ -28,7 +28,9 @@ VERBS = {
     "node list": set(),
     "service call": set(),
     "action send_goal": {"--feedback"},
-    "topic echo": {"--once", "--field", "--no-arr"},
+    "topic echo": {
+        *("--once", "--field", "--no-arr", "--qos-durability", "--qos-reliability"),
+    },
     "topic info": {"--verbose"},
     "topic pub": {"--once"},
     "param dump": set(),
@@ -103,6 +105,13 @@ def check_arguments(verb: str, rest: list[str]) -> None:
     elif verb == "topic echo" and rest:
         (topic,) = (w for w in rest if w.startswith("/"))
         message = topics[topic.rpartition("/")[2]]
+        if "--once" in rest:
+            # Without the type it ends where no publisher was discovered yet, and without the QoS
+            # it may miss what was latched.
+            assert rest[-1] == message, rest
+            given = dict(pairwise(rest))
+            assert given.get("--qos-durability") == "transient_local", rest
+            assert given.get("--qos-reliability") == "reliable", rest
         for flag, field in pairwise(rest):
             if flag == "--field":
                 assert (

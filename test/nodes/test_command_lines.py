@@ -37,3 +37,14 @@ def test_what_ros_would_pass_over_in_silence_is_refused(
     said = capsys.readouterr().err
     assert said.startswith(f"{name}: -p measurement_max:=50.0 has no effect outside of --ros-args")
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_a_parameter_without_its_flag_is_refused_with_what_to_type(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("--ros-args", "-p", "use_sim_time:=false", "-r", "a:=b", "amplitude:=1.0")
+    assert run(name, *given) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"{name}: amplitude:=1.0 has no flag before it; type -p amplitude:=1.0")
+    assert said.count("\n") == 1
