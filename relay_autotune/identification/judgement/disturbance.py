@@ -135,7 +135,8 @@ def with_its_load(
     :return: the identification and the record as it was driven; those given, where a load does
         not explain what no model does.
     """
-    samples = bool(cycles) and len(found.fitted) == len(record)
+    relay = record.settings is not None and bool(cycles)
+    samples = relay and len(found.fitted) == len(record)
     if not samples or record.continuous_command or not is_contradicted(found, record):
         return found, record
     # Imported here, since few records need it.

@@ -21,6 +21,8 @@ from relay_autotune.record.record import FloatArray, PiecewiseConstant, Record
 
 # Instants at which a load is looked for first, and how many of the best are followed up.
 _INSTANTS = 60
+# Share of the sum of squares that the best guess may leave; a load leaves next to nothing.
+_PROMISE = 0.7
 _FOLLOWED = 6
 # So many samples tell a load as well as more would.
 _SAMPLES = 1500
@@ -138,7 +140,7 @@ class _Fit:
         )
 
     def starts(self) -> list[FloatArray]:
-        """Return the best few guesses."""
+        """Return the best few guesses; none where no instant promises to explain what is left."""
         now = self._output(self._values, self._u)
         left = self._measurement - now
 
@@ -160,6 +162,8 @@ class _Fit:
             guess = np.concatenate((self._values, [instant, answer[-1], answer[0]]))
             guesses.append((sum_of_squares, guess))
         guesses.sort(key=lambda guess: guess[0])
+        if guesses[0][0] > _PROMISE * float(np.sum((left - left.mean()) ** 2)):
+            return []
         return [guess for _, guess in guesses[:_FOLLOWED]]
 
     def with_doubt(self, load: LoadStep) -> Identification:

@@ -37,7 +37,7 @@ FloatArray = NDArray[np.float64]
 _WHITE = 1e-3
 # Samples that are compared: of correlated ones more tell little, unless the process is fast; but
 # samples much denser than its response would weigh what is faster than the process most.
-_FEW, _MOST = 1200, 6000
+_FEW, _MOST = 1200, 3000
 _A_RESPONSE = 5.0
 _MOST_TIMES = 4
 # A structure whose criterion is larger by this in one colour is not tried in the next one, but
@@ -162,27 +162,44 @@ def _compared(
     The noise is estimated in turn with the models, from two beginnings: what the best simulation
     leaves, and a slow disturbance, which a simulation would bend to. The likelier end counts.
     """
+    # Some samples are enough to begin with: in colour, all are fitted.
+    few = problem.thinned(_FEW)
     grounds = [
-        _ground(replace(problem, relaxation=relaxation, past=past), sign)
+        _ground(replace(few, relaxation=relaxation, past=past), sign)
         for relaxation, past in (_PASTS[:1] if _rests(problem) else _PASTS)
         if problem.past_is_open or not past
     ]
     # Each past in the colour of what it leaves itself, and a richer one has to earn its place.
-    begun = [[c for name in names or _FIRST for c in g.fit((name,), order)] for g in grounds]
-    found = [
-        (_in_its_own(first, g), first, g) for first, g in zip(begun, grounds, strict=True) if first
-    ]
-    found = [(c, first, g) for c, first, g in found if c]
+    found = []
+    for ground in grounds:
+        begun = [c for name in names or _FIRST for c in ground.fit((name,), order)]
+        asked = _of_all(ground, problem)
+        if begun and (own := _in_its_own(_fitted_to(asked.problem, begun), asked)):
+            found.append((_joint(own) + _unasked(asked.problem), begun, ground))
     if not found:
         return []
-    _, simulated, asked = min(found, key=lambda f: _joint(f[0]) + _unasked(f[2].problem))
+    _, begun, ground = min(found, key=lambda f: f[0])
     if not names:
         tried = (*_OTHERS, *_INTEGRATING, *(_UNSTABLE if held else ()))
-        simulated += [c for name, n in tried for c in asked.fit((name,), n)]
+        begun += [c for name, n in tried for c in ground.fit((name,), n)]
+    asked = _of_all(ground, problem)
+    simulated = _fitted_to(asked.problem, begun)
     once = _in_its_own(simulated, asked)
     slow = slow_colour(1.0 - _SLOWEST / problem.time.size)
     ends = [_converged(once, asked), _converged(_in(slow, simulated, asked), asked)]
     return _ordered(min(ends, key=_joint))
+
+
+def _of_all(ground: Ground, problem: Problem) -> Ground:
+    """Return a ground of all samples, with the past of one of some of them."""
+    past = ground.problem
+    problem = replace(problem, relaxation=past.relaxation, past=past.past)
+    return replace(ground, problem=problem, floor=problem.time.size * NEGLIGIBLE**2)
+
+
+def _fitted_to(problem: Problem, found: list[Candidate]) -> list[Candidate]:
+    """Return candidates as models of a problem's samples, for their residual there."""
+    return [replace(c, problem=replace(problem, structure=c.structure)) for c in found]
 
 
 def _in_its_own(found: list[Candidate], ground: Ground) -> list[Candidate]:
