@@ -35,6 +35,8 @@ _SHARES = (0.25, 0.5, 0.75)
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
 # Of the command's range, the least range of the levels on one side.
 _OWN = 0.2
+# Of what does not follow one sample away, the share at the same instant that stands out.
+_AT_ONCE = 0.5
 
 
 def unequal_gains(record: Record, model: TransferFunction) -> str | None:
@@ -129,6 +131,31 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
             loss = (abs(above - below) - _SURE_LOSS * sigma) / largest
             found.append((float(max(loss, 0.0)), float(level)))
     return max(found, default=None)
+
+
+def followed_share(record: Record, sign: int) -> float | None:
+    """Return which share of the command's variance follows the measurement at the same instant.
+
+    A proportional controller makes ``u = c + b y``, with b against the process's sign. Between
+    samples of a process y comes after u; so the share at the same instant, the square of the
+    correlation, has to stand out from those at one sample earlier and later.
+
+    :param record: any record.
+    :param sign: of the process; a b of the same sign is a loop that would run away.
+    :return: None where b is against it, or what does not follow is not least at the same instant.
+    """
+    u, y = record.command, record.measurement
+    if len(record) < _LEAST_SAMPLES or not (np.ptp(u) > 0.0 and np.ptp(y) > 0.0):
+        return None
+    at_once = float(np.corrcoef(u, y)[0, 1])
+    beside = [
+        0.0 if not (np.ptp(a) > 0.0 and np.ptp(b) > 0.0) else float(np.corrcoef(a, b)[0, 1])
+        for a, b in ((u[1:], y[:-1]), (u[:-1], y[1:]))
+    ]
+    left = 1.0 - at_once**2
+    if at_once * sign <= 0.0 or left > _AT_ONCE * min(1.0 - r**2 for r in beside):
+        return None
+    return at_once**2
 
 
 def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:

@@ -44,6 +44,8 @@ _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
 _TIMES, _GAIN, _DEAD_TIME = 1.0, 2.0, 1.0
 _DRAWS = 40
 _FARTHEST = 20.0
+# A sum of squares that is larger by less counts as equal.
+_AS_WELL = 1.1
 # A criterion that is larger by less is as good: odds of e^3.
 _AS_GOOD = 6.0
 _TRIAL = 1e-6
@@ -72,7 +74,8 @@ def halves(found: Identification, record: Record) -> tuple[Part, ...]:
     """Return what either half of a record tells of the process in the chosen structure.
 
     The record is parted where half of the information on the parameters has come. Each half has
-    an offset and a free initial state of its own.
+    an offset and a free initial state of its own, but the first one where the record explains
+    itself from rest.
 
     :param found: a fit to the samples.
     :param record: what was fitted.
@@ -94,8 +97,10 @@ def halves(found: Identification, record: Record) -> tuple[Part, ...]:
     scale = float(np.ptp(record.measurement))
     gain = whole.coefficients[: len(structure.powers)]
     parts = []
-    for chosen in (slice(None, middle), slice(middle, None)):
-        part = problem.part(chosen)
+    for part in (
+        problem.part(slice(None, middle)),
+        _with_free_state(problem).part(slice(middle, None)),
+    ):
         models = _allowed(part, gain, theta, scale)
         if models:
             parts.append(Part(float(part.time[0]), float(part.time[-1]), models))
@@ -108,7 +113,23 @@ def _problem(found: Identification, record: Record, structure: Structure) -> Pro
     problem = problem_of([(record.time, y, record.drive())], structure)
     problem = problem.part(np.isfinite(found.fitted)).thinned(_MOST_SAMPLES)
     # The free state of an integrator is the offset; a command off its balance is a drift.
-    return replace(problem, relaxation=bool(structure.factors), drift=structure.integrators > 0)
+    problem = replace(problem, drift=structure.integrators > 0)
+    return problem if _begins_at_rest(problem, found, record) else _with_free_state(problem)
+
+
+def _with_free_state(problem: Problem) -> Problem:
+    return replace(problem, relaxation=bool(problem.structure.factors))
+
+
+def _begins_at_rest(problem: Problem, found: Identification, record: Record) -> bool:
+    """Return whether the model that was found explains the samples from rest as well."""
+    own = found.estimate.structure
+    if isinstance(own, GivenModel) or own.unstable:
+        return False
+    left = (record.measurement - found.fitted)[problem.index] / float(np.ptp(record.measurement))
+    rested = replace(problem, structure=own, drift=own.integrators > 0)
+    from_rest = evaluate(rested, theta_of(own, found.values)).cost
+    return from_rest <= _AS_WELL * max(float(left @ left), left.size * NEGLIGIBLE**2)
 
 
 def _allowed(

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.identification.judgement.checks import lost_effect
+from relay_autotune.identification.judgement.checks import followed_share, lost_effect
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.identification.judgement.refits import other_sign
@@ -44,6 +44,11 @@ def _direction(evidence: Evidence) -> Measured | None:
         f"way: have the relay work in the other direction (process_gain_sign {sign}; 0: it is "
         "found)",
     )
+
+
+def _fed_back(evidence: Evidence) -> Measured | None:
+    share = followed_share(evidence.record, evidence.found.model.process_sign)
+    return None if share is None else Measured(share)
 
 
 def _open_dead_time(evidence: Evidence) -> Measured | None:
@@ -192,6 +197,20 @@ MODEL_CHECKS = (
         measure=_direction,
     ),
     Check(
+        name="fed_back",
+        title="Feedback",
+        what="share of the command's variance that follows the measurement at the same instant, "
+        "in the direction that the model says would run away",
+        unit="",
+        failed=0.98,
+        sentence="the command follows the measurement ({value} of its variance), in a direction "
+        "in which a loop with this process would have run away: the model is the controller, read "
+        "backward",
+        remedy="move the set-point while recording, or let a relay work in place of the "
+        "controller",
+        measure=_fed_back,
+    ),
+    Check(
         name="dead_time_open",
         title="Dead time",
         what="upper end of the dead time's interval over the length of the record",
@@ -252,7 +271,7 @@ MODEL_CHECKS = (
         title="K_u",
         what="half width of the 95 % interval of K_u over K_u",
         unit="",
-        doubtful=0.5,
+        doubtful=2.0,
         sentence="K_u is known to {value} of itself only",
         remedy="run more cycles, or use a larger amplitude",
         measure=_ultimate,

@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.known import LOSSES, Known
 from relay_autotune.identification.waveform.colour import Colour, colour_of, slow_colour
-from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit
+from relay_autotune.identification.waveform.fit_covariance import (
+    NEGLIGIBLE,
+    Fit,
+    Noise,
+    estimate_of,
+)
 from relay_autotune.identification.waveform.residuals import ljung_box, worth
 from relay_autotune.identification.waveform.selection import Candidate, Ground, nuisances_of
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
@@ -37,8 +42,8 @@ FloatArray = NDArray[np.float64]
 _WHITE = 1e-3
 # Samples that are compared: of correlated ones more tell little, unless the process is fast; but
 # samples much denser than its response would weigh what is faster than the process most.
-_FEW, _MOST = 1200, 3000
-_A_RESPONSE = 5.0
+_FEW, _MOST = 1200, 4000
+_A_RESPONSE, _AT_LEAST = 5.0, 2.0
 _MOST_TIMES = 4
 # A structure whose criterion is larger by this in one colour is not tried in the next one, but
 # for the plain ones, on whose models gains have to hold, too.
@@ -65,6 +70,8 @@ _LONGEST = 0.25
 _EARNED = 10.0
 # Lengths of the record up to which a lag is one.
 _LASTING = 2.0
+# Standard deviations of parameters in their own sizes beyond which samples do not tell them.
+_TOLD = 1.0
 # Before all structures are tried: a flexible one that leaves this much colour is enough to know.
 _CLEAR = 1e-12
 _LITTLE_WORTH = 0.5
@@ -127,22 +134,44 @@ def in_colour(
     """
     whole = replace(problem, drift=False, relaxation=False, past=False)
     names = (known.structure,) if known.structure else ()
-    found = _compared(_dense_enough(whole, sign), sign, names, known.order, held=held)
+    found = _compared(*_dense_enough(whole, sign), sign, names, known.order, held=held)
     if not found or found[0].problem.colour is None:
         return None
-    chosen = found[0]
+    chosen = next((c for c in found if _is_told(c)), found[0])
+    found = [chosen, *(c for c in found if c is not chosen)]
     return Fit(chosen.problem, refine(chosen.problem, chosen.state.theta), tuple(found), scale)
 
 
-def _dense_enough(problem: Problem, sign: int) -> Problem:
-    """Return evenly spaced samples, a few for each response of the process."""
+def _is_told(candidate: Candidate) -> bool:
+    """Return whether the samples tell each parameter.
+
+    A gain and a lag to their own size, a zero and a dead time to that of all times together: what
+    is less sure is a lag between the samples or beyond the record, or two that are one.
+    """
+    problem, state = candidate.problem, candidate.state
+    estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise(False))
+    if estimate is None or estimate.root is None:
+        return False
+    deviation = np.sqrt(np.einsum("pk,pk->p", estimate.root, estimate.root))
+    model = estimate.model
+    slow = model.dead_time + sum(abs(t) for t in model.time_constants)
+    pairs = zip(estimate.structure.parameters, estimate.values, strict=True)
+    size = [abs(float(v)) if p.logarithmic else slow for p, v in pairs]
+    return bool(np.all(deviation <= _TOLD * np.maximum(size, 1e-300)))
+
+
+def _dense_enough(problem: Problem, sign: int) -> tuple[Problem, Problem]:
+    """Return evenly spaced samples, a few for each response of the process, and fewer of them."""
     few = problem.thinned(_FEW)
     if few.time.size == problem.time.size:
-        return problem
+        return problem, problem
     log_tau, dead_time = _ground(few, sign).fopdt.theta
-    response = math.exp(log_tau) + dead_time
-    asked = _A_RESPONSE * float(np.ptp(problem.time)) / response
-    return problem.thinned(int(min(max(asked, _FEW), _MOST)))
+    responses = float(np.ptp(problem.time)) / (math.exp(log_tau) + dead_time)
+    every, some = (
+        problem.thinned(int(min(max(each * responses, _FEW), _MOST)))
+        for each in (_A_RESPONSE, _AT_LEAST)
+    )
+    return every, some
 
 
 def _colour(problem: Problem, state: Trial) -> Colour | None:
@@ -155,15 +184,13 @@ def _colour(problem: Problem, state: Trial) -> Colour | None:
 
 
 def _compared(
-    problem: Problem, sign: int, names: tuple[str, ...], order: int, *, held: bool
+    problem: Problem, few: Problem, sign: int, names: tuple[str, ...], order: int, *, held: bool
 ) -> list[Candidate]:
     """Return all structures in one colour, the one that counts first.
 
     The noise is estimated in turn with the models, from two beginnings: what the best simulation
     leaves, and a slow disturbance, which a simulation would bend to. The likelier end counts.
     """
-    # Some samples are enough to begin with: in colour, all are fitted.
-    few = problem.thinned(_FEW)
     grounds = [
         _ground(replace(few, relaxation=relaxation, past=past), sign)
         for relaxation, past in (_PASTS[:1] if _rests(problem) else _PASTS)
