@@ -14,7 +14,7 @@ from analysed import completed
 from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification import Estimate, Known, identify
-from relay_autotune.identification.judgement.checks import lost_effect
+from relay_autotune.identification.judgement.checks import followed_share, lost_effect
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.refits import halves, plain_models
 from relay_autotune.identification.judgement.table import CHECKS
@@ -285,6 +285,35 @@ def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
 
 
 @pytest.mark.long
+def fed_back(process, gain, *, steps=2000):
+    """Record a proportional controller beside noise at the process's input."""
+    plant = VirtualProcess(process)
+    time = 0.1 * np.arange(steps)
+    load = np.random.default_rng(4).normal(0.0, 0.3, steps)
+    y, u = np.zeros(steps), np.zeros(steps)
+    for k in range(steps):
+        y[k] = plant.measure(float(time[k]))
+        u[k] = -gain * y[k]
+        plant.command(float(u[k] + load[k]))
+    return Record(time=time, measurement=y, command=u)
+
+
+def test_a_controller_that_is_read_backward_gives_no_gains():
+    record = fed_back(TransferFunction.fopdt(2.0, 4.0, 1.0), 1.5)
+    assert followed_share(record, -1) == pytest.approx(1.0)
+    # Of the process's own sign the loop is one that could run.
+    assert followed_share(record, 1) is None
+    inverse = analyse_alone(record)
+    assert inverse.best_gains is None or inverse.model.model.process_sign == 1
+
+
+def test_a_slow_command_that_the_process_follows_is_not_fed_back():
+    time = np.arange(0.0, 400.0, 0.5)
+    record = Record(time=time, measurement=np.zeros(time.size), command=np.sin(time / 40.0))
+    y = response(TransferFunction.fopdt(2.0, 1.0, 0.5), time, record.input())
+    assert followed_share(replace(record, measurement=y), 1) is None
+
+
 def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
     # A heater that warms faster than it cools: but for 0 and 10, its command has two levels.
     time = np.arange(0.0, 600.0, 1.0)

@@ -13,8 +13,10 @@ from scipy import signal
 from scipy.linalg import expm
 
 from relay_autotune.errors import RecordError
+from relay_autotune.identification.waveform.theta import columns_of
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import Plant
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
 
@@ -135,3 +137,18 @@ def test_a_held_signal_is_checked_and_compressed():
     np.testing.assert_array_equal(u.values, [7.0])
     assert u.initial == 5.0
     np.testing.assert_array_equal(u(np.array([-1.0, 1.9, 2.0, 9.0])), [5.0, 5.0, 7.0, 7.0])
+
+
+def test_a_lag_under_a_busy_input_is_the_same_whatever_way_it_is_followed():
+    rng = np.random.default_rng(5)
+    changes = np.cumsum(rng.uniform(0.05, 1.0, 400))
+    u = PiecewiseConstant(changes, rng.normal(0.0, 1.0, 400), 0.3)
+    time = np.linspace(0.0, 220.0, 500)
+    for tau, dead_time in ((0.2, 0.4), (40.0, 1.3)):
+        theta = np.array([np.log(tau), dead_time])
+        columns, derivatives = columns_of(FOPDT, theta, time, u)
+        expected = response(TransferFunction.fopdt(1.0, tau, dead_time), time, u)
+        np.testing.assert_allclose(columns[0], expected, atol=1e-10)
+        step = 1e-6
+        slower, _ = columns_of(FOPDT, theta + np.array([step, 0.0]), time, u)
+        np.testing.assert_allclose(derivatives[0, 0], (slower[0] - columns[0]) / step, atol=1e-4)

@@ -38,6 +38,8 @@ _MOST = 24
 _POWERS = np.maximum(np.subtract.outer(np.arange(_MOST), np.arange(_MOST)), 0)
 _BINOMIALS = np.array([[float(math.comb(i, j)) for j in range(_MOST)] for i in range(_MOST)])
 # exp() of it, and of its negative, is a normal number.
+# With fewer changes plain numbers are quicker than arrays; what is left of a state that is none.
+MANY_CHANGES, _FORGOTTEN = 100, 1e-20
 _BLOCK = 200.0
 _OVERFLOW = 300.0
 
@@ -198,11 +200,31 @@ def _recursions(
     return state
 
 
+def doubled(decay: Numbers, drive: Numbers) -> Numbers:
+    """Return ``x_k = decay_(k-1) x_(k-1) + drive_k`` by joining ever longer stretches.
+
+    Hillis and Steele 1986: of m numbers, log m sums of arrays.
+
+    :param decay: of magnitude at most 1, shape (m - 1,).
+    :param drive: shape (m,).
+    """
+    found = drive.astype(decay.dtype)
+    over = np.concatenate(([0.0], decay))
+    reach = 1
+    while reach < found.size and np.abs(over[reach:]).max() > _FORGOTTEN:
+        found[reach:] += over[reach:] * found[:-reach]
+        over[reach:] = over[reach:] * over[:-reach]
+        reach *= 2
+    return found
+
+
 def _recursion(p: Any, changes: FloatArray, decay: Numbers, drive: Numbers) -> Numbers:
     """Return ``x_k = exp(p (t_k - t_(k-1))) x_(k-1) + drive_k``, shape (m,)."""
     span = abs(p.real) * abs(float(changes[-1] - changes[0])) if changes.size else 0.0
     if changes.size <= _FEW_CHANGES * (1.0 + span / _BLOCK):
         # Fewer to a block than what a block costs, as with a fast pole and a busy input.
+        if changes.size > MANY_CHANGES and (p.real * (changes[-1] - changes[0])) < 0.0:
+            return doubled(decay, drive)
         x = drive.tolist()
         for k, a in enumerate(decay.tolist(), start=1):
             x[k] += a * x[k - 1]

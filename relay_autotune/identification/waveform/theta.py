@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.identification.waveform.partial_fractions import MANY_CHANGES, doubled
 from relay_autotune.identification.waveform.rational import responses
 from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.model_parameters import DEAD_TIME
@@ -120,24 +121,38 @@ def one_lag(
     :return: shapes (1, n) and (2, 1, n).
     """
     tau, dead_time = math.exp(float(theta[0])), float(theta[1])
-    levels = (u.values - u.initial).tolist()
-    gaps = np.diff(u.times) / tau
-    decay = np.exp(-gaps).tolist()
-    state, slope = [0.0], [0.0]
-    s = q = 0.0
-    for level, gap, a in zip(levels, gaps.tolist(), decay, strict=False):
-        away = s - level
-        q = a * (q + away * gap)
-        s = level + away * a
-        state.append(s)
-        slope.append(q)
+    levels, gaps = u.values - u.initial, np.diff(u.times) / tau
+    state, slope = _at_changes(levels, gaps)
     delayed = time - dead_time
     segment = u.times.searchsorted(delayed, side="right") - 1
     k = np.maximum(segment, 0)
     delta = (delayed - u.times[k]) / tau
     e = np.exp(-np.maximum(delta, 0.0))
-    level_at = np.array(levels)[k]
-    part = (np.array(state)[k] - level_at) * e
-    values = np.stack((level_at + part, np.array(slope)[k] * e + part * delta, part / tau))
+    level_at = levels[k]
+    part = (state[k] - level_at) * e
+    values = np.stack((level_at + part, slope[k] * e + part * delta, part / tau))
     values[:, segment < 0] = 0.0
     return values[:1], values[1:, None, :]
+
+
+def _at_changes(levels: FloatArray, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lag's state s at each change, and its derivative by log tau.
+
+    :param levels: after each change, shape (m,).
+    :param gaps: between changes, over tau, shape (m - 1,).
+    """
+    decay = np.exp(-gaps)
+    if levels.size > MANY_CHANGES:
+        state = doubled(decay, np.append(0.0, -np.expm1(-gaps) * levels[:-1]))
+        away = state[:-1] - levels[:-1]
+        return state, doubled(decay, np.append(0.0, decay * away * gaps))
+    # Of fewer, plain numbers are quicker than arrays.
+    states, slopes = [0.0], [0.0]
+    s = q = 0.0
+    for level, gap, a in zip(levels.tolist(), gaps.tolist(), decay.tolist(), strict=False):
+        apart = s - level
+        q = a * (q + apart * gap)
+        s = level + apart * a
+        states.append(s)
+        slopes.append(q)
+    return np.array(states), np.array(slopes)
