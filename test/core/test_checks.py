@@ -10,6 +10,8 @@ import math
 import numpy as np
 import pytest
 
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.judgement.checks import (
     disagreeing_point,
     unequal_amplitudes,
@@ -21,6 +23,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import Plant
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -94,6 +97,29 @@ def test_a_linear_process_raises_no_alarm(seed):
     assert unequal_gains(record, MODEL) is None
     assert disagreeing_point(record, MODEL, 0.002) is None
     assert identify_waveform(record, Known(structure="fopdt")).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("baseline", "before"), [(3.0, ()), (2.0, ((3.3, 15.0), (0.7, 12.0), (3.3, 9.0)))],
+    ids=["wrong baseline", "restarted"],
+)  # fmt: skip
+def test_a_start_away_from_rest_is_named_and_is_no_other_gain(baseline, before):
+    """Such linear processes were said not to be linear."""
+    noise = Disturbances(noise_std=0.02)
+    process = VirtualProcess(MODEL, rest_command=2.0, disturbances=noise, seed=1)
+    t = 0.0
+    for command, lasting in before:
+        process.command(command)
+        t += lasting
+        process.measure(t)
+    test = RelayExperiment(ExperimentParameters(amplitude=1.0, sample_period=0.2), baseline)
+    while not test.finished:
+        process.command(test.step(t, process.measure(t)))
+        t += 0.2
+    found = identify_waveform(test.record(), Known(structure="fopdt"))
+    assert found.model.gain == pytest.approx(1.65, rel=0.02)
+    (told,) = found.warnings
+    assert told.startswith("the process was not at rest at the baseline when the test began")
 
 
 def test_a_record_that_begins_within_the_relay_raises_no_alarm():

@@ -109,8 +109,8 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
             else "the process is unstable and the amplitude too small to hold it"
         )
         return (
-            f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, or "
-            f"{other}"
+            f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, "
+            f"the process was not at rest at the start, or {other}"
         )
     if abs(third - second) <= level:
         return (

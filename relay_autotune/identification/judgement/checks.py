@@ -32,6 +32,8 @@ _LEAST_CYCLES = 3
 _LEAST_SAMPLES = 24
 # Of a command's range, where its effect may end; beside the level that it starts from.
 _SHARES = (0.25, 0.5, 0.75)
+# Curves that differ by less than this part count as the same.
+_ALIKE = 1e-6
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
 # Of the command's range, the least range of the levels on one side.
 _OWN = 0.2
@@ -39,15 +41,20 @@ _OWN = 0.2
 _AT_ONCE = 0.5
 
 
-def unequal_gains(record: Record, model: TransferFunction) -> str | None:
+def unequal_gains(
+    record: Record, model: TransferFunction, fitted: FloatArray | None = None
+) -> str | None:
     """Say whether the process answers commands above and below the baseline differently.
 
     The response to the part of the command above the baseline and to the part below it get a
-    gain each, in the least-squares sense, beside an offset and a drift; a heater that heats faster
-    than the room cools has two that differ.
+    gain each, in the least-squares sense, beside an offset, a drift, and what was fitted beside
+    the response to the command, such as the way back to rest after a wrong baseline. A heater that
+    heats faster than the room cools has two gains that differ.
 
     :param record: the record, with the relay's settings.
     :param model: the model fitted to it, with a stable or integrating process.
+    :param fitted: the fitted measurement at the samples [y], shape (n,), NaN where there is none;
+        None: nothing was fitted beside the response.
     :return: a sentence, or None where the two agree, or cannot be told apart.
     """
     settings = record.settings
@@ -64,7 +71,8 @@ def unequal_gains(record: Record, model: TransferFunction) -> str | None:
         if not bool(np.any(values)):
             return None
         parts.append(response(model, record.time, PiecewiseConstant(u.times, values, initial)))
-    (above, below), covariance = _factors(record, parts)
+    beside = () if fitted is None else (fitted - response(model, record.time, u),)
+    (above, below), covariance = _factors(record, parts, beside)
     contrast = np.array((1.0, -1.0))
     uncertainty = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
     difference = abs(above - below)
@@ -192,26 +200,34 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
 
 
 def _factors(
-    record: Record, parts: Sequence[FloatArray], *, correlated: bool = False
+    record: Record,
+    parts: Sequence[FloatArray],
+    beside: Sequence[FloatArray] = (),
+    *,
+    correlated: bool = False,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the factors of some responses in a record, and their covariance.
 
     An offset and a drift are estimated beside them.
 
     :param parts: each of the record's length.
+    :param beside: further curves of free size, NaN where they are not known.
     :param correlated: True: samples count by what they are worth beside their neighbours.
     """
     line = record.time - record.time.mean()
-    columns = np.stack((*parts, np.ones(len(record)), line))
+    columns = np.stack((*parts, np.ones(len(record)), line, *beside))
+    known = np.isfinite(columns).all(axis=0)
+    columns, measured = columns[:, known], record.measurement[known]
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     scaled = columns / size[:, None]
-    factors, *_ = np.linalg.lstsq(scaled.T, record.measurement, rcond=None)
-    residual = record.measurement - factors @ scaled
-    variance = float(residual @ residual) / len(record)
+    # A curve beside that is offset and drift alone tells nothing more.
+    factors, *_ = np.linalg.lstsq(scaled.T, measured, rcond=_ALIKE)
+    residual = measured - factors @ scaled
+    variance = float(residual @ residual) / measured.size
     if correlated:
         variance /= worth(residual)
-    covariance = np.linalg.pinv(scaled @ scaled.T) * variance
+    covariance = np.linalg.pinv(scaled @ scaled.T, rcond=_ALIKE**2) * variance
     count = len(parts)
     return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]
 

@@ -105,7 +105,12 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         fitted=_fitted(records, fit, residual),
     )
     gain_std = found.ultimate_gain_std / abs(found.ultimate_gain)
-    notes = [note for r in records for note in _checks(r, found, gain_std)]
+    curves = (found.fitted, *[None] * (len(records) - 1))
+    notes = [
+        note
+        for record, curve in zip(records, curves, strict=True)
+        for note in _checks(record, found, gain_std, curve)
+    ]
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(notes)))
     found = _beside_rivals(found, fit, noise)
     if halves is not None and not halves.agree:
@@ -171,9 +176,11 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
     return fitted
 
 
-def _checks(record: Record, found: Identification, gain_std: float) -> list[str]:
+def _checks(
+    record: Record, found: Identification, gain_std: float, fitted: FloatArray | None
+) -> list[str]:
     notes = (
-        unequal_gains(record, found.model),
+        unequal_gains(record, found.model, fitted),
         disagreeing_point(record, found.model, gain_std),
     )
     return [note for note in notes if note]
@@ -255,6 +262,11 @@ def _measured_noise(records: Sequence[Record]) -> float:
     return math.sqrt(sum(squares) / len(squares)) if len(squares) == len(records) else math.nan
 
 
+def _from_baseline(record: Record) -> bool:
+    """Return whether a record is of a relay that began at its baseline, as for a rest."""
+    return record.settings is not None and record.input().initial == record.settings.baseline
+
+
 def _warnings(
     records: Sequence[Record], quality: FitReport, noise: Noise, fit: Fit, residual: FloatArray
 ) -> list[str]:
@@ -292,6 +304,11 @@ def _warnings(
             found.append(f"{which}{record.lost_samples} samples were lost on the way")
     if fit.problem.drift:
         found.append("the measurement drifts; the drift was fitted together with the model")
+    if (fit.problem.relaxation or fit.problem.past) and any(map(_from_baseline, records)):
+        found.append(
+            "the process was not at rest at the baseline when the test began, and its way there "
+            "was fitted with the model; check the baseline, or wait longer before a test"
+        )
     if fit.loss != "squares":
         found.append(f"the {fit.loss} loss was minimised, as asked for, in place of the squares")
     return found
