@@ -35,6 +35,8 @@ PROGRAM = "apply_gains"
 _FIGURES = (
     ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
 )  # fmt: skip
+# How long to look for the controller_node [s].
+_FOUND_WITHIN = 5.0
 # Relative difference of equal gains, since another node may round them.
 _SAME = 1e-9
 # What a loop does, by the fields of `Performance`.
@@ -105,10 +107,25 @@ def _work(options: argparse.Namespace) -> int:
     with client:
         if options.file:
             return _write(client, options)
-        client.find(5.0)
+        client.find(_FOUND_WITHIN)
         if options.revert:
             print(client.ask("revert"))
             return DONE
+        return apply_and_verify(client, options)
+
+
+def apply_at(name: str, *, doubtful: bool) -> int:
+    """Offer the newest gains to a controller_node; return the exit status.
+
+    :param name: its full name.
+    :param doubtful: True: also gains whose verdict is not trusted.
+    """
+    from relay_autotune.nodes.gains_client import GainsClient
+
+    namespace, _, node = name.rpartition("/")
+    options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
+    with GainsClient(namespace, node) as client:
+        client.find(_FOUND_WITHIN)
         return apply_and_verify(client, options)
 
 

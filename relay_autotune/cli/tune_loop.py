@@ -24,10 +24,22 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, TextIO
 
+from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.export import Target, exported, write
+from relay_autotune.cli.layout import width
+from relay_autotune.cli.new_loop import (
+    START_WITHIN,
+    add_new_loop,
+    agrees,
+    asked_for_file,
+    is_new_loop,
+    nodes_for,
+    own_namespace,
+)
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (
     NARROWEST,
@@ -41,6 +53,7 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError
+from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -49,6 +62,8 @@ if TYPE_CHECKING:
 PROGRAM = "tune_loop"
 # Time between two updates of a terminal [s].
 _TICK = 0.25
+# Part of the checklist's line on rest while few samples have come.
+NOT_KNOWN_YET = "not known yet"
 # How long to wait for what the report needs from the nodes [s].
 _PATIENCE = 5.0
 
@@ -108,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
         help="write a report: .html, or a picture: .png, .svg or .pdf",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_new_loop(parser)
     return parser
 
 
@@ -127,19 +143,37 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         from relay_autotune.cli.report import check_output
 
         check_output(PROGRAM, options.report)
+    new = is_new_loop(options)
     try:
-        client = TuneClient(options.namespace, options.node, ros)
+        namespace = own_namespace(options) if new else options.namespace
+        client = TuneClient(namespace, options.node, ros)
     except ParameterError as error:
         say(PROGRAM, str(error))
         return USAGE
-    with client:
-        deadline = time.monotonic() + options.wait
-        with Working(f"looking for {client.name}"):
+    with ExitStack() as stack:
+        stack.enter_context(client)
+        patience = options.wait
+        if new:
+            # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            nodes = stack.enter_context(nodes_for(client, options))
+            patience = max(patience, START_WITHIN)
+        deadline = time.monotonic() + patience
+
+        def leave() -> bool:
+            if new:
+                nodes.require_alive()
+            return bool(interrupted)
+
+        with Working(f"{'starting' if new else 'looking for'} {client.name}"):
             client.find(
-                options.wait,
+                patience,
                 needs_identifier=not (options.dry_run or options.record_only),
-                leave=lambda: bool(interrupted),
+                leave=leave,
             )
+        if new and not options.dry_run and not _is_agreed(client, options, deadline):
+            return NOTHING_FOUND
+        heed(signal.SIGINT)
         # Until here nothing has started. Ctrl-Z may stop this command; the tune then continues.
         heeded = ending_signals() - {signal.SIGTSTP}
         for number in heeded:
@@ -174,6 +208,27 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             raise
 
 
+def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float) -> bool:
+    """Show the plan of a tune, and return whether it is to start."""
+    with Working("looking at the loop"):
+        while True:
+            client.ask(options.amplitude, dry_run=True)
+            while not client.done():
+                client.spin(_TICK)
+            checks = list(client.result.checks)
+            # Right after its start the node does not know yet whether the process is at rest.
+            if not client.not_ready_yet and not any(NOT_KNOWN_YET in line for line in checks):
+                break
+            if time.monotonic() > deadline:
+                break
+            time.sleep(_TICK)
+    print("\n".join(check_lines(checks, width())), flush=True, file=sys.stderr)
+    if not client.succeeded:
+        say(PROGRAM, f"{client.name} refuses: {client.result.reason}")
+        return False
+    return agrees("Start the tune?", options)
+
+
 def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
     """Show the feedback until the result is there, and cancel when asked to."""
     asked = 0
@@ -204,10 +259,14 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
         paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
         print("\n".join(result_lines(result, cancelled, paint)), flush=True)
     flags, report = _afterwards(client, options)
+    # Gains of nodes that end with this command cannot be asked for later.
+    controllers = [] if is_new_loop(options) else client.controllers()
     if options.json:
         print(json.dumps(document(result, client.name, cancelled, report)))
     else:
-        steps = next_commands(result, client.controllers(), _prefix(), flags, report)
+        if is_new_loop(options) and result.gains.experiment_id:
+            _hand_over(client, options)
+        steps = next_commands(result, controllers, _prefix(), flags, report)
         if steps:
             print("\nNext:")
         for what, command in steps:
@@ -219,6 +278,22 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
     return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
 
 
+def _hand_over(client: TuneClient, options: argparse.Namespace) -> None:
+    """Offer to apply and verify the gains, and write them for another controller."""
+    result, file = client.result, options.export
+    doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
+    if not options.yes:
+        there = client.controllers() if sys.stdin.isatty() else []
+        for name in there:
+            print()
+            apply_at(name, doubtful=bool(doubt))
+        file = file or ("" if there else asked_for_file("\nWrite the gains for pid_controller"))
+    if file:
+        gains = gains_from_message(result.gains)
+        write(exported(gains, "pid_controller", Target(), doubt=doubt), file)
+        print(f"  {'gains for':<16} pid_controller: {file}")
+
+
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
     """Print the result of a dry run, or why the node refuses."""
     reason, checks = client.result.reason, list(client.result.checks)
@@ -226,7 +301,7 @@ def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
         told = {"accepted": client.succeeded, "reason": reason, "checks": checks}
         print(json.dumps({"node": client.name} | told))
     elif checks:
-        print("\n".join(check_lines(checks, shutil.get_terminal_size().columns)))
+        print("\n".join(check_lines(checks, width())))
     if client.succeeded and not options.json:
         again = [word for word in options.typed if word != "--dry-run"]
         print(f"\nNext:\n  {'start it':<26} {_prefix()}{shlex.join((PROGRAM, *again))}")
@@ -244,7 +319,8 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
     from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
 
     result = client.result
-    values = None if options.record_only else client.identifier_values(_PATIENCE)
+    with Working("asking identifier_node for its parameters"):
+        values = None if options.record_only else client.identifier_values(_PATIENCE)
     flags = flags_of(values) if values is not None else ""
     if not options.report:
         return flags, ""

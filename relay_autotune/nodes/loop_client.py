@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from difflib import SequenceMatcher
 from types import TracebackType
 from typing import Any, Self
 
@@ -18,13 +20,19 @@ from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameExceptio
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import LoopError, ParameterError
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.live_types import ARRAY, reader_of
 
+# How long present commands are listened to [s].
+_LISTEN = 1.0
+# Topics that are named where one is missing.
+_MOST_NAMED = 4
 # How long a node may take to answer [s].
 ANSWER_WITHIN = 10.0
 
@@ -143,6 +151,55 @@ class LoopClient:
         ).result
         if not result.successful:
             raise LoopError(f"{node} refuses {', '.join(values)}: {result.reason}")
+
+    def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
+        """Return the message type of a topic, as soon as its other end is there.
+
+        :param topic: its name.
+        :param patience: how long to wait for it [s].
+        :param published: True: it has to have a publisher; False: a subscription.
+        :raises LoopError: with the topics that may be meant, if it has none.
+        """
+        name = self._resolved(topic)
+        node = self._node
+        ends_of = (
+            node.get_publishers_info_by_topic
+            if published
+            else node.get_subscriptions_info_by_topic
+        )
+        if self._wait(lambda: bool(ends_of(name)), time.monotonic() + patience):
+            return str(ends_of(name)[0].topic_type)
+        own = {end.topic_name for end in (*node.publishers, *node.subscriptions)}
+        there = [n for n, _ in node.get_topic_names_and_types() if n not in own and ends_of(n)]
+        near = sorted(there, key=lambda other: SequenceMatcher(None, name, other).ratio())[::-1]
+        what = "publisher" if published else "subscription"
+        flag = "--measurement" if published else "--command"
+        meant = f"; type {flag} {near[0]}" if near else ""
+        others = f" (others: {', '.join(near[1:_MOST_NAMED])})" if near[1:] else ""
+        raise LoopError(f"{name} has no {what} within {patience:g} s{meant}{others}")
+
+    def is_controlled(self) -> bool:
+        """Tell whether a controller of this namespace publishes controller_command."""
+        return self._node.count_publishers(self._resolved("controller_command")) > 0
+
+    def commanded(self, topic: str, type_name: str) -> float:
+        """Return the mean of the commands that are published now; NaN: none are.
+
+        :param topic: name of the command's topic.
+        :param type_name: its message type.
+        """
+        name = self._resolved(topic)
+        if not self._node.count_publishers(name):
+            return math.nan
+        heard: list[float] = []
+        field = "data[0]" if type_name == ARRAY else "data"
+        reader = reader_of(type_name, field)
+        ear = self._node.create_subscription(
+            reader.kind, name, lambda m: heard.append(reader.value(m)), qos_profile_sensor_data
+        )
+        self._wait(lambda: False, time.monotonic() + _LISTEN)
+        self._node.destroy_subscription(ear)
+        return sum(heard) / len(heard) if heard else math.nan
 
     def _is_here(self, name: str) -> bool:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]

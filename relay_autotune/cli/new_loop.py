@@ -1,0 +1,190 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What tune_loop does for a loop that has no nodes yet: look at it, ask, and start them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.cli.arguments import finite
+from relay_autotune.cli.export import number
+from relay_autotune.cli.own_nodes import OwnNodes
+from relay_autotune.cli.progress import Working
+from relay_autotune.errors import LoopError, SelectionError
+
+if TYPE_CHECKING:
+    from relay_autotune.nodes.tune_client import TuneClient
+
+# How long the nodes may take to start on a busy machine [s].
+START_WITHIN = 30.0
+
+
+def add_new_loop(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a loop that has no nodes yet.
+
+    :param parser: of tune_loop.
+    """
+    group = parser.add_argument_group(
+        "a loop without nodes",
+        "with --measurement and --command it starts relay_node and identifier_node itself, asks "
+        "for what it must know, shows the plan, tunes, and ends them",
+    )
+    group.add_argument("--measurement", metavar="TOPIC", help="topic that measures")
+    group.add_argument("--command", metavar="TOPIC", help="topic that commands the actuator")
+    group.add_argument(
+        "--field", default="data", metavar="PATH",
+        help="the number in the messages of --measurement (%(default)s)",
+    )  # fmt: skip
+    group.add_argument(
+        "--at", type=finite, metavar="U", help="the present command, at which the process rests"
+    )
+    group.add_argument(
+        "--within", type=finite, nargs=2, metavar=("LOW", "HIGH"),
+        help="the tune ends where the measurement leaves these [y]",
+    )  # fmt: skip
+    group.add_argument(
+        "--command-within", type=finite, nargs=2, metavar=("LOW", "HIGH"),
+        help="no command beyond these is sent [u]",
+    )  # fmt: skip
+    group.add_argument("--yes", action="store_true", help="do not ask, for scripts")
+    group.add_argument(
+        "--export", metavar="FILE", help="write the gains for ros2_controllers' pid_controller"
+    )
+
+
+def is_new_loop(options: argparse.Namespace) -> bool:
+    """Return whether the command is to start the nodes itself.
+
+    :param options: with the flags of `add_new_loop`.
+    :raises SelectionError: if only some of the flags are given.
+    """
+    if options.measurement and options.command:
+        return True
+    for flag in ("measurement", "command", "at", "within", "command_within", "export"):
+        if getattr(options, flag) is not None:
+            raise SelectionError(
+                f"--{flag.replace('_', '-')} is for a loop without nodes: give --measurement and "
+                f"--command, too"
+            )
+    return False
+
+
+def own_namespace(options: argparse.Namespace) -> str:
+    """Return the namespace of the nodes: that of the flag, else one of this process alone."""
+    return str(options.namespace or f"tune_loop_{os.getpid()}")
+
+
+def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
+    """Look at the loop, ask for what is not given, and return the nodes to start.
+
+    :param client: a node of the graph.
+    :param options: with the flags of `add_new_loop`.
+    :raises LoopError: if a topic is not there, or something is not known and nobody can be asked.
+    """
+    with Working(f"looking at {options.measurement} and {options.command}"):
+        kind = client.kind_of(options.measurement, options.wait, published=True)
+        command_kind = client.kind_of(options.command, options.wait, published=False)
+        present = client.commanded(options.command, command_kind)
+        # Its mean command is the baseline where a controller commands through relay_node.
+        controlled = client.is_controlled()
+    told = "" if math.isnan(present) else f"{present:.6g}"
+    at = math.nan if controlled and options.at is None else options.at
+    if at is None:
+        at = _asked("present command, at which the process rests [u]", "--at", told, _number)
+    within = options.within or _asked(
+        "lowest and highest measurement that the process may see [y]", "--within", "", _pair
+    )
+    command_within = options.command_within
+    if command_within is None and not options.amplitude:
+        # The amplitude is found between these.
+        command_within = _asked(
+            "lowest and highest command of the actuator [u]", "--command-within", "", _pair
+        )
+    values: dict[str, Any] = {
+        "baseline": at,
+        "measurement_min": within[0],
+        "measurement_max": within[1],
+        "measurement_type": kind,
+        "measurement_field": options.field,
+        "command_type": command_kind,
+        "amplitude": options.amplitude,
+    }
+    if command_within is not None:
+        values |= {"command_min": command_within[0], "command_max": command_within[1]}
+    named = ["-r", f"__ns:=/{own_namespace(options).strip('/')}"]
+    relay = [*named, "-r", f"measurement:={options.measurement}"]
+    relay += ["-r", f"command:={options.command}"]
+    for name, value in values.items():
+        if value != value:
+            continue
+        relay += ["-p", f"{name}:={number(value) if isinstance(value, float) else value}"]
+    nodes = {"relay_node": relay}
+    return OwnNodes(nodes if options.record_only else nodes | {"identifier_node": named})
+
+
+def asked_for_file(what: str) -> str:
+    """Ask for a file to write; return its name, empty for none.
+
+    :param what: what would be written.
+    """
+    return _input(f"{what}, to which file? [none]: ") if sys.stdin.isatty() else ""
+
+
+def agrees(question: str, options: argparse.Namespace) -> bool:
+    """Ask a question, unless ``--yes`` has answered it.
+
+    :param question: with its question mark.
+    :param options: with the flags of `add_new_loop`.
+    :raises LoopError: if nobody can be asked.
+    """
+    if options.yes:
+        return True
+    _require_somebody("--yes")
+    return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
+
+
+def _asked(what: str, flag: str, known: str, read: Callable[[str], Any]) -> Any:
+    """Ask for a value until it can be read.
+
+    :param what: what is asked for, with its unit.
+    :param flag: the flag that would have given it.
+    :param known: the value that Enter takes; empty: none.
+    :param read: returns the value of a text; None: it is none.
+    """
+    _require_somebody(flag)
+    shown = f"{what} [{known}]: " if known else f"{what}: "
+    while (value := read(_input(shown) or known)) is None:
+        print(f"expected {'two numbers' if read is _pair else 'a number'}", file=sys.stderr)
+    return value
+
+
+def _require_somebody(flag: str) -> None:
+    if not sys.stdin.isatty():
+        raise LoopError(f"nobody can be asked here: give {flag}")
+
+
+def _input(shown: str) -> str:
+    try:
+        return input(shown).strip()
+    except EOFError:
+        raise LoopError("the input has ended: nothing was started") from None
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _pair(text: str) -> list[float] | None:
+    numbers = [_number(word) for word in text.replace(",", " ").split()]
+    found = [number for number in numbers if number is not None]
+    return found if len(found) == len(numbers) == 2 else None

@@ -1,0 +1,84 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Nodes that a command starts for itself, and that end with it, however it ends."""
+
+from __future__ import annotations
+
+import ctypes
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+
+from relay_autotune.cli.progress import Working
+from relay_autotune.errors import LoopError
+
+# How long a node may take to end: relay_node sends its last command first [s].
+_END_WITHIN = 8.0
+# prctl's request that a process gets a signal when its parent ends.
+_PR_SET_PDEATHSIG = 1
+
+
+class OwnNodes:
+    """Start nodes as processes of the command, and end all of them with the block.
+
+    They are not in the terminal's group, so that Ctrl-C reaches the command alone, which ends the
+    tune in order. If the command itself is killed, each of them gets SIGTERM from the system, and
+    `relay_node` sends the safe command.
+
+    :param nodes: the arguments for ROS of each node, by the name of its executable, in the order
+        in which they end.
+    """
+
+    def __init__(self, nodes: Mapping[str, Sequence[str]]) -> None:
+        self._nodes = nodes
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115  it is closed at the end of the block
+
+    def __enter__(self) -> OwnNodes:
+        # Loaded before the fork: after it only few calls are allowed.
+        prctl = ctypes.CDLL(None).prctl
+        for name, arguments in self._nodes.items():
+            run = f"from relay_autotune.start import {name}; raise SystemExit({name}())"
+            self._running[name] = subprocess.Popen(
+                [sys.executable, "-c", run, "--ros-args", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
+            )
+        return self
+
+    def require_alive(self) -> None:
+        """Refuse to go on without a node.
+
+        :raises LoopError: with its last line, if one of them has ended.
+        """
+        for name, process in self._running.items():
+            if process.poll() is not None:
+                self._log.seek(0)
+                lines = self._log.read().decode(errors="replace").strip().splitlines()
+                raise LoopError(f"{name} has ended: {lines[-1] if lines else 'without a word'}")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with Working("ending the nodes"):
+            for process in self._running.values():
+                process.terminate()
+            deadline = time.monotonic() + _END_WITHIN
+            for process in self._running.values():
+                try:
+                    process.wait(max(deadline - time.monotonic(), 0.0))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+        self._log.close()

@@ -1,0 +1,118 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What tune_loop asks for, and what it starts its own nodes with."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from typing import Any
+
+import pytest
+
+from relay_autotune.cli import new_loop
+from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for
+from relay_autotune.errors import LoopError, SelectionError
+
+
+class Looker:
+    """A client of a loop whose topics have these types, with a present command."""
+
+    def __init__(self, present: float = math.nan, controlled: bool = False) -> None:
+        self.present, self.controlled = present, controlled
+
+    def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
+        return {"/tank/level": "std_msgs/msg/Float32"}.get(topic, "std_msgs/msg/Float64")
+
+    def commanded(self, topic: str, type_name: str) -> float:
+        return self.present
+
+    def is_controlled(self) -> bool:
+        return self.controlled
+
+
+def options(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_new_loop(parser)
+    parser.set_defaults(namespace="tank", wait=1.0, amplitude=0.0, record_only=False)
+    return parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve", *words])
+
+
+def arguments(client: Any, given: argparse.Namespace) -> dict[str, str]:
+    """Return parameters and remappings of the relay_node that would be started."""
+    words = nodes_for(client, given)._nodes["relay_node"]
+    return dict(word.split(":=", 1) for word in words if ":=" in word)
+
+
+@pytest.fixture
+def typed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Answer each question with the next of these texts, as at a terminal."""
+    answers: list[str] = []
+    monkeypatch.setattr("builtins.input", lambda shown: answers.pop(0))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    return answers
+
+
+def test_flags_become_limits_levels_topics_and_types_without_a_question() -> None:
+    given = options("--within", "30", "50", "--at", "2", "--command-within", "0", "5")
+    assert arguments(Looker(), given) == {
+        "__ns": "/tank",
+        "measurement": "/tank/level",
+        "command": "/tank/valve",
+        "baseline": "2.0",
+        "measurement_min": "30.0",
+        "measurement_max": "50.0",
+        "command_min": "0.0",
+        "command_max": "5.0",
+        "amplitude": "0.0",
+        "measurement_type": "std_msgs/msg/Float32",
+        "measurement_field": "data",
+        "command_type": "std_msgs/msg/Float64",
+    }
+    assert set(nodes_for(Looker(), given)._nodes) == {"relay_node", "identifier_node"}
+
+
+def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -> None:
+    typed += ["two", "2", "30", "30 50", "0, 5"]
+    found = arguments(Looker(), options())
+    assert not typed
+    assert (found["baseline"], found["measurement_max"]) == ("2.0", "50.0")
+    assert (found["command_min"], found["command_max"]) == ("0.0", "5.0")
+
+
+def test_the_command_that_is_heard_needs_only_enter(typed: list[str]) -> None:
+    typed += ["", "0 5"]
+    assert arguments(Looker(present=2.25), options("--within", "1", "9"))["baseline"] == "2.25"
+
+
+def test_a_controller_in_the_loop_tells_the_baseline_by_itself(typed: list[str]) -> None:
+    given = options("--within", "1", "9", "--command-within", "0", "5")
+    assert "baseline" not in arguments(Looker(controlled=True), given)
+
+
+def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
+    with pytest.raises(LoopError, match="give --at"):
+        nodes_for(Looker(), options())
+    with pytest.raises(LoopError, match="give --within"):
+        nodes_for(Looker(), options("--at", "2"))
+    with pytest.raises(LoopError, match="give --command-within"):
+        nodes_for(Looker(), options("--at", "2", "--within", "1", "9"))
+    with pytest.raises(LoopError, match="give --yes"):
+        new_loop.agrees("Start?", options())
+    assert new_loop.agrees("Start?", options("--yes"))
+
+
+def test_flags_of_a_new_loop_need_both_topics() -> None:
+    assert is_new_loop(options())
+    given = options("--within", "1", "9")
+    given.command = None
+    with pytest.raises(SelectionError, match="--measurement is for a loop without nodes"):
+        is_new_loop(given)
+    given.measurement = None
+    with pytest.raises(SelectionError, match="--within is for a loop without nodes"):
+        is_new_loop(given)
+    given.within = None
+    assert not is_new_loop(given)

@@ -1,0 +1,99 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""tune_loop on a loop that has nothing but its topics: it starts and ends its own nodes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+from loop_rig import RELIABLE, Rig
+from std_msgs.msg import Float64
+
+FAST = {
+    "sample_period": 0.005,
+    "structure": "fopdt",
+    "gain": 1.65,
+    "time_constants": [0.1],
+    "dead_time": 0.05,
+    "operating_point": [40.0, 2.0],
+    "noise_std": 0.02,
+}
+TOPICS = ("-r", "measurement:=/tank/level", "-r", "command:=/tank/valve")
+WORDS = (
+    "--measurement", "/tank/level", "--command", "/tank/valve", "--within", "30", "50",
+    "--at", "2", "--amplitude", "1", "--command-within", "0", "5", "--yes", "--wait", "30",
+)  # fmt: skip
+
+
+def begun(rig: Rig, *words: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [shutil.which("tune_loop"), *WORDS, *words],
+        env=rig.environment | {"HOME": str(rig.folder)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def nodes_of(parent: int) -> list[int]:
+    """Return the processes that a process has started."""
+    text = Path(f"/proc/{parent}/task/{parent}/children").read_text()
+    return [int(number) for number in text.split()]
+
+
+def is_there(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+
+
+def test_one_command_leads_from_topics_to_gains_and_leaves_nothing_running(rig: Rig) -> None:
+    rig.start("plant_node", *TOPICS, **FAST)
+    file = rig.folder / "gains.yaml"
+    process = begun(rig, "--export", str(file))
+    output, said = process.communicate(timeout=120.0)
+    assert process.returncode in (0, 3), output + said
+    assert "ok    measurement   /tank/level from /plant_node" in said
+    assert "stepped to 3.3, " in said
+    assert "gains" in output and "completed: " in output
+    (settings,) = yaml.safe_load(file.read_text()).values()
+    p = settings["ros__parameters"]["gains"]["joint"]["p"]
+    assert p == pytest.approx(0.64, rel=0.25)
+    ours = {"relay_node", "identifier_node", "tune_loop"}
+    rig.until(lambda: not ours & set(rig.node.get_node_names()), "the end of its nodes")
+
+
+def test_if_the_command_is_killed_its_nodes_end_with_the_safe_command(rig: Rig) -> None:
+    commands = rig.listen("/tank/valve", Float64, RELIABLE)
+    rig.start("plant_node", *TOPICS, **FAST | {"time_constants": [50.0]})
+    process = begun(rig, "--record-only")
+    rig.until(lambda: any(m.data != 2.0 for m in commands), "a step", timeout=90.0)
+    started = nodes_of(process.pid)
+    assert len(started) == 1
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    rig.until(lambda: not any(map(is_there, started)), "the end of its nodes")
+    rig.until(lambda: commands[-1].data == 2.0, "the safe command")
+
+
+def test_a_topic_that_is_not_there_is_told_with_the_nearest(rig: Rig) -> None:
+    rig.start("plant_node", *TOPICS, **FAST)
+    words = [word.replace("/tank/level", "/tank/levle") for word in WORDS]
+    done = subprocess.run(
+        [shutil.which("tune_loop"), *words, "--wait", "6"],
+        env=rig.environment, capture_output=True, text=True, timeout=60.0, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    told = done.stderr.splitlines()[-1]
+    assert told.startswith("tune_loop: /tank/levle has no publisher within 6 s")
+    assert "type --measurement /tank/level" in told
