@@ -32,7 +32,11 @@ def generate_launch_description() -> LaunchDescription:
         default_value=PathJoinSubstitution([SHARE, "config", "several_loops.yaml"]),
         description="File that lists the loops",
     )
-    return LaunchDescription([loops, OpaqueFunction(function=loops_of)])
+    check = IncludeLaunchDescription(
+        AnyLaunchDescriptionSource(PathJoinSubstitution([SHARE, "launch", "arguments.launch.py"])),
+        launch_arguments=[("known", "loops")],
+    )
+    return LaunchDescription([loops, check, OpaqueFunction(function=loops_of)])
 
 
 def loops_of(context: LaunchContext) -> list[GroupAction]:

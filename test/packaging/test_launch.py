@@ -11,12 +11,16 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import json
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
@@ -31,7 +35,9 @@ EXECUTABLES = set(re.findall(r'"(\w+) = relay_autotune', (ROOT / "setup.py").rea
 DECLARATIVE = sorted((ROOT / "launch").glob("*.launch.xml")) + sorted(
     (ROOT / "launch").glob("*.launch.yaml")
 )
-PYTHON = sorted((ROOT / "launch").glob("*.launch.py"))
+# That which checks arguments is started by the others alone.
+CHECK = ROOT / "launch/arguments.launch.py"
+PYTHON = sorted(set((ROOT / "launch").glob("*.launch.py")) - {CHECK})
 SEVERAL = ROOT / "config/several_loops.yaml"
 PARAMETER_FILES = [f for f in sorted((ROOT / "config").glob("*.yaml")) if f != SEVERAL]
 
@@ -69,6 +75,8 @@ def from_yaml(entries: list[dict[str, Any]]) -> Iterator[Action]:
 
 
 def declared_arguments(file: Path) -> set[str]:
+    if file.suffix == ".py":
+        return set(re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', file.read_text()))
     return {inner["name"] for tag, inner in actions(file) if tag == "arg"}
 
 
@@ -300,3 +308,36 @@ def test_topics_and_fields_of_the_plotjuggler_layout_exist() -> None:
         parts = [part for part in splitter if part.tag in ("DockArea", "DockSplitter")]
         assert int(splitter.attrib["count"]) == len(parts)
         assert len(splitter.attrib["sizes"].split(";")) == len(parts)
+
+
+@pytest.fixture
+def check(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Return the file that looks for misspelt arguments; its function needs no `ros2 launch`."""
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros.substitutions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    spec = importlib.util.spec_from_file_location("arguments", CHECK)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@by_file(DECLARATIVE)
+def test_a_launch_file_has_its_own_arguments_checked_first(file: Path) -> None:
+    others = [action for action in actions(file) if action[0] != "arg"]
+    tag, inner = others[0]
+    assert (tag, inner["file"]) == ("include", f"{SHARE}launch/{CHECK.name}")
+    (known,) = inner["arg"]
+    assert set(known["value"].split()) == declared_arguments(file)
+
+
+def test_a_misspelt_launch_argument_is_refused(check: ModuleType) -> None:
+    known = sorted(declared_arguments(ROOT / "launch/tune.launch.xml"))
+    parameters = entries_of("relay_node")
+    assert check.problems([*known, "known"], known, parameters) == []
+    (told,) = check.problems(["measurment", "command"], known, parameters)
+    assert told == "there is no launch argument measurment; did you mean measurement?"
+    (told,) = check.problems(["amplitude"], known, parameters)
+    assert "amplitude is a parameter of a node" in told and "params:=FILE" in told
+    # of a launch file that includes ours
+    assert check.problems(["robot_name", "loops", "simulate"], known, parameters) == []
