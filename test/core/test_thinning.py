@@ -10,6 +10,7 @@ from relay_autotune.analysis import analyse_alone
 from relay_autotune.identification import Known, identify
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.record.thinning import BLOCKS, LEFT_ALONE, thinned
 
@@ -154,3 +155,15 @@ def test_an_analysis_says_so_and_designs_for_single_samples():
     assert any(f"of {t.size} samples" in w for w in found.model.warnings)
     assert found.record.unthinned.noise == pytest.approx(NOISE, rel=0.1)
     assert found.added_delay == pytest.approx(0.5 * (t[1] - t[0]))
+
+
+def test_what_a_first_order_leaves_of_means_is_not_taken_for_jitter():
+    # It leaves a thousandth of the range, which means of three samples do not hide.
+    rng = np.random.default_rng(2)
+    t = 0.05 * np.arange(12_000)
+    u = np.select([t < 50, t < 200, t < 350, t < 450], [0.0, 1.0, -0.5, 0.5], 0.0)
+    process = TransferFunction(2.0, (), (40.0, 1.5), 0, 3.0)
+    short = thinned(made(process, t, u, rng, noise=0.002))
+    found = identify(short, "waveform")
+    assert found.structure == "sopdt"
+    assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.02)

@@ -110,6 +110,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         ],
         FOPDT,
     )
+    problem = replace(problem, averaged=any(r.unthinned is not None for r in records))
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
     fit = _explained(

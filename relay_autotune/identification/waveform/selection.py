@@ -453,7 +453,8 @@ def _good_enough(candidates: list[Candidate]) -> Candidate | None:
     """Return a FOPDT that leaves so little that jitter or rounding explains the rest as well.
 
     Below that, what the criterion prefers is made of the errors of the instants, which are
-    not white. Where a structure is exact, nothing is left to such errors.
+    not white. Where a structure is exact, nothing is left to such errors; and means of many
+    samples have so little of them that what a FOPDT leaves is the process's.
     """
 
     def rms(candidate: Candidate) -> float:
@@ -461,6 +462,8 @@ def _good_enough(candidates: list[Candidate]) -> Candidate | None:
 
     fopdt = next((c for c in candidates if c.structure.name == "fopdt"), None)
     integrator = next((c for c in candidates if c.structure.name == "ipdt"), None)
+    if candidates[0].problem.averaged:
+        return None
     if fopdt is None or rms(candidates[0]) < _EXACT or rms(fopdt) > _ENOUGH:
         return None
     slower = integrator is not None and integrator.criterion < fopdt.criterion

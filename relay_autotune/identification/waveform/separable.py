@@ -59,6 +59,7 @@ class Problem:
     :param past: True: the command before each experiment is estimated: the process rested, or
         moved freely, under another level than its first one.
     :param colour: of the noise; None: it is white.
+    :param averaged: True: the samples are means of several, which hide less.
     """
 
     time: FloatArray
@@ -72,6 +73,7 @@ class Problem:
     weight: FloatArray | None = None
     past: bool = False
     colour: Colour | None = None
+    averaged: bool = False
 
     @property
     def past_is_open(self) -> bool:
