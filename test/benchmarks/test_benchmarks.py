@@ -50,6 +50,7 @@ QUICK = {
     "fuzz_bags": ("--quick",),
     "fleet_time": ("--quick",),
     "paper_designs": ("--quick",),
+    "unmodelled": ("--quick",),
 }
 
 

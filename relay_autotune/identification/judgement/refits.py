@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
+from relay_autotune.identification.waveform.halves import parted
 from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
@@ -87,20 +88,13 @@ def halves(found: Identification, record: Record) -> tuple[Part, ...]:
     problem = _problem(found, record, structure)
     theta = theta_of(structure, found.values)
     whole = evaluate(problem, theta)
-    jacobian = np.concatenate((whole.columns[: len(structure.powers)], whole.derivative))
-    size = np.maximum(np.einsum("pn,pn->p", jacobian, jacobian), 1e-300)
-    told = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
-    middle = int(np.searchsorted(told, 0.5 * told[-1]))
-    least = max(_FEWEST, 4 * whole.parameters)
-    if min(middle, problem.time.size - middle) < least:
+    halved = parted(problem, whole)
+    if halved is None:
         return ()
     scale = float(np.ptp(record.measurement))
     gain = whole.coefficients[: len(structure.powers)]
     parts = []
-    for part in (
-        problem.part(slice(None, middle)),
-        _with_free_state(problem).part(slice(middle, None)),
-    ):
+    for part in (halved[0], _with_free_state(halved[1])):
         models = _allowed(part, gain, theta, scale)
         if models:
             parts.append(Part(float(part.time[0]), float(part.time[-1]), models))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
-from relay_autotune.identification.waveform.separable import refine
+from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.float64]
@@ -45,6 +45,25 @@ class Halves:
         return self.apart <= _BY_CHANCE
 
 
+def parted(problem: Problem, state: Trial) -> tuple[Problem, Problem] | None:
+    """Part a record where half of the information on the model's parameters has come.
+
+    :param problem: of one or several experiments.
+    :param state: its fit.
+    :return: None: of several experiments, or of too few samples.
+    """
+    if len(problem.bounds) > 1:
+        return None
+    jacobian = np.concatenate((state.columns[: len(problem.structure.powers)], state.derivative))
+    size = np.einsum("pn,pn->p", jacobian, jacobian)
+    size[size == 0.0] = 1.0
+    told = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
+    middle = int(np.searchsorted(told, 0.5 * told[-1]))
+    if min(middle, problem.time.size - middle) < max(_FEWEST, 4 * state.parameters):
+        return None
+    return problem.part(slice(None, middle)), problem.part(slice(middle, None))
+
+
 def halves_of(fit: Fit, frequency: float) -> Halves | None:
     """Fit the chosen structure to either half of a record, and compare the responses.
 
@@ -57,20 +76,12 @@ def halves_of(fit: Fit, frequency: float) -> Halves | None:
     :param frequency: at which the responses are compared [rad/s].
     :return: None: it cannot be parted.
     """
-    problem, state = fit.problem, fit.state
-    if len(problem.bounds) > 1:
-        return None
-    jacobian = np.concatenate((state.columns[: len(problem.structure.powers)], state.derivative))
-    size = np.einsum("pn,pn->p", jacobian, jacobian)
-    size[size == 0.0] = 1.0
-    told = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
-    middle = int(np.searchsorted(told, 0.5 * told[-1]))
-    if min(middle, problem.time.size - middle) < max(_FEWEST, 4 * state.parameters):
+    parts = parted(fit.problem, fit.state)
+    if parts is None:
         return None
     found: list[tuple[Estimate, complex, FloatArray]] = []
-    for part in (slice(None, middle), slice(middle, None)):
-        half = problem.part(part)
-        own = refine(half, state.theta, tolerance=_TRIAL, most=_STEPS)
+    for half in parts:
+        own = refine(half, fit.state.theta, tolerance=_TRIAL, most=_STEPS)
         estimate = estimate_of(half, own, fit, Noise(False))
         if estimate is None or not estimate.known:
             return None
