@@ -101,7 +101,7 @@ def read_csv(
     except UnicodeError:
         raise BagError(f"{path} is not a text file; expected CSV in UTF-8") from None
     except csv.Error as error:
-        raise BagError(f"{path} is no CSV file: {error}") from None
+        raise BagError(f"{path} is not a CSV file: {error}") from None
     notes = table.notes
     time_ns, dated = _nanoseconds(path, chosen[0], stamps, table.has_dates, notes)
     order = _order(path, time_ns, table.lines, notes)

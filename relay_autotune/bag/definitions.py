@@ -75,7 +75,7 @@ def _installed(type_name: str, suffix: str, prefixes: Sequence[Path]) -> Iterato
     parts = type_name.split("/")
     if len(parts) != 3 or not all(re.fullmatch(r"\w+", part) for part in parts):
         raise BagError(
-            f"{type_name!r} is no message type; expected a name like std_msgs/msg/Float64"
+            f"{type_name!r} is not a message type; expected a name like std_msgs/msg/Float64"
         )
     for prefix in prefixes:
         path = prefix.joinpath("share", *parts).with_suffix(suffix)

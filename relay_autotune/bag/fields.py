@@ -75,7 +75,7 @@ def named_field(root: Struct, field: str, topic: str) -> Path:
         some = itertools.islice(_listed(kind), _LISTED)
         inner = [f"{field}{'' if p[:1] == '[' else '.'}{p}" for p in some]
         raise SelectionError(
-            f"{field!r} of {topic} is no number; expected the name of one"
+            f"{field!r} of {topic} is not a number; expected the name of one"
             + (f", such as {', '.join(inner)}" if inner else "")
         )
     return Path(root, tuple(steps))
@@ -119,7 +119,7 @@ def _steps(field: str, topic: str) -> Iterator[Step]:
         match = _STEP.match(field, at)
         if match is None:
             raise SelectionError(
-                f"{field!r} is no name of a field of {topic}; expected one such as "
+                f"{field!r} is not the name of a field of {topic}; expected one such as "
                 f"linear_acceleration.x or position[3]"
             )
         yield match[1] if match[1] else int(match[2])

@@ -52,7 +52,7 @@ class _Parser:
         while at < len(text):
             match = _TOKEN.match(text, at)
             if match is None:
-                raise ValueError(f"{text[at : at + 20]!r} is no word of IDL")
+                raise ValueError(f"{text[at : at + 20]!r} is not a word of IDL")
             if match.lastgroup is not None:
                 self._tokens.append(match.group())
             at = match.end()
@@ -126,7 +126,7 @@ class _Parser:
         elif what == "const":
             self._constant(scope)
         else:
-            raise ValueError(f"{what[:60]!r} is no definition")
+            raise ValueError(f"{what[:60]!r} is not a definition")
         self._take(";")
 
     def _struct(self, scope: tuple[str, ...]) -> None:
@@ -177,7 +177,7 @@ class _Parser:
             return _size(self._take())
         name = self._resolved(self._scoped(), scope, self._sizes)
         if name not in self._sizes:
-            raise ValueError(f"{name[:60]!r} is no size")
+            raise ValueError(f"{name[:60]!r} is not a size")
         return self._sizes[name]
 
     # --- types
@@ -225,7 +225,7 @@ class _Parser:
                 words.append(self._take())
             word = " ".join(words)
             if word not in _NUMBERS:
-                raise ValueError(f"{word!r} is no type")
+                raise ValueError(f"{word!r} is not a type")
             return (1, (_NUMBERS[word], 0))
         if word in _NUMBERS:
             return (1, (_NUMBERS[self._take()], 0))

@@ -98,7 +98,7 @@ def read_experiments(
     if path.suffix.lower() == ".csv":
         records, notes = _of_csv(path, wanted)
     elif wanted.time is not None:
-        raise SelectionError(f"--time names a column of a CSV file, but {path} is none")
+        raise SelectionError(f"--time names a column of a CSV file, but {path} is not one")
     else:
         with ExitStack() as opened:
             files: list[McapFile | SqliteFile] = []

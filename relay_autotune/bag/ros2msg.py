@@ -54,7 +54,7 @@ def _fields(text: str, owner: str) -> Fields:
             continue
         match = _LINE.match(line)
         if match is None:
-            raise ValueError(f"line {number} of {owner}, {line[:60]!r}, is no field")
+            raise ValueError(f"line {number} of {owner}, {line[:60]!r}, is not a field")
         kind, count, array, name, behind = match.groups()
         if behind == "=":
             continue

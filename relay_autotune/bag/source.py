@@ -160,7 +160,7 @@ class Source:
     def _check_start(self) -> None:
         start = self.read(0, 16)
         if not start and self.notes:
-            raise BagError(f"{self.path} is no recording: {self.notes[0]}")
+            raise BagError(f"{self.path} is not a recording: {self.notes[0]}")
         if not start:
             raise BagError(
                 f"{self.path} is empty (0 bytes); expected an MCAP recording: "

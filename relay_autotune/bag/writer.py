@@ -201,7 +201,7 @@ class BagWriter:
         self._check()
         if topic not in self._channels:
             raise BagError(
-                f"{topic} is no topic of the bag {self.path}, "
+                f"{topic} is not a topic of the bag {self.path}, "
                 f"which has {', '.join(self._channels) or 'none'}"
             )
         self._writer.add_message(

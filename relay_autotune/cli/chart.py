@@ -330,9 +330,9 @@ def identify_chart(method: str, numbers: Numbers, known: Known) -> Identificatio
     unused = [option(n) for n in numbers if n not in chart.required + chart.optional]
     if unused:
         takes = ", ".join(option(n) for n in chart.required + chart.optional)
-        raise SelectionError(f"{method} makes no use of {', '.join(unused)}; it takes {takes}")
+        raise SelectionError(f"{method} does not use {', '.join(unused)}; it takes {takes}")
     if (known.structure or known.order) and not chart.any_structure:
-        raise SelectionError(f"{method} makes no use of --structure and --order")
+        raise SelectionError(f"{method} does not use --structure and --order")
     for name, value in numbers.items():
         _require_range(name, value)
     facts = replace(

@@ -113,7 +113,9 @@ def _run(options: argparse.Namespace) -> int:
     if options.report:
         check_output(PROGRAM, options.report)
         if options.output or options.scheduler or options.jobs > 1:
-            raise SelectionError("--report cannot be had with --output, --jobs or --scheduler")
+            raise SelectionError(
+                "--report cannot be combined with --output, --jobs or --scheduler"
+            )
     if options.output:
         return _into_file(jobs, options)
     status = DONE
@@ -167,7 +169,7 @@ def _recordings(given: Sequence[str]) -> list[str]:
         return list(given)
     for name in dict.fromkeys(given):
         if name not in found:
-            say(PROGRAM, f"{name} is passed over: it is no recording (.mcap, .db3 or .csv)")
+            say(PROGRAM, f"{name} is left out: it is not a recording (.mcap, .db3 or .csv)")
     return found
 
 

@@ -167,7 +167,7 @@ def _exported(
     if only.verdict is not Verdict.TRUSTED and not accept_doubtful:
         raise RelayAutotuneError(
             f"gains are {only.verdict.name.lower()}: {only.judgement.reason}; give "
-            "--accept-doubtful to export them all the same"
+            "--accept-doubtful to export them anyway"
         )
     assert only.best_gains is not None
     return exported(only.best_gains, how, target, doubt=only.judgement.reason).rstrip("\n")

@@ -175,7 +175,7 @@ def check_output(program: str, output: str) -> None:
         return
     if path.suffix.lower() == ".html" and not is_ours(path):
         raise SelectionError(
-            f"{path} exists and is no report of this package; name another file, or take it away"
+            f"{path} exists and is not a report of this package; name another file, or remove it"
         )
     say(program, f"{path} exists and will be replaced")
 

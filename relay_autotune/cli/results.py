@@ -68,7 +68,7 @@ class Results:
         if self._table.exists() and not self.path.exists():
             raise BagError(
                 f"{self._table} exists, and there is no {self.path} that it was made of; name "
-                "another file, or take it away"
+                "another file, or remove it"
             )
         self.done: set[str] = set()
         self.status = DONE
@@ -137,7 +137,7 @@ class Results:
             return document
         raise BagError(
             f"{self.path} exists and holds something else than results of replay; "
-            f"name another file, or take it away"
+            f"name another file, or remove it"
         )
 
     def _rows(self) -> Iterator[dict[str, Any]]:

@@ -50,7 +50,7 @@ def model_of(options: argparse.Namespace) -> TransferFunction:
         model = _built(given)
         return recognised(model) if model.structure == GENERAL else model
     except ModelError as error:
-        raise SelectionError(f"this is no model: {error}") from error
+        raise SelectionError(f"this is not a model: {error}") from error
 
 
 def _built(given: dict[str, Any]) -> TransferFunction:

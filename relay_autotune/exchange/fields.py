@@ -214,7 +214,7 @@ def word(value: Any) -> str:
     :raises ValueError: if it is not made of letters, digits and underscores.
     """
     if not isinstance(value, str) or not value.isidentifier():
-        raise ValueError(f"{value!r} is no name")
+        raise ValueError(f"{value!r} is not a name")
     return value
 
 

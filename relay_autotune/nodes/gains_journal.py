@@ -136,7 +136,7 @@ class GainsJournal:
 
     def _unreadable(self, why: str) -> JournalError:
         return JournalError(
-            f"{self.path} is no journal of gains ({why}): remove it to start with the gains of "
+            f"{self.path} is not a journal of gains ({why}): remove it to start with the gains of "
             "the parameters"
         )
 

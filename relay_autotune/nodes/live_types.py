@@ -46,7 +46,7 @@ def reader_of(type_name: str, field: str) -> Reader:
 
     :param type_name: such as ``sensor_msgs/msg/Temperature``.
     :param field: path of a numeric field, such as ``position[2]`` or ``twist.linear.x``.
-    :raises ParameterError: if the type does not exist, or the field is no number.
+    :raises ParameterError: if the type does not exist, or the field is not a number.
     """
     package, _, rest = type_name.partition("/")
     try:
@@ -125,4 +125,6 @@ def _check(example: Any, path: list[str | int], type_name: str, field: str) -> N
             )
         found = getattr(found, step)
     if isinstance(found, bool) or not isinstance(found, (int, float)):
-        raise ParameterError(f"measurement_field is {field!r}, which is no number in {type_name}")
+        raise ParameterError(
+            f"measurement_field is {field!r}, which is not a number in {type_name}"
+        )

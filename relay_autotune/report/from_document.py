@@ -41,14 +41,14 @@ def read_documents(path: Path | str) -> tuple[Case, ...]:
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError:
-        raise BagError(f"{path} is no JSON: it is not in UTF-8") from None
+        raise BagError(f"{path} is not JSON: it is not in UTF-8") from None
     documents = _parsed(text, str(path))
     return tuple(case for document in documents for case in cases_of_document(document, str(path)))
 
 
 def _parsed(text: str, name: str) -> list[Any]:
     if not text.strip():
-        raise BagError(f"{name} is no JSON: it is empty; expected what `replay --json` prints")
+        raise BagError(f"{name} is not JSON: it is empty; expected what `replay --json` prints")
     try:
         try:
             return [json.loads(text)]
@@ -56,7 +56,7 @@ def _parsed(text: str, name: str) -> list[Any]:
             return [json.loads(line) for line in text.splitlines() if line.strip()]
     except (ValueError, RecursionError) as error:
         raise BagError(
-            f"{name} is no JSON: {error}; expected what `replay --json` prints"
+            f"{name} is not JSON: {error}; expected what `replay --json` prints"
         ) from error
 
 
@@ -77,7 +77,8 @@ def cases_of_document(document: Any, name: str) -> tuple[Case, ...]:
             ArithmeticError, RecursionError, MemoryError) as error:  # fmt: skip
         what = f"no field {error}" if isinstance(error, KeyError) else visible(str(error))
         raise BagError(
-            f"{name} is no result of an experiment ({what}); expected what `replay --json` prints"
+            f"{name} is not a result of an experiment ({what}); expected what `replay --json` "
+            "prints"
         ) from error
 
 

@@ -89,8 +89,8 @@ def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
         reason = f"PID would still have {100.0 * share:.0f} % of its IAE"
     elif search.noise is None:
         reason = (
-            f"PID would have {100.0 * share:.0f} % of its IAE, but what it makes of the noise is "
-            "not known without noise, amplitude and sampling period"
+            f"PID would have {100.0 * share:.0f} % of its IAE, and is chosen where noise, "
+            "amplitude and sampling period are given, as by a recording"
         )
     else:
         reason = f"{_promise(other, search)}; its IAE is {100.0 * share:.0f} % of that of PI"

@@ -174,12 +174,16 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
     }
     for name, (value, asked) in bounds.items():
         if value > _HELD * asked:
-            found.append(f"{name} is {value:.3g}, above the {asked:g} that was asked for")
+            found.append(
+                f"{name} is {value:.3g}, above the {asked:g} asked for; choose another rule, or "
+                f"allow more by {name.lower()}"
+            )
     noise = performance.noise_gain * options.noise_std
     known = options.sample_period > 0.0 and options.amplitude > 0.0
     if known and noise > _HELD * options.noise_share * options.amplitude:
         found.append(
             f"the noise alone moves the command by {noise:.3g} (standard deviation), "
-            f"{100.0 * noise / options.amplitude:.0f} % of the relay's amplitude"
+            f"{100.0 * noise / options.amplitude:.0f} % of the relay's amplitude; filter the "
+            "measurement, or ask for PI"
         )
     return tuple(found)

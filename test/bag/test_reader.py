@@ -346,7 +346,7 @@ def test_flipped_bytes_never_break_the_reader(data, tmp_path_factory):
         (b"hello, world, this is text", r"not an MCAP file: it begins with b'hello, w'"),
         (b"SQLite format 3\0" + bytes(100), "not an MCAP file: it is an SQLite file"),
         (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
-        (b"\x28\xb5\x2f\xfd0000000", r"is no recording: bag\.mcap cannot be expanded"),
+        (b"\x28\xb5\x2f\xfd0000000", r"is not a recording: bag\.mcap cannot be expanded"),
     ],
 )
 def test_a_file_that_is_no_recording(tmp_path, content, sentence):

@@ -409,7 +409,7 @@ def test_types_that_double_are_gone_through_once():
     root = message_type(channel(doubling(38, "float64")))
     with pytest.raises(SelectionError, match=r"name one, as in /t:b\.a\.a"):
         named_field(root, "", "/t")
-    with pytest.raises(SelectionError, match="'header' of /t is no number"):
+    with pytest.raises(SelectionError, match="'header' of /t is not a number"):
         named_field(root, "header", "/t")
 
 

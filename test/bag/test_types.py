@@ -458,11 +458,11 @@ def test_fields_that_are_not_there_are_refused_with_those_that_are():
     assert only_field(root) is None
     for field, sentence in (
         ("linear.x", r"no field 'linear.x'; it has orientation.x, orientation.y"),
-        ("orientation", r"is no number; expected the name of one, such as orientation.x"),
+        ("orientation", r"is not a number; expected the name of one, such as orientation.x"),
         ("orientation_covariance[9]", r"an array of 9 elements ends at \[8\]"),
-        ("orientation..x", "is no name of a field"),
+        ("orientation..x", "is not the name of a field"),
         ("", "holds several numbers; name one, as in /t:orientation.x"),
-        ("header.frame_id", "is no number"),
+        ("header.frame_id", "is not a number"),
     ):
         with pytest.raises(SelectionError, match=sentence):
             named_field(root, field, "/t")

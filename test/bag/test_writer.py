@@ -123,7 +123,7 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path):
 
 def test_an_unknown_topic_and_a_closed_bag_are_refused(tmp_path):
     bag = BagWriter(tmp_path / "bag", [Topic("/m")], start_ns=START)
-    with pytest.raises(BagError, match=r"/x is no topic of the bag .* which has /m"):
+    with pytest.raises(BagError, match=r"/x is not a topic of the bag .* which has /m"):
         bag.write("/x", 1, 1, b"")
     bag.close()
     bag.close()

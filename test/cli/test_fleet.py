@@ -279,7 +279,7 @@ def test_what_is_no_recording_is_passed_over_with_a_line(tmp_path, capsys):
     output = tmp_path / "fleet.csv"
     given = sorted(tmp_path.iterdir())
     status, _, err = run(capsys, *QUICK, "--jobs", 2, "--output", output, *given)
-    passed_over = [line for line in err.splitlines() if "is passed over" in line]
+    passed_over = [line for line in err.splitlines() if "is left out" in line]
     assert [line.split()[1] for line in passed_over] == [
         str(tmp_path / "README.md"),
         str(tmp_path / "pictures"),

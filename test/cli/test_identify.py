@@ -96,13 +96,13 @@ WANG = "--method wang --period-high 1 --period-low 1 --peak-max 1 --peak-min -1 
     ("arguments", "message"),
     [
         ("--method chang --period 33", "chang also needs --amplitude, --relay, --dead-time"),
-        (f"--method chang {EXAMPLE} --dead-time 10 --bias 1", "makes no use of --bias"),
+        (f"--method chang {EXAMPLE} --dead-time 10 --bias 1", "does not use --bias"),
         ("--method nonsense --period 3", "unknown method 'nonsense'; known: "),
         ("--method atv --period -3 --amplitude 1 --relay 1 --dead-time 1", "finite and > 0"),
         ("--method atv --period 3 --amplitude 1 --relay 1 --dead-time -1", "finite and >= 0"),
-        ("--method chang --period x", "'x' is no number"),
+        ("--method chang --period x", "'x' is not a number"),
         (f"{WANG} --bias 0.1", "also needs --gain, or --mean-measurement and --mean-command"),
-        (f"{WANG} --bias 0.1 --structure sopdt", "makes no use of --structure"),
+        (f"{WANG} --bias 0.1 --structure sopdt", "does not use --structure"),
         (
             f"--method chang {EXAMPLE} --dead-time 10 --order -1",
             "order is -1, expected from 0 to 20",

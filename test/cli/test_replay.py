@@ -288,7 +288,7 @@ def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):
 
 BAD_FILES = {
     "empty.mcap": b"",
-    "text.mcap": b"this is no recording at all",
+    "text.mcap": b"this is not a recording at all",
     "short.mcap": b"\x89MCAP0\r\n\x01",
     "empty.csv": b"",
     "constant.csv": b"t,y,u\n0,1,0\n1,1,1\n2,1,0\n",

@@ -96,9 +96,9 @@ def test_results_of_several_recordings_share_a_page(capsys, tmp_path, result, mo
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        ("", "is no JSON"),
-        ("{", "is no JSON"),
-        ("[1]", "is no result of an experiment"),
+        ("", "is not JSON"),
+        ("{", "is not JSON"),
+        ("[1]", "is not a result of an experiment"),
         ('{"bag": "b", "experiments": [{}]}', "no field 'limit_cycle'"),
         ('{"bag": "b"}', "no field 'experiments'"),
     ],

@@ -112,7 +112,7 @@ def test_a_state_that_was_overtaken_is_left_out(tmp_path):
 def test_a_file_that_is_no_journal_is_refused(tmp_path, text):
     journal = journal_in(tmp_path)
     journal.path.write_text(text)
-    with pytest.raises(JournalError, match=r"is no journal of gains .*remove it"):
+    with pytest.raises(JournalError, match=r"is not a journal of gains .*remove it"):
         journal.load()
 
 

@@ -108,7 +108,7 @@ def test_a_journal_that_cannot_be_read_or_written(rig: Rig) -> None:
     name.write_text("torn")
     third = rig.start("controller_node", **loop.parameters)
     assert third.wait() == 2
-    assert "is no journal of gains" in third.log
+    assert "is not a journal of gains" in third.log
     name.unlink()
     name.with_suffix(".lock").unlink()
     rig.records.rmdir()

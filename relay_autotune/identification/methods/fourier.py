@@ -219,7 +219,7 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
     elif not _covered(point.frequency, harmonics):
         remarks.append(
             f"the ultimate frequency lies outside the points, which begin at "
-            f"{harmonics[0].frequency:.4g} rad/s: K_u and w_u hang on the structure of the model"
+            f"{harmonics[0].frequency:.4g} rad/s: K_u and w_u depend on the structure of the model"
         )
     return replace(
         found,

@@ -215,8 +215,8 @@ def _beside_rivals(found: Identification, fit: Fit, noise: Noise) -> Identificat
     told = (
         "whether the process integrates is not in the data: a stable "
         f"{best.model.structure} with gain {best.model.gain:.3g} has {100 * best.support:.0f} "
-        "% of the support; a biased relay or a longer step would tell; K_u and w_u are "
-        "determined all the same"
+        "% of the support; a biased relay or a longer step would tell; K_u and w_u do not "
+        "depend on it"
     )
     return replace(found, warnings=(*found.warnings, told))
 
@@ -298,12 +298,16 @@ def _warnings(
         if math.isfinite(measured) and rms > max(_UNEXPLAINED * measured, 1e-6 * fit.scale):
             found.append(
                 f"{which}the residual ({rms:.3g} rms) is larger than the noise measured before "
-                f"the test ({measured:.3g}): the model leaves part of the response unexplained"
+                f"the test ({measured:.3g}): look in the report at what the model leaves"
             )
         if record.lost_samples:
-            found.append(f"{which}{record.lost_samples} samples were lost on the way")
+            found.append(
+                f"{which}{record.lost_samples} samples were lost on the way; check the network"
+            )
     if fit.problem.drift:
-        found.append("the measurement drifts; the drift was fitted together with the model")
+        found.append(
+            "the measurement drifts, and the drift was fitted with the model; wait for rest"
+        )
     if (fit.problem.relaxation or fit.problem.past) and any(map(_from_baseline, records)):
         found.append(
             "the process was not at rest at the baseline when the test began, and its way there "
