@@ -338,6 +338,7 @@ def test_a_relay_on_the_set_point_keeps_the_loop_closed(rig: Rig) -> None:
     assert models[-1].dead_time == pytest.approx(0.4, abs=0.06)
 
 
+@pytest.mark.nightly
 def test_a_relay_on_the_set_point_ends_when_it_knows_enough(rig: Rig) -> None:
     wanted = rig.listen("controller_command", Float64, RELIABLE)
     models = rig.listen("transfer_function", TransferFunction)

@@ -22,7 +22,7 @@ def test_the_demo_tunes_and_leaves_bag_result_and_picture(tmp_path: Path) -> Non
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=90,
+        timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the same gains to the last digit" in done.stdout

@@ -24,8 +24,8 @@ from std_msgs.msg import Float64
 
 from relay_autotune_msgs.msg import RelayExperiment
 
-# Number of moments for each fault; `benchmarks/fault_table.py` uses two hundred.
-RUNS = 3
+# Moments of a fault; `benchmarks/fault_table.py` tries two hundred.
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +55,15 @@ def loop(loop_of: Callable[[str], Loop]) -> Loop:
     return loop
 
 
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_ends_in_the_safe_command(loop_of: Callable[[str], Loop], name: str) -> None:
-    loop = loop_of(FAULTS[name].kind)
-    for seed in range(RUNS):
-        FAULTS[name].course(loop, Random(f"{name} {seed}"))
+def test_a_fault_ends_in_the_safe_command(
+    loop_of: Callable[[str], Loop], name: str, seed: int
+) -> None:
+    FAULTS[name].course(loop_of(FAULTS[name].kind), Random(f"{name} {seed}"))
 
 
-@pytest.mark.parametrize("seed", range(RUNS))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_an_actuator_that_sticks_for_a_moment_is_no_end_of_all_cycles(
     loop: Loop, seed: int
 ) -> None:
@@ -79,8 +80,8 @@ def test_an_actuator_that_sticks_for_a_moment_is_no_end_of_all_cycles(
     loop.rig.until(lambda: loop.commands[-1] in (BASELINE, SAFE), "the end")
     commands = list(ended.command)
     switches = sum(a != b for a, b in itertools.pairwise(commands))
-    # Twelve cycles, and as many half cycles as three of the long stays hold.
-    assert switches < 2 * 12 + 60
+    # Twelve cycles, and three times that none is clear for three of the long stays, 40 switches.
+    assert switches < 2 * 12 + 3 * 40
     if ended.outcome == RelayExperiment.COMPLETED:
         assert len(ended.cycle_start) > 3
     loop.check_that_it_stays(commands[-1])
@@ -117,7 +118,7 @@ def test_what_there_are_two_of_refuses_the_next_tune(loop: Loop, topic: str, sai
     loop.rig.until(lambda: loop.rig.ask_for_tune(dry_run=True).accepted, "a loop that is ready")
 
 
-@pytest.mark.parametrize("seed", range(RUNS))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_commands_stay_within_their_limits_and_rate(loop: Loop, seed: int) -> None:
     random = Random(seed)
     top, rate = random.uniform(1.3, 1.5), random.uniform(20.0, 60.0)

@@ -79,6 +79,7 @@ def test_the_commands_for_a_tune_in_lockstep_give_the_same_gains_every_time(rig:
     assert gains[0].ti == pytest.approx(wanted.ti, rel=0.05)
 
 
+@pytest.mark.nightly
 def test_the_job_of_a_build_server_gives_gains_and_ends_its_nodes(rig: Rig) -> None:
     """The block is run as it is written, with all nodes started at once."""
     text = block_noted("docs/quick_start.md", "tested: a job of a build server").text

@@ -157,6 +157,7 @@ def test_simulated_time_from_end_to_end(rig: Rig) -> None:
     assert model.dead_time == pytest.approx(0.5, abs=0.06)
 
 
+@pytest.mark.nightly
 def test_real_time(rig: Rig) -> None:
     results = Results(rig)
     rig.plant(
