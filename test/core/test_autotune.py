@@ -43,6 +43,7 @@ def test_a_completed_experiment_yields_models_and_gains():
     assert len(found.cycles) >= 3
 
 
+@pytest.mark.long
 def test_the_chosen_method_and_rule_come_first():
     found = analyse(_record(), method="wang_biased", rule="imc")
     assert found.model.method == "wang_biased"

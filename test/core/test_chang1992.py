@@ -133,6 +133,7 @@ def test_the_generalised_equations_return_the_process(model, share):
         assert both == pytest.approx((model.gain, tau), rel=1e-9)
 
 
+@pytest.mark.long
 def test_the_papers_iteration_over_harmonics_converges_to_the_exact_time_constant():
     period, amplitude, _ = _cycle(PROCESSES[2], 0.0)
     relative = amplitude / (2.0 * RELAY)

@@ -122,6 +122,7 @@ def test_a_load_that_walks_at_random_beside_a_relay_test():
         assert error < 3.5 * found.ultimate_gain_std
 
 
+@pytest.mark.long
 def test_a_heater_that_is_switched_on_with_the_first_sample():
     """The command before is nowhere in the record, nor is the dead time before it acts."""
     time = np.arange(900.0)

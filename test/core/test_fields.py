@@ -158,6 +158,7 @@ def test_every_field_of_a_result_is_declared(kind):
     assert all(each.meaning for each in told_fields(kind))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [k for k in RESULTS if k not in (LimitCycle, Cycle, Progress)])
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())

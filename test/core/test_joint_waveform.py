@@ -59,6 +59,7 @@ def test_a_drift_of_each_record_and_a_start_in_motion_are_its_own():
     assert found.values == pytest.approx(TRUTH, rel=1e-6)
 
 
+@pytest.mark.long
 def test_two_short_noisy_records_halve_the_variance():
     records = [_record(noise=0.1, seed=s) for s in range(24)]
     single = [identify_jointly((r,), "waveform", FOPDT) for r in records]
@@ -102,6 +103,7 @@ def test_records_of_opposite_direction_are_refused():
         identify_jointly((one, two), "waveform")
 
 
+@pytest.mark.long
 def test_a_joint_model_gets_gains():
     records = [
         replace(r, outcome=Outcome.COMPLETED) for r in (_record(), _record(bias=0.3, seed=1))

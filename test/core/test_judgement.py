@@ -104,6 +104,7 @@ def test_a_model_that_would_have_run_away_is_refused(record, gains):
     assert "growth" not in findings(record, PROCESS, gains)
 
 
+@pytest.mark.long
 def test_a_rival_on_which_the_loop_is_unstable_makes_gains_doubtful(record, gains):
     own = identify(record, "waveform")
     same = findings(record, own.model, gains, others=(own,))["rivals"]
@@ -117,6 +118,7 @@ def test_a_rival_on_which_the_loop_is_unstable_makes_gains_doubtful(record, gain
     assert findings(record, own.model, gains, others=(worse,))["rivals"].result is Result.PASSED
 
 
+@pytest.mark.long
 def test_steps_and_relays_of_ordinary_processes_are_trusted(record):
     assert analyse(record).verdict is Verdict.TRUSTED
     assert completed().verdict is Verdict.TRUSTED
@@ -224,6 +226,7 @@ def test_a_half_that_shows_nothing_objects_to_nothing(gains):
     assert found["halves_direction"].result is Result.PASSED
 
 
+@pytest.mark.long
 def test_a_plain_model_that_explains_as_much_speaks_against_gains_of_another(record, gains):
     weak = TransferFunction.fopdt(0.4, 10.0, 3.0)
     strong = analyse_alone(steps(weak)).best_gains
@@ -325,6 +328,7 @@ def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
     assert lost_effect(record, heater) is None
 
 
+@pytest.mark.long
 def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse_alone(clipped_steps(9.0)).verdict is Verdict.TRUSTED
     assert analyse_alone(clipped_steps(0.7)).verdict is not Verdict.TRUSTED

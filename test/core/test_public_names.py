@@ -34,6 +34,7 @@ def test_the_package_alone_loads_nothing() -> None:
     assert not loaded_by("import relay_autotune") & {"numpy", "scipy", "matplotlib", "mcap"}
 
 
+@pytest.mark.long
 def test_what_draws_is_loaded_when_it_draws() -> None:
     loaded = loaded_by("from relay_autotune import analyse, draw, write_report")
     assert not loaded & {"matplotlib", "jinja2", "mcap"}

@@ -43,6 +43,7 @@ def test_methods_for_an_ideal_relay_step_aside(method):
     assert identify(_record(0.0), method).model.gain > 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "model",
     [TransferFunction.fopdt(1.65, 20.0, 10.0), TransferFunction.integrator_lag(0.5, 2.0, 1.0)],

@@ -100,6 +100,7 @@ def test_a_load_that_stops_the_oscillation_is_borne():
     check(tune, rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("load_time", "load_size"), [(90.0, 0.8), (110.0, 1.5)])
 def test_a_load_that_stops_the_first_cycle_is_borne(load_time, load_size):
     tune = run(load_time=load_time, load_size=load_size, noise_std=0.01, max_cycles=20)

@@ -81,6 +81,7 @@ def test_the_least_ms_on_an_unstable_process(ratio, pi, pid):
     assert search.least_ms(derivative=True) == pytest.approx(pid, rel=0.015)
 
 
+@pytest.mark.long
 def test_an_infeasible_bound_is_relaxed_with_a_warning():
     model = TransferFunction.unstable_fopdt(2.0, 3.0, 0.9)
     options = DesignOptions(controller="pi")

@@ -346,6 +346,7 @@ def test_unstable_processes_are_held_nearly_as_well_as_any_gains_could(ratio, ki
     assert least[ratio] < ms < 1.15 * 1.11 * least[ratio]
 
 
+@pytest.mark.long
 def test_an_unstable_process_beyond_reach_is_refused():
     with pytest.raises(TuningError, match="1 is the limit"):
         unstable(task(_T.unstable_fopdt(1.0, 1.0, 1.2), controller="pi"))
@@ -421,6 +422,7 @@ ANY = {
 }
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=15)
 @given(
     gain=st.floats(0.05, 50.0) | st.floats(-50.0, -0.05),

@@ -26,6 +26,7 @@ from relay_autotune.record.record import RelaySettings
 PROCESS = TransferFunction.fopdt(2.0, 3.0, 1.0)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=150)
 @given(
     amplitude=st.floats(1e-6, 2.0),

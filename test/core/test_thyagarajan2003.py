@@ -142,6 +142,7 @@ def test_an_unstable_fopdt_process_with_hysteresis(relay, dead_time):
     assert forward == pytest.approx((s.period, s.amplitude), rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("relay", RELAYS)
 @pytest.mark.parametrize("ratio", [0.001, 0.01, 0.1])
 def test_two_equal_lags_with_hysteresis(relay, ratio):

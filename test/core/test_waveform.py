@@ -207,6 +207,7 @@ def test_whether_a_slow_process_integrates_is_said_to_be_open():
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("measurement", "command", "said"),
     [
@@ -291,6 +292,7 @@ def test_spikes_of_the_sensor_are_left_out_and_told():
     assert int(np.sum(np.isnan(found.fitted))) == 9
 
 
+@pytest.mark.long
 def test_clean_records_have_no_outliers():
     for seed in range(20):
         found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)

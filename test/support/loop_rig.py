@@ -36,7 +36,7 @@ LATCHED = QoSProfile(
 RELIABLE = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
 
 # Deadline for a busy machine; a passing test does not wait for it.
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 
 class Process:

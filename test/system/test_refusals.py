@@ -375,6 +375,7 @@ sys.exit(identifier.main())
 """
 
 
+@pytest.mark.nightly
 def test_an_identifier_that_takes_long_is_waited_for_and_says_if_nothing_comes(rig: Rig) -> None:
     start_plant(rig)
     identifier = rig.start_python("late_identifier", LATE)

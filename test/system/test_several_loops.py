@@ -61,6 +61,7 @@ class Loop:
         self.answer = self.rig.until(accepted, f"start of {self.name}")
 
 
+@pytest.mark.nightly
 def test_two_loops_tune_at_once(rig: Rig) -> None:
     loops = [Loop(rig, name) for name in LOOPS]
     for loop in loops:
