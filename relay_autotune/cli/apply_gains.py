@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
-from relay_autotune.cli.layout import in_columns, labelled, width
+from relay_autotune.cli.layout import Help, in_columns, labelled, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.text import digits, duration
 
@@ -61,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=Help,
         epilog="Example:\n  apply_gains --namespace tank --step 0.5",
     )
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of the loop")

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import sys
@@ -52,6 +53,32 @@ def broken(text: str, columns: int) -> list[str]:
         else:
             lines += textwrap.wrap(part, columns, break_long_words=False, break_on_hyphens=False)
     return lines or [""]
+
+
+def paragraphs(text: str, columns: int) -> str:
+    """Return text with its paragraphs filled; lines that begin with a blank stay as they are.
+
+    :param text: lines, as in a docstring.
+    :param columns: that a line may have.
+    """
+    done: list[str] = []
+    words: list[str] = []
+    for line in [*text.splitlines(), ""]:
+        if line[:1].strip():
+            words += line.split()
+            continue
+        if words:
+            done += broken(" ".join(words), columns)
+            words = []
+        done.append(line)
+    return "\n".join(done).strip("\n")
+
+
+class Help(argparse.RawDescriptionHelpFormatter):
+    """The help of a command: paragraphs as wide as the terminal, examples as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n".join(indent + line for line in paragraphs(text, width).splitlines())
 
 
 def labelled(

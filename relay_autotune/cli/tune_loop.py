@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
 from relay_autotune.cli.export import Target, exported, write
-from relay_autotune.cli.layout import width
+from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     START_WITHIN,
     add_new_loop,
@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=Help,
         epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5 --report tank.html",
     )
     parser.add_argument(

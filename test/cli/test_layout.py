@@ -16,7 +16,7 @@ from analysed import completed
 from relay_autotune.cli import arguments, layout, tune
 from relay_autotune.cli.table import table
 
-COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag")
+COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag", "tune_loop", "apply_gains")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
