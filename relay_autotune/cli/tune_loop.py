@@ -257,7 +257,7 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
         return _nothing_started(client, options)
     if not options.json:
         paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-        print("\n".join(result_lines(result, cancelled, paint)), flush=True)
+        print("\n".join(result_lines(result, cancelled, paint, width())), flush=True)
     flags, report = _afterwards(client, options)
     # Gains of nodes that end with this command cannot be asked for later.
     controllers = [] if is_new_loop(options) else client.controllers()

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from relay_autotune.cli.layout import WIDEST, labelled
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.exchange.messages import transfer_function_from_message
@@ -29,7 +30,6 @@ OUTCOMES = ("unknown", "completed", "aborted", "failed")
 NARROWEST = 80
 
 _BAR = 16
-_TEXT = 78
 _GREEN, _YELLOW, _RED, _BOLD, _DIM, _PLAIN = "32", "33", "31", "1", "2", "0"
 # Where the text of a check begins: after its mark and its name.
 _CHECK_INDENT = 20
@@ -158,47 +158,50 @@ def check_lines(checks: Sequence[str], width: int) -> list[str]:
     ]
 
 
-def result_lines(result: Any, cancelled: bool, paint: Paint) -> list[str]:
+def result_lines(result: Any, cancelled: bool, paint: Paint, columns: int = WIDEST) -> list[str]:
     """Return the result of a tune.
 
     :param result: a `Tune.Result` with an experiment.
     :param cancelled: True if this command cancelled it.
     :param paint: the look of text.
+    :param columns: that a line may have.
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
-    told = outcome if result.reason == outcome else f"{outcome}: {result.reason}"
-    first, *rest = textwrap.wrap(told, _TEXT)
-    first = paint(outcome, f"{_BOLD};{colour}") + first.removeprefix(outcome)
-    lines = [f"  {'tune':<16} {first}", *_continued(rest)]
+    repeats = result.reason.startswith(outcome)
+    told = result.reason if repeats else f"{outcome}: {result.reason}"
+    first, *rest = labelled("tune", told, columns)
+    lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]
     if outcome != "completed":
-        lines.append(f"  {'':<16} the plant is left at the safe command; no gains are given")
+        left = "the plant is left at the safe command; no gains are given"
+        lines += labelled("", left, columns)
     if result.transfer_function.experiment_id:
-        lines += ["", *model_lines(result.transfer_function, paint)]
+        lines += ["", *model_lines(result.transfer_function, paint, columns)]
     if result.transfer_function.experiment_id:
-        lines += ["", *_verdict_lines(result, paint)]
+        lines += ["", *_verdict_lines(result, paint, columns)]
     if result.gains.experiment_id:
-        lines += ["", *gains_lines(result.gains, Verdict(result.verdict))]
-    lines += ["", f"  {'recording':<16} {result.bag or 'none'}"]
+        lines += ["", *gains_lines(result.gains, Verdict(result.verdict), columns)]
+    lines += ["", *labelled("recording", result.bag or "none", columns)]
     return lines
 
 
-def _verdict_lines(result: Any, paint: Paint) -> list[str]:
+def _verdict_lines(result: Any, paint: Paint, columns: int) -> list[str]:
     """Return the verdict in its colour, with what to look at."""
     verdict = Verdict(result.verdict)
     colour = {Verdict.TRUSTED: _GREEN, Verdict.DOUBTFUL: _YELLOW}.get(verdict, _RED)
     lines = [f"  {'verdict':<16} {paint(verdict.name.lower(), f'{_BOLD};{colour}')}"]
-    return lines + _continued(textwrap.wrap(result.verdict_reason, _TEXT))
+    return lines + (labelled("", result.verdict_reason, columns) if result.verdict_reason else [])
 
 
-def model_lines(message: Any, paint: Paint) -> list[str]:
+def model_lines(message: Any, paint: Paint, columns: int = WIDEST) -> list[str]:
     """Return an identified model with its accuracy.
 
     :param message: a `TransferFunction`.
     :param paint: the look of text.
+    :param columns: that a line may have.
     """
     process = process_text(transfer_function_from_message(message))
-    lines = [f"  {'process':<16} {process}   ({message.structure}, {message.method})"]
+    lines = labelled("process", f"{process}   ({message.structure}, {message.method})", columns)
     for name, low, high in zip(
         message.parameters, message.ci95_low, message.ci95_high, strict=True
     ):
@@ -214,15 +217,10 @@ def model_lines(message: Any, paint: Paint) -> list[str]:
         )
     if math.isfinite(message.fit):
         lines.append(f"  {'  fit':<16} {100.0 * message.fit:.2f} %")
-    label = paint(f"{'  warning':<16}", _YELLOW)
     for text in message.warnings:
-        first, *rest = textwrap.wrap(text, _TEXT)
-        lines += [f"  {label} {first}", *_continued(rest)]
+        first, *rest = labelled("  warning", text, columns)
+        lines += [first.replace("warning", paint("warning", _YELLOW), 1), *rest]
     return lines
-
-
-def _continued(lines: Sequence[str]) -> list[str]:
-    return [f"  {'':<16} {line}" for line in lines]
 
 
 def next_commands(

@@ -294,6 +294,21 @@ def test_a_tune_without_gains_offers_none() -> None:
     assert document(stopped, "/relay_node", True)["gains"] is None
 
 
+def test_a_reason_that_begins_with_the_outcome_does_not_repeat_it() -> None:
+    reason = "cancelled; 3 samples repeat the one before, since the sensor was silent"
+    stopped = result(outcome=Tune.Result.ABORTED, reason=reason, bag="/records/x")
+    assert result_lines(stopped, True, Paint())[0].split(maxsplit=1) == ["tune", reason]
+
+
+def test_a_result_fits_80_columns_and_no_word_is_broken() -> None:
+    tune = completed()
+    tune.reason = "3 cycles agree within 2 %, allowing for noise; 1 cycle was disturbed " * 2
+    tune.transfer_function.warnings = ["look at /home/somebody/records/2026-11-20/of_a_tank " * 3]
+    narrow, broad = (result_lines(tune, False, Paint(), columns) for columns in (80, 99))
+    assert max(map(len, narrow)) <= 80 < max(map(len, broad)) <= 99
+    assert " ".join(narrow).split() == " ".join(broad).split()
+
+
 def test_the_document_is_json_with_null_for_what_is_not_estimated() -> None:
     found = json.loads(json.dumps(document(completed(), "/tank/relay_node", False)))
     assert found["outcome"] == "completed"
