@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,15 @@ if TYPE_CHECKING:
 
 # How long the nodes may take to start on a busy machine [s].
 START_WITHIN = 30.0
+# What a checklist says to type, and the flags that give these parameters here.
+_TYPED = re.compile(r"; type: ros2 param set \S+ (\w+) \w+$")
+_FLAGS = {
+    "baseline": "--at",
+    "measurement_min": "--within",
+    "measurement_max": "--within",
+    "command_min": "--command-within",
+    "command_max": "--command-within",
+}
 
 
 def add_new_loop(parser: argparse.ArgumentParser) -> None:
@@ -126,6 +136,14 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         relay += ["-p", f"{name}:={number(value) if isinstance(value, float) else value}"]
     nodes = {"relay_node": relay}
     return OwnNodes(nodes if options.record_only else nodes | {"identifier_node": named})
+
+
+def with_flags(check: str) -> str:
+    """Return a line of the checklist with the flag to give in place of a node's parameter.
+
+    :param check: the line; its node ends with the command, so that nothing can be set on it.
+    """
+    return _TYPED.sub(lambda found: f"; give {_FLAGS.get(found[1], found[1])}", check)
 
 
 def asked_for_file(what: str) -> str:

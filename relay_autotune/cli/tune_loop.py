@@ -39,6 +39,7 @@ from relay_autotune.cli.new_loop import (
     is_new_loop,
     nodes_for,
     own_namespace,
+    with_flags,
 )
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (
@@ -62,8 +63,9 @@ if TYPE_CHECKING:
 PROGRAM = "tune_loop"
 # Time between two updates of a terminal [s].
 _TICK = 0.25
-# Part of the checklist's line on rest while few samples have come.
-NOT_KNOWN_YET = "not known yet"
+# Parts of the checklist's lines on rest while few samples have come, and on the model while
+# identifier_node is not discovered.
+NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
 # How long to wait for what the report needs from the nodes [s].
 _PATIENCE = 5.0
 
@@ -216,13 +218,16 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
             while not client.done():
                 client.spin(_TICK)
             checks = list(client.result.checks)
-            # Right after its start the node does not know yet whether the process is at rest.
-            if not client.not_ready_yet and not any(NOT_KNOWN_YET in line for line in checks):
+            # Right after its start the node does not know all of these yet.
+            awaited = (NOT_KNOWN_YET,) if options.record_only else (NOT_KNOWN_YET, NO_MODEL)
+            lacking = any(text in line for line in checks for text in awaited)
+            if not (client.not_ready_yet or lacking):
                 break
             if time.monotonic() > deadline:
                 break
             time.sleep(_TICK)
-    print("\n".join(check_lines(checks, width())), flush=True, file=sys.stderr)
+    shown = check_lines(list(map(with_flags, checks)), width())
+    print("\n".join(shown), flush=True, file=sys.stderr)
     if not client.succeeded:
         say(PROGRAM, f"{client.name} refuses: {client.result.reason}")
         return False

@@ -29,6 +29,8 @@ from relay_autotune.errors import LoopError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import ARRAY, reader_of
 
+# Topics of every node.
+_COMMON = {"/rosout", "/parameter_events"}
 # How long present commands are listened to [s].
 _LISTEN = 1.0
 # Topics that are named where one is missing.
@@ -169,7 +171,7 @@ class LoopClient:
         )
         if self._wait(lambda: bool(ends_of(name)), time.monotonic() + patience):
             return str(ends_of(name)[0].topic_type)
-        own = {end.topic_name for end in (*node.publishers, *node.subscriptions)}
+        own = {end.topic_name for end in (*node.publishers, *node.subscriptions)} | _COMMON
         there = [n for n, _ in node.get_topic_names_and_types() if n not in own and ends_of(n)]
         near = sorted(there, key=lambda other: SequenceMatcher(None, name, other).ratio())[::-1]
         what = "publisher" if published else "subscription"

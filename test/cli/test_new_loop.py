@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from relay_autotune.cli import new_loop
-from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for
+from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, SelectionError
 
 
@@ -90,6 +90,13 @@ def test_the_command_that_is_heard_needs_only_enter(typed: list[str]) -> None:
 def test_a_controller_in_the_loop_tells_the_baseline_by_itself(typed: list[str]) -> None:
     given = options("--within", "1", "9", "--command-within", "0", "5")
     assert "baseline" not in arguments(Looker(controlled=True), given)
+
+
+def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> None:
+    check = "NO    present       too low; type: ros2 param set /t/relay_node measurement_min LIMIT"
+    assert with_flags(check) == "NO    present       too low; give --within"
+    other = "note  model         no identifier_node; type: ros2 run relay_autotune identifier_node"
+    assert with_flags(other) == other
 
 
 def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
