@@ -17,6 +17,10 @@ from typing import Any
 from rclpy.node import Node
 
 from relay_autotune.errors import ModelError, RelayAutotuneError, TuningError
+
+# Loaded now, though it is needed only for the first model: that comes in a tune, and loading takes
+# most of a second, in which no measurement would be answered.
+from relay_autotune.exchange import models  # noqa: F401
 from relay_autotune.exchange.evidence import Evidence, check_finding
 from relay_autotune.exchange.messages import (
     finding_from_message,

@@ -18,7 +18,7 @@ from rclpy.action import ActionClient
 from std_msgs.msg import Float64
 
 from relay_autotune_msgs.action import Verify
-from relay_autotune_msgs.msg import RelayExperiment, TransferFunction
+from relay_autotune_msgs.msg import RelayExperiment, TransferFunction, Verification
 
 PLANT: dict[str, Any] = {
     "sample_period": 0.01,
@@ -117,6 +117,7 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
     rig.until(lambda: len(commands) > 60, "a closed loop")
     # The sensor's only message at rest.
     assert len(values) < 10
+    steps = rig.listen("verification", Verification)
     client = ActionClient(rig.node, Verify, "controller_node/verify")
     rig.until(client.server_is_ready, "the action")
     sent = client.send_goal_async(Verify.Goal(setpoint_step=0.5))
@@ -126,7 +127,7 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
     client.destroy()
     result = answer.result().result
     assert result.passed, result.reason
-    (step,) = result.steps
+    (step,) = rig.until(lambda: steps, "the samples of the step")
     assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
     # No gap, although the sensor is silent once the loop has settled.
     assert np.median(np.diff(step.time)[-20:]) == pytest.approx(0.04, abs=0.021)
