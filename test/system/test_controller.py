@@ -108,18 +108,21 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     assert max(abs(m.data - 1.0) for m in commands[before:]) < 0.25
     # Gains are applied only on request.
     assert "wait: kc" in controller.log
-    done = subprocess.run(
+    process = subprocess.Popen(
         [shutil.which("apply_gains"), "--yes", "--step", "0.2", "--load", "0.1"],
-        env=rig.environment, capture_output=True, text=True, timeout=90.0,
+        env=rig.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    *shown, verdict, first, second, _, last = done.stdout.splitlines()
+    # Taking messages meanwhile, so that none wait in the queue afterwards.
+    rig.until(lambda: process.poll() is not None, "the verdict", timeout=90.0)
+    output, said = process.communicate()
+    assert process.returncode == 0, output + said
+    *shown, verdict, first, second, _, last = output.splitlines()
     assert "passed: the loop does what the model predicts" in verdict
     assert "+0.2 y: overshoot" in first and "+0.1 u: overshoot" in second
     assert f"kc {digits(gains[-1].kc)}" in last
     for part in ("0.3000", digits(gains[-1].kc), digits(gains[-1].ti)):
         assert part in "\n".join(shown)
-    assert "step 1 of 2, set-point +0.2 y, " in done.stderr
+    assert "step 1 of 2, set-point +0.2 y, " in said
     assert "step 2 of 2, load +0.1 u, " in controller.log
     assert parameters_of(rig) == [gains[-1].kc, gains[-1].ti]
     full = rig.listen("verification", Verification)
