@@ -39,10 +39,9 @@ def _direction(evidence: Evidence) -> Measured | None:
     raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
     return Measured(
         other.lead,
-        f"the relay took it that a higher command {lowers} the measurement, but the record goes "
-        f"as well with a process where it {raises} it in the end, after a first answer the other "
-        f"way: have the relay work in the other direction (process_gain_sign {sign}; 0: it is "
-        "found)",
+        f"the relay assumed that a higher command {lowers} the measurement; a process where it "
+        f"first {lowers} and then {raises} it fits the record as well: test with "
+        f"process_gain_sign {sign} (0: it is found)",
     )
 
 
@@ -193,7 +192,7 @@ MODEL_CHECKS = (
         unit="",
         failed=-6.0,
         sentence="{detail}",
-        remedy="or test again when nothing drifts",
+        remedy="test again when nothing drifts",
         measure=_direction,
     ),
     Check(
@@ -216,7 +215,7 @@ MODEL_CHECKS = (
         what="upper end of the dead time's interval over the length of the record",
         unit="",
         failed=1.0,
-        sentence="the record goes with a dead time of any length, so that it bounds no gain",
+        sentence="the record fits a dead time of any length, so that no gain is known to be safe",
         remedy="record a relay test, or a step that stands clear of the noise",
         measure=_open_dead_time,
     ),
@@ -311,7 +310,7 @@ MODEL_CHECKS = (
         unit="",
         doubtful=0.5,
         failed=0.9,
-        sentence="from {detail} the record goes with a process that works in the other direction",
+        sentence="from {detail} the record also fits a process of the other direction",
         remedy="keep other inputs constant, or start the record from rest",
         measure=_halves_direction,
     ),
