@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import flag_of, typed_as
@@ -81,7 +82,11 @@ def report_of_tune(
     from relay_autotune.report.case import case_of
 
     found = analysed_as_there(record, values)
-    write_report([case_of(found, source)], output)
+    case = case_of(found, source)
+    if result.bag:
+        again = f"report {shlex.quote(result.bag)} {flags_of(values)}".rstrip()
+        case = replace(case, command=f"{again} -o {shlex.quote(output)}")
+    write_report([case], output)
     gains, published = found.best_gains, result.gains
     kc = gains.kc if gains is not None else math.nan
     if published.experiment_id and not math.isclose(kc, published.kc, rel_tol=_NEAR):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import shlex
@@ -280,7 +281,9 @@ def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_pa
     tune.gains.kc = analysed().best_gains.kc
     record = analysed().record
     assert report_of_tune(record, defaults(), tune, "/records/x", page) == ""
-    assert "Gains to type in" in (tmp_path / "page.html").read_text()
+    told = (tmp_path / "page.html").read_text()
+    assert "Gains to type in" in told
+    assert f"report '{tune.bag}' -o {page}" in html.unescape(told)
     tune.gains.kc *= 1.1
     assert "identifier_node gave" in report_of_tune(record, defaults(), tune, "x", page)
 
