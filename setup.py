@@ -35,9 +35,8 @@ setup(
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
     extras_require={
         "fleet": ["distributed", "pyarrow"],
-        "idl": ["rosbags"],
         "report": ["jinja2", "matplotlib"],
-        "test": ["control", "hypothesis", "pytest"],
+        "test": ["control", "hypothesis", "pytest", "rosbags"],
     },
     zip_safe=True,
     entry_points={

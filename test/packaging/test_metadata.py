@@ -95,10 +95,8 @@ def test_manifest_names_what_is_imported():
                 names = [node.module]
             needed |= {name.partition(".")[0] for name in names}
     needed -= {"relay_autotune", *sys.stdlib_module_names}
-    # Only replay on a cluster or into a Parquet file, and definitions in IDL, need these; each
-    # says so without them.
-    extras = ast.literal_eval(setup_arguments()["extras_require"])
-    optional = {*extras["fleet"], *extras["idl"]}
+    # Only replay on a cluster or into a Parquet file needs these; it says so without them.
+    optional = set(ast.literal_eval(setup_arguments()["extras_require"])["fleet"])
     assert optional <= needed
     needed -= optional
     assert {keys.get(name, name) for name in needed} <= declared
