@@ -317,6 +317,12 @@ def test_a_slow_command_that_the_process_follows_is_not_fed_back():
     assert followed_share(replace(record, measurement=y), 1) is None
 
 
+@pytest.mark.parametrize(("tau", "result"), [(8.0, Result.PASSED), (0.2, Result.DOUBTFUL)])
+def test_an_answer_between_few_samples_is_not_trusted(record, gains, tau, result):
+    found = fitted_as(TransferFunction.fopdt(2.0, tau, 0.1), record)
+    assert of_checks(record, found, gains)["resolution"].result is result
+
+
 def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
     # A heater that warms faster than it cools: but for 0 and 10, its command has two levels.
     time = np.arange(0.0, 600.0, 1.0)

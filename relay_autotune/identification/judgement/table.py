@@ -58,6 +58,12 @@ def _open_dead_time(evidence: Evidence) -> Measured | None:
     return Measured(float(high) / evidence.record.duration)
 
 
+def _resolution(evidence: Evidence) -> Measured | None:
+    model = evidence.found.model
+    answer = model.dead_time + sum(abs(t) for t in model.time_constants)
+    return Measured(evidence.record.interval / answer) if answer > 0.0 else None
+
+
 def _residual(evidence: Evidence) -> Measured | None:
     # What was not measured at rest is no measure: instruments and processes have noise of any
     # colour, and second differences show its fast part alone.
@@ -218,6 +224,16 @@ MODEL_CHECKS = (
         sentence="the record fits a dead time of any length, so that no gain is known to be safe",
         remedy="record a relay test, or a step that stands clear of the noise",
         measure=_open_dead_time,
+    ),
+    Check(
+        name="resolution",
+        title="Sampling",
+        what="time between samples over the model's dead time and lags together",
+        unit="",
+        doubtful=0.4,
+        sentence="one sample takes {value} of the whole answer, whose form is not seen so",
+        remedy="sample faster",
+        measure=_resolution,
     ),
     Check(
         name="growth",
