@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
 from relay_autotune.cli.layout import Help, in_columns, labelled, width
+from relay_autotune.cli.progress import Working
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.text import digits, duration
 
@@ -125,7 +126,8 @@ def apply_at(name: str, *, doubtful: bool) -> int:
     namespace, _, node = name.rpartition("/")
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
     with GainsClient(namespace, node) as client:
-        client.find(_FOUND_WITHIN)
+        with Working(f"looking for {name}"):
+            client.find(_FOUND_WITHIN)
         return apply_and_verify(client, options)
 
 
@@ -152,9 +154,12 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     :param client: of the controller_node, which was found.
     :param options: as the command line gives them.
     """
-    present, model = client.in_force(), client.model()
-    if not options.verify_only:
+    settles = 0.0
+    with Working("asking for the gains"):
+        present, model = client.in_force(), client.model()
         gains, doubt = client.waiting()
+    if not options.verify_only:
+        settles = gains.settling_time if math.isfinite(gains.settling_time) else 0.0
         _require_trust(doubt, options)
         if present is not None and _are_equal(present, gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
@@ -170,7 +175,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     if options.no_verify:
         print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
         return DONE
-    result = _verified(client, step, options)
+    result = _verified(client, step, settles, options)
     print("\n".join(verdict_lines(result, client.in_force(), width())))
     return DONE if result.passed else NOTHING_FOUND
 
@@ -215,8 +220,16 @@ def _agrees(question: str) -> bool:
         return False
 
 
-def _verified(client: GainsClient, step: float, options: argparse.Namespace) -> Any:
-    """Verify with a step that the user has agreed to, whatever the node allows otherwise."""
+def _verified(
+    client: GainsClient, step: float, settles: float, options: argparse.Namespace
+) -> Any:
+    """Verify with a step that the user has agreed to, whatever the node allows otherwise.
+
+    :param client: of the controller_node.
+    :param step: of the set-point [y].
+    :param settles: how long the loop takes to settle with gains that were just applied [s].
+    :param options: as the command line gives them.
+    """
     names = ("verify_step", "verify_step_max")
     before = client.values(client.name, names)
     more = abs(step) > max(map(abs, before.values()))
@@ -224,6 +237,7 @@ def _verified(client: GainsClient, step: float, options: argparse.Namespace) -> 
         client.set_values(client.name, {"verify_step_max": abs(step)})
     shown = StatusLine()
     try:
+        client.let_settle(settles, shown)
         return client.verify(step, options.load, options.wait, shown)
     finally:
         shown.clear()

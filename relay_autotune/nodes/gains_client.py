@@ -25,12 +25,15 @@ from relay_autotune.nodes.controller_parameters import GAINS
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.nodes.remote_gains import controller_of, mapping_of
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.text import duration
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 # How long a latched result may take to come [s].
 _RESULT_WITHIN = 5.0
+# How often is told what is waited for [s].
+_TOLD_EVERY = 0.8
 # Beginning of the refusal of ~/verify that time cures.
 _NOT_AT_REST = "the loop is not at rest"
 
@@ -128,6 +131,17 @@ class GainsClient(LoopClient):
             raise LoopError(f"{self.name} refuses: {answer.message}")
         return str(answer.message)
 
+    def let_settle(self, seconds: float, tell: Callable[[str], None]) -> None:
+        """Wait until a loop with new gains has come to rest.
+
+        :param seconds: how long it takes [s].
+        :param tell: called each second with what is waited for.
+        """
+        begun = time.monotonic()
+        while (waited := time.monotonic() - begun) < seconds:
+            tell(f"the loop settles with the new gains, {duration(waited)} of {duration(seconds)}")
+            self._wait(lambda: False, time.monotonic() + min(_TOLD_EVERY, seconds - waited))
+
     def verify(
         self, setpoint: float, load: float, patience: float, tell: Callable[[str], None]
     ) -> Any:
@@ -162,4 +176,4 @@ class GainsClient(LoopClient):
                     f"with --verify-only"
                 )
             tell(result.reason)
-            self._wait(lambda: False, time.monotonic() + 0.8)
+            self._wait(lambda: False, time.monotonic() + _TOLD_EVERY)
