@@ -79,6 +79,10 @@ def main(args: Sequence[str] | None = None) -> int:
     if options.amplitude < 0.0 or options.wait < 0.0:
         parser.error("--amplitude and --wait are at least 0")
     options.typed = given
+    if options.measurement and options.command:
+        # At once, since what follows takes a second to load.
+        told = f"looking at {options.measurement} and {options.command}; nothing is commanded yet"
+        print(told, file=sys.stderr, flush=True)
     import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
 
     return guarded(PROGRAM, lambda: _tune(options, ros))
@@ -321,10 +325,11 @@ def _prefix() -> str:
 
 def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, str]:
     """Write the report if it is wanted; return the flags for `replay`, and the report's name."""
-    from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
-
     result = client.result
     with Working("asking identifier_node for its parameters"):
+        # Imported here, because it loads slowly and must not delay a tune.
+        from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
+
         values = None if options.record_only else client.identifier_values(_PATIENCE)
     flags = flags_of(values) if values is not None else ""
     if not options.report:
