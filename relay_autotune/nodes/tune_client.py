@@ -77,6 +77,10 @@ class TuneClient(LoopClient):
         :param leave: returns True to stop waiting; this method then returns.
         :raises LoopError: if a node is missing; the sentence names the nodes that are there.
         """
+        # What reads a model takes most of a second to load: now, while the middleware looks for
+        # the nodes, and not at the first model in the middle of a tune.
+        from relay_autotune.exchange import models  # noqa: F401
+
         deadline = time.monotonic() + patience
         if not self._wait(lambda: leave() or self._client.server_is_ready(), deadline):
             # This client itself appears in the graph under the name that it looks for.
