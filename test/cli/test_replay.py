@@ -396,7 +396,8 @@ UNWANTED = {
     *("zstandard", "lz4", "concurrent.futures.process", "distributed"),
     *("scipy.signal", "scipy.stats", "scipy.integrate", "scipy.interpolate"),
     *(f"relay_autotune.bag.{name}" for name in ("csv_file", "foreign", "pairing", "writer")),
-    *(f"relay_autotune.{name}" for name in ("document", "excitation", "relay", "report")),
+    *(f"relay_autotune.report.{name}" for name in ("case", "figures", "page", "picture")),
+    *(f"relay_autotune.{name}" for name in ("exchange.document", "experiment.experiment")),
 }
 
 

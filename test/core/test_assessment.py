@@ -21,10 +21,11 @@ from relay_autotune.identification import Estimate, Known, identify
 from relay_autotune.identification.judgement.assessment import assess, fit_of_model
 from relay_autotune.identification.judgement.validation import Validation, integrated_error
 from relay_autotune.identification.waveform.residuals import noise_to_signal
+from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import told_fields
-from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.0, 2.0, 1.0)
 RELAY = RelaySettings(3.0, 1.0, 1.0, 0.0, 0.1)
@@ -105,3 +106,15 @@ def test_json_table_and_message_carry_all_of_it(record, models):
     assert message.validation_shape == models[2].validation.shape
     assert list(message.point_std) == [p.std for p in models[2].points]
     assert message.prediction != message.prediction
+
+
+def test_a_record_that_begins_with_its_first_step_is_reproduced():
+    # The record has the command of before in no sample; the process was at rest there.
+    model = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    time = np.arange(0.0, 200.0, 0.5)
+    true = PiecewiseConstant(np.array([0.0, 100.0]), np.array([33.0, 28.0]), initial=30.0)
+    y = 50.0 + response(model, time, true) - 1.65 * 30.0
+    record = Record(time, y, true(time))
+    assert fit_of_model(model, record, 50.0).residual_rms < 1e-9
+    other = TransferFunction.fopdt(1.65, 40.0, 10.0)
+    assert fit_of_model(other, record, 50.0).residual_rms > 0.1

@@ -27,7 +27,7 @@ from relay_autotune.identification.shown.steady_state import steady_state
 from relay_autotune.identification.waveform.residuals import ljung_box, noise_to_signal
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 FloatArray = NDArray[np.float64]
 
@@ -66,7 +66,10 @@ def _fit(found: Identification, record: Record, rest: float) -> FitReport:
 
 
 def fit_of_model(model: TransferFunction, record: Record, rest: float) -> FitReport:
-    """Return how well a model reproduces all samples of a record, with the best offset.
+    """Return how well a model reproduces all samples of a record.
+
+    Estimated with it are the offset and, for a self-regulating process, the command before the
+    record: a record may begin with its first step.
 
     :param model: any; of an unstable one, which no open loop follows, nothing is estimated.
     :param record: any record.
@@ -76,8 +79,13 @@ def fit_of_model(model: TransferFunction, record: Record, rest: float) -> FitRep
         return FitReport(noise_std=record.noise_std)
     y = record.measurement
     answer = response(model, record.time, record.input())
+    unknown = [np.ones_like(y)]
+    if model.integrators == 0:
+        before = PiecewiseConstant(record.time[:1], np.zeros(1), initial=1.0)
+        unknown.append(response(model, record.time, before))
+    columns = np.column_stack(unknown)
     residual = y - answer
-    residual = residual - residual.mean()
+    residual = residual - columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
     rms = math.sqrt(float(np.mean(residual**2)))
     spread = float(np.std(y))
     exact = rms <= _NEGLIGIBLE * float(np.ptp(y))
