@@ -108,7 +108,7 @@ def test_pid_has_to_be_worth_its_derivative():
     assert "PID would still have" in reason
     controller, reason = robust(DesignTask(model=model))
     assert controller.td == 0.0
-    assert "the noise is not known" in reason
+    assert "is chosen where noise, amplitude and sampling period are given" in reason
 
 
 def test_the_loop_of_the_controller_to_be_is_longer_by_its_period_and_delay():
