@@ -147,7 +147,7 @@ def test_the_predicted_ms_holds_on_the_process():
     assert abs(true_ms / found.ms - 1.0) < 2.0 * 0.04
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_the_quick_fits_never_end_a_test_that_a_choice_would_not(seed):

@@ -124,7 +124,7 @@ def test_structures_that_are_known(model, known):
         assert found.std[0] == found.std[2] == 0.0
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_the_deviations_are_those_over_seeds():
     truth = ultimate_point(FOPDT)
     scores = []

@@ -59,7 +59,7 @@ def test_a_drift_of_each_record_and_a_start_in_motion_are_its_own():
     assert found.values == pytest.approx(TRUTH, rel=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_two_short_noisy_records_halve_the_variance():
     records = [_record(noise=0.1, seed=s) for s in range(24)]
     single = [identify_jointly((r,), "waveform", FOPDT) for r in records]

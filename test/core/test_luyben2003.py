@@ -149,7 +149,7 @@ def test_a_record_without_noise(process, end, step):
     assert found.fit.fit > 0.999
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_records_with_noise():
     inside = []
     for process, end in PROCESSES[:4]:

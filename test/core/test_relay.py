@@ -176,7 +176,7 @@ def test_noise(ratio, level, seed):
     assert 0.7 * (high + low) < limit_cycle(tune.record()).period < 1.1 * (high + low)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_dense_noisy_samples_make_no_false_cycles():
     # So many samples while the measurement passes the band that noise reaches across it.
     tune = experiment(process_gain_sign=1)

@@ -67,7 +67,7 @@ def test_a_rectangular_record_is_taken_for_fopdt():
     assert found.values[0] == pytest.approx(1.0, rel=5e-3)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_slowly_growing_record_is_taken_for_two_lags():
     model = TransferFunction.lag_n(1.0, 25.0, 2, 0.05)
     record = record_of(model, cycles=60, samples=8000)
@@ -94,7 +94,7 @@ def test_a_record_of_high_order():
     assert true.values == pytest.approx([1.0, 6.0], rel=3e-3)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize("noise", [0.05, 0.1])
 def test_noise_is_averaged_and_reported(noise):
     model = TransferFunction.fopdt(1.65, 20.0, 10.0)

@@ -80,7 +80,10 @@ PROCESSES = [(1.65, 20.0, 10.0), (1.0, 2.0, 2.0), (1.0, 1.0, 0.1), (1.0, 1.0, 10
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("process", PROCESSES)
+@pytest.mark.parametrize(
+    "process",
+    [PROCESSES[0], *(pytest.param(p, marks=pytest.mark.nightly) for p in PROCESSES[1:])],
+)
 def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
     run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
     records = [_noisy(run, 0.1, seed) for seed in range(80)]
@@ -95,7 +98,7 @@ def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
     assert stated == pytest.approx(bounds[0], rel=0.1)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_the_intervals_cover_the_truth():
     process = (1.65, 20.0, 10.0)
     run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
