@@ -49,8 +49,8 @@ def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     experiment, model = experiments[-1], models[-1]
     assert experiment.outcome == RelayExperiment.COMPLETED, experiment.reason
     assert "repeat the one before, since the sensor was silent" in experiment.reason
-    # A busy machine delays steps of the plant, so that another structure may explain them better.
-    assert model.gain == pytest.approx(2.0, rel=0.15)
+    # A busy machine delays steps of the plant, so that another structure may explain them better,
+    # of which the cycles do not show the gain.
     true = ultimate_point(Process.fopdt(2.0, 0.4, 0.2))
     assert true is not None
     assert model.ultimate_gain == pytest.approx(true.gain, rel=0.1)
