@@ -19,6 +19,9 @@ _SPACE = r" \, "
 # Half a unit of the fourth digit of 9999, the finest of four digits.
 _FINEST = 5e-5
 
+# Interval at which users are told what is waited for [s]: below a second on a busy machine, too.
+TOLD_EVERY = 0.8
+
 # Coefficients of 1, s, s^2 of one factor.
 _Polynomial = tuple[float, ...]
 

@@ -21,8 +21,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.asking import agrees
 from relay_autotune.cli.layout import Help, in_columns, labelled, width
-from relay_autotune.cli.progress import Working
+from relay_autotune.cli.progress import StatusLine, Working
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.text import digits, duration
 
@@ -165,7 +166,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model)))
     step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
-    if not (options.yes or _agrees(_question(options, step))):
+    if not agrees(_question(options, step), yes=options.yes):
         say(PROGRAM, "nothing was changed")
         return NOTHING_FOUND
     if options.accept_doubtful:
@@ -211,15 +212,6 @@ def _question(options: argparse.Namespace, step: float) -> str:
             f"{joined}?").capitalize()  # fmt: skip
 
 
-def _agrees(question: str) -> bool:
-    if not sys.stdin.isatty():
-        raise LoopError("nobody can be asked here: give --yes to apply the gains")
-    try:
-        return input(f"\n{question} [y/N] ").strip().lower() in ("y", "yes")
-    except EOFError:
-        return False
-
-
 def _verified(
     client: GainsClient, step: float, settles: float, options: argparse.Namespace
 ) -> Any:
@@ -243,25 +235,6 @@ def _verified(
         shown.clear()
         if more:
             client.set_values(client.name, {"verify_step_max": before["verify_step_max"]})
-
-
-class StatusLine:
-    """What is waited for, on standard error: in place on a terminal, else line by line."""
-
-    def __init__(self) -> None:
-        self._live = sys.stderr.isatty()
-
-    def __call__(self, status: str) -> None:
-        """Show a sentence."""
-        text = f"\r\x1b[K{status[: width() - 1]}" if self._live else f"{status}\n"
-        sys.stderr.write(text)
-        sys.stderr.flush()
-
-    def clear(self) -> None:
-        """Remove the line."""
-        if self._live:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
 
 
 def beside(present: Controller | None, gains: Gains, model: TransferFunction) -> list[str]:

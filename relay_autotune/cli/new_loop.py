@@ -9,15 +9,14 @@ import argparse
 import math
 import os
 import re
-import sys
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import finite
+from relay_autotune.cli.asking import asked, number_of, pair_of
 from relay_autotune.cli.export import number
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
-from relay_autotune.errors import LoopError, SelectionError
+from relay_autotune.errors import SelectionError
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
@@ -106,15 +105,15 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     told = "" if math.isnan(present) else f"{present:.6g}"
     at = math.nan if controlled and options.at is None else options.at
     if at is None:
-        at = _asked("present command, at which the process rests [u]", "--at", told, _number)
-    within = options.within or _asked(
-        "lowest and highest measurement that the process may see [y]", "--within", "", _pair
+        at = asked("present command, at which the process rests [u]", "--at", told, number_of)
+    within = options.within or asked(
+        "lowest and highest measurement that the process may see [y]", "--within", "", pair_of
     )
     command_within = options.command_within
     if command_within is None and not options.amplitude:
         # The amplitude is found between these.
-        command_within = _asked(
-            "lowest and highest command of the actuator [u]", "--command-within", "", _pair
+        command_within = asked(
+            "lowest and highest command of the actuator [u]", "--command-within", "", pair_of
         )
     values: dict[str, Any] = {
         "baseline": at,
@@ -144,65 +143,3 @@ def with_flags(check: str) -> str:
     :param check: the line; its node ends with the command, so that nothing can be set on it.
     """
     return _TYPED.sub(lambda found: f"; give {_FLAGS.get(found[1], found[1])}", check)
-
-
-def asked_for_file(what: str) -> str:
-    """Ask for a file to write; return its name, empty for none.
-
-    :param what: what would be written.
-    """
-    return _input(f"{what}, to which file? [none]: ") if sys.stdin.isatty() else ""
-
-
-def agrees(question: str, options: argparse.Namespace) -> bool:
-    """Ask a question, unless ``--yes`` has answered it.
-
-    :param question: with its question mark.
-    :param options: with the flags of `add_new_loop`.
-    :raises LoopError: if nobody can be asked.
-    """
-    if options.yes:
-        return True
-    _require_somebody("--yes")
-    return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
-
-
-def _asked(what: str, flag: str, known: str, read: Callable[[str], Any]) -> Any:
-    """Ask for a value until it can be read.
-
-    :param what: what is asked for, with its unit.
-    :param flag: the flag that would have given it.
-    :param known: the value that Enter takes; empty: none.
-    :param read: returns the value of a text; None: it is none.
-    """
-    _require_somebody(flag)
-    shown = f"{what} [{known}]: " if known else f"{what}: "
-    while (value := read(_input(shown) or known)) is None:
-        print(f"expected {'two numbers' if read is _pair else 'a number'}", file=sys.stderr)
-    return value
-
-
-def _require_somebody(flag: str) -> None:
-    if not sys.stdin.isatty():
-        raise LoopError(f"nobody can be asked here: give {flag}")
-
-
-def _input(shown: str) -> str:
-    try:
-        return input(shown).strip()
-    except EOFError:
-        raise LoopError("the input has ended: nothing was started") from None
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _pair(text: str) -> list[float] | None:
-    numbers = [_number(word) for word in text.replace(",", " ").split()]
-    found = [number for number in numbers if number is not None]
-    return found if len(found) == len(numbers) == 2 else None

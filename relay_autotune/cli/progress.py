@@ -11,17 +11,41 @@ import time
 from contextlib import suppress
 from types import TracebackType
 
-from relay_autotune.text import duration
+from relay_autotune.cli.layout import width
+from relay_autotune.text import TOLD_EVERY, duration
 
-# Time before the first line, and between two of them [s].
+# Time before the first share of a work is shown, and between two of them [s].
 _PATIENCE = 1.0
 _INTERVAL = 0.2
-# Interval at which work is told that has no measure of its progress [s].
-_TOLD_EVERY = 0.8
+
+
+class StatusLine:
+    """What is done or waited for, on standard error: in place on a terminal, else line by line."""
+
+    def __init__(self) -> None:
+        self.in_place = sys.stderr.isatty()
+        self._shown = False
+
+    def __call__(self, status: str) -> None:
+        """Show a sentence."""
+        text = f"\r\x1b[K{status[: width() - 1]}" if self.in_place else f"{status}\n"
+        # The work goes on even if this cannot be written.
+        with suppress(OSError):
+            sys.stderr.write(text)
+            sys.stderr.flush()
+        self._shown = True
+
+    def clear(self) -> None:
+        """Remove the line of a terminal, so that something else can be written."""
+        if self._shown and self.in_place:
+            with suppress(OSError):
+                sys.stderr.write("\r\x1b[K")
+                sys.stderr.flush()
+            self._shown = False
 
 
 class ProgressLine:
-    """A line on standard error that is updated in place and removed at the end.
+    """The share of a work that is done; on a terminal only.
 
     :param what: what is being done.
     """
@@ -29,31 +53,22 @@ class ProgressLine:
     def __init__(self, what: str) -> None:
         self._what = what
         self._next = time.monotonic() + _PATIENCE
-        self._shown = False
-        self._terminal = sys.stderr.isatty()
+        self._line = StatusLine()
 
     def __call__(self, done: int, total: int) -> None:
         """Show how much is done of how much."""
-        if not self._terminal or total <= 0 or time.monotonic() < self._next:
+        if not self._line.in_place or total <= 0 or time.monotonic() < self._next:
             return
         self._next = time.monotonic() + _INTERVAL
-        self._shown = True
-        share = 100.0 * min(done / total, 1.0)
-        sys.stderr.write(f"\r\x1b[K{self._what}: {share:.0f} %")
-        sys.stderr.flush()
+        self._line(f"{self._what}: {100.0 * min(done / total, 1.0):.0f} %")
 
     def clear(self) -> None:
         """Remove the line, so that something else can be written."""
-        if self._shown:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
-            self._shown = False
+        self._line.clear()
 
 
 class Working:
     """Say each second on standard error what is being done, until the block ends.
-
-    On a terminal the line is updated in place and removed at the end.
 
     :param what: what is being done.
     """
@@ -62,7 +77,6 @@ class Working:
         self._what = what
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
-        self._terminal = sys.stderr.isatty()
 
     def __enter__(self) -> Working:
         self._thread.start()
@@ -78,14 +92,7 @@ class Working:
         self._thread.join()
 
     def _tell(self) -> None:
-        began, shown = time.monotonic(), False
-        # The work goes on even if this cannot be written.
-        with suppress(OSError):
-            while not self._over.wait(_TOLD_EVERY):
-                told = f"{self._what}, {duration(time.monotonic() - began)}"
-                sys.stderr.write(f"\r\x1b[K{told}" if self._terminal else f"{told}\n")
-                sys.stderr.flush()
-                shown = True
-            if shown and self._terminal:
-                sys.stderr.write("\r\x1b[K")
-                sys.stderr.flush()
+        began, line = time.monotonic(), StatusLine()
+        while not self._over.wait(TOLD_EVERY):
+            line(f"{self._what}, {duration(time.monotonic() - began)}")
+        line.clear()

@@ -29,13 +29,12 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.asking import agrees, asked_for_file
 from relay_autotune.cli.export import Target, exported, write
 from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     START_WITHIN,
     add_new_loop,
-    agrees,
-    asked_for_file,
     is_new_loop,
     nodes_for,
     own_namespace,
@@ -235,7 +234,7 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
     if not client.succeeded:
         say(PROGRAM, f"{client.name} refuses: {client.result.reason}")
         return False
-    return agrees("Start the tune?", options)
+    return agrees("Start the tune?", yes=options.yes)
 
 
 def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:

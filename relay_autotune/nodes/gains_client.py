@@ -25,15 +25,13 @@ from relay_autotune.nodes.controller_parameters import GAINS
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.nodes.remote_gains import controller_of, mapping_of
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.text import duration
+from relay_autotune.text import TOLD_EVERY, duration
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 # How long a latched result may take to come [s].
 _RESULT_WITHIN = 5.0
-# How often is told what is waited for [s].
-_TOLD_EVERY = 0.8
 # Beginning of the refusal of ~/verify that time cures.
 _NOT_AT_REST = "the loop is not at rest"
 
@@ -140,7 +138,7 @@ class GainsClient(LoopClient):
         begun = time.monotonic()
         while (waited := time.monotonic() - begun) < seconds:
             tell(f"the loop settles with the new gains, {duration(waited)} of {duration(seconds)}")
-            self._wait(lambda: False, time.monotonic() + min(_TOLD_EVERY, seconds - waited))
+            self._wait(lambda: False, time.monotonic() + min(TOLD_EVERY, seconds - waited))
 
     def verify(
         self, setpoint: float, load: float, patience: float, tell: Callable[[str], None]
@@ -176,4 +174,4 @@ class GainsClient(LoopClient):
                     f"with --verify-only"
                 )
             tell(result.reason)
-            self._wait(lambda: False, time.monotonic() + _TOLD_EVERY)
+            self._wait(lambda: False, time.monotonic() + TOLD_EVERY)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from difflib import SequenceMatcher
 from types import TracebackType
 from typing import Any, Self
 
@@ -29,12 +28,8 @@ from relay_autotune.errors import LoopError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import ARRAY, reader_of
 
-# Topics of every node.
-_COMMON = {"/rosout", "/parameter_events"}
 # How long present commands are listened to [s].
 _LISTEN = 1.0
-# Topics that are named where one is missing.
-_MOST_NAMED = 4
 # How long a node may take to answer [s].
 ANSWER_WITHIN = 10.0
 
@@ -171,13 +166,10 @@ class LoopClient:
         )
         if self._wait(lambda: bool(ends_of(name)), time.monotonic() + patience):
             return str(ends_of(name)[0].topic_type)
-        own = {end.topic_name for end in (*node.publishers, *node.subscriptions)} | _COMMON
-        there = [n for n, _ in node.get_topic_names_and_types() if n not in own and ends_of(n)]
-        near = sorted(there, key=lambda other: SequenceMatcher(None, name, other).ratio())[::-1]
+        first, others = quality.nearest(node, name, ends_of)
         what = "publisher" if published else "subscription"
         flag = "--measurement" if published else "--command"
-        meant = f"; type {flag} {near[0]}" if near else ""
-        others = f" (others: {', '.join(near[1:_MOST_NAMED])})" if near[1:] else ""
+        meant = f"; type {flag} {first}" if first else ""
         raise LoopError(f"{name} has no {what} within {patience:g} s{meant}{others}")
 
     def is_controlled(self) -> bool:

@@ -11,8 +11,7 @@ from typing import Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 
-# Interval of what is told [s]: with what a busy machine adds it stays below a second.
-EVERY = 0.8
+from relay_autotune.text import TOLD_EVERY
 
 
 class Narrator:
@@ -30,7 +29,7 @@ class Narrator:
         self._words = words
         self._tell = tell
         self._timer = node.create_timer(
-            EVERY, self.now, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
+            TOLD_EVERY, self.now, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
         )
 
     def now(self) -> None:

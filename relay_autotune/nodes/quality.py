@@ -48,7 +48,8 @@ def latched(depth: int) -> QoSProfile:
 
 RESULT = latched(1)
 
-# Topics that are named where one is missing.
+# Topics of every node, and how many others are named where one is missing.
+_COMMON = {"/rosout", "/parameter_events"}
 _MOST_NAMED = 4
 
 # A killed process stays in the graph for some 20 s. With this liveliness lease a subscriber
@@ -123,22 +124,40 @@ def _other(
     node: Node, topic: str, kind: str, name: str, ends_of: Callable[[str], Sequence[Any]]
 ) -> str:
     """Return what to type for the topic that may be meant: that of this type with like names."""
+    first, more = nearest(node, topic, ends_of, kind)
+    if not first:
+        return ""
+    return f"; {first} has one of this type: start the node with -r {name}:={first}{more}"
+
+
+def nearest(
+    node: Node, topic: str, ends_of: Callable[[str], Sequence[Any]], kind: str = ""
+) -> tuple[str, str]:
+    """Return the topic whose name is most like one that is missing, and a list of others.
+
+    :param node: the node that looks for the topic.
+    :param topic: the resolved name that is missing.
+    :param ends_of: returns the ends that a topic must have: publishers, or subscriptions.
+    :param kind: the message type; empty: any.
+    :return: its name, empty if there is none; " (others: ...)", empty if there are none.
+    """
     mine = node.get_fully_qualified_name()
     # Both sides of a topic of this node are its own, not those of a sensor or an actuator.
-    own = {end.topic_name for end in (*node.publishers, *node.subscriptions)}
+    own = {end.topic_name for end in (*node.publishers, *node.subscriptions)} | _COMMON
     there = sorted(
         (
             other
             for other, kinds in node.get_topic_names_and_types()
-            if kind in kinds and other not in own and any(who(e) != mine for e in ends_of(other))
+            if (not kind or kind in kinds)
+            and other not in own
+            and any(who(e) != mine for e in ends_of(other))
         ),
         key=lambda other: SequenceMatcher(None, topic, other).ratio(),
         reverse=True,
     )
     if not there:
-        return ""
-    more = f" (others: {', '.join(there[1:_MOST_NAMED])})" if there[1:] else ""
-    return f"; {there[0]} has one of this type: start the node with -r {name}:={there[0]}{more}"
+        return "", ""
+    return there[0], f" (others: {', '.join(there[1:_MOST_NAMED])})" if there[1:] else ""
 
 
 def who(end: Any) -> str:

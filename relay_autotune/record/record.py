@@ -421,6 +421,11 @@ class Record:
         return _interval(self)
 
     @property
+    def mean_interval(self) -> float:
+        """Mean time between samples, gaps included [s]."""
+        return self.duration / max(len(self) - 1, 1)
+
+    @property
     def noise(self) -> float:
         """The noise measured before the test, else what second differences show of it [y]."""
         return self.noise_std if math.isfinite(self.noise_std) else _roughness(self)

@@ -240,7 +240,7 @@ def rate_of(
 
     known = np.isfinite(values)
     t, v = record.time[known], values[known]
-    step = max(record.duration / max(len(record) - 1, 1), period / 400.0)
+    step = max(record.mean_interval, period / 400.0)
     grid = np.arange(t[0], t[-1], step)
     even = np.interp(grid, t, v)
     count = 2 * round(0.5 * period / _WINDOW / step) + 1

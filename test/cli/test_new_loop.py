@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from relay_autotune.cli import new_loop
+from relay_autotune.cli.asking import agrees
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, SelectionError
 
@@ -108,8 +108,8 @@ def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyP
     with pytest.raises(LoopError, match="give --command-within"):
         nodes_for(Looker(), options("--at", "2", "--within", "1", "9"))
     with pytest.raises(LoopError, match="give --yes"):
-        new_loop.agrees("Start?", options())
-    assert new_loop.agrees("Start?", options("--yes"))
+        agrees("Start?", yes=False)
+    assert agrees("Start?", yes=True)
 
 
 def test_flags_of_a_new_loop_need_both_topics() -> None:

@@ -73,7 +73,7 @@ def _tests_of(records: Sequence[Record]) -> _Tests:
         if changes.size:
             gap = float(np.median(np.diff(changes))) if changes.size > 1 else record.duration
             rested |= float(changes[0] - record.time[0]) >= _SHORT_REST * gap
-    intervals = [record.duration / max(len(record) - 1, 1) for record in records]
+    intervals = [record.mean_interval for record in records]
     relay = all(record.settings is not None for record in records)
     return _Tests(biased, rested, max(intervals), relay)
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,11 +22,7 @@ _BETTER = 0.5
 # A load is looked for in these structures, the second one being what was found without it.
 _SIMPLE = ("sopdt", "", "fopdt")
 
-# Points of a cycle at which residuals are compared, and the share that is the same in all.
-_PHASES = 64
-_REPEATED = 0.5
-
-# So many last cycles are kept.
+# Number of last cycles that are kept.
 KEPT_CYCLES = 3
 
 
@@ -51,35 +46,6 @@ def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
         return None
     first = starts[-(KEPT_CYCLES + 1)]
     return record.part(first, len(record))
-
-
-def is_repeated(found: Identification, record: Record) -> bool:
-    """Return True if what a model leaves is mostly the same in every cycle.
-
-    A disturbance comes once. What comes again with each cycle is what the structure lacks, and
-    the last cycles alone do not tell that any better: they only let a wilder model bend to it.
-
-    :param found: what was identified from the whole record.
-    :param record: the record.
-    """
-    starts = record.cycle_start
-    if len(starts) < KEPT_CYCLES + 2 or len(found.fitted) != len(record):
-        return False
-    left = record.measurement - found.fitted
-    if not bool(np.all(np.isfinite(left[starts[0] : starts[-1]]))):
-        return False
-    cycles = np.array(
-        [
-            np.interp(
-                np.linspace(record.time[a], record.time[b], _PHASES, endpoint=False),
-                record.time[a : b + 1],
-                left[a : b + 1],
-            )
-            for a, b in itertools.pairwise(starts)
-        ]
-    )
-    power = float(np.mean(cycles**2))
-    return float(np.mean(cycles.mean(axis=0) ** 2)) > _REPEATED * power
 
 
 def without_disturbance(

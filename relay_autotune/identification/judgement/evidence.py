@@ -99,7 +99,7 @@ class Evidence:
             *(r.model for r in self.found.rivals if r.support > _WORTH_HEARING),
             *(m.model for m in self.others if m.fit.residual_rms <= most),
         )
-        interval = self.record.duration / max(len(self.record) - 1, 1)
+        interval = self.record.mean_interval
         return tuple(
             m
             for m in models

@@ -242,7 +242,7 @@ def plain_models(found: Identification, record: Record) -> tuple[TransferFunctio
         model = problem.structure.model_at(state.theta, state.coefficients * scale)
         if model is None or other > own + _AS_GOOD:
             continue
-        interval = record.duration / max(len(record) - 1, 1)
+        interval = record.mean_interval
         if not is_unseen(model, interval, record.duration):
             models.append(model)
     return tuple(models)

@@ -111,7 +111,7 @@ def _visible(evidence: Evidence) -> Measured | None:
     if loop is None or error is None:
         return None
     record, model = evidence.record, evidence.found.model
-    interval = record.duration / max(len(record) - 1, 1)
+    interval = record.mean_interval
     w = np.geomspace(2.0 * math.pi / record.duration, math.pi / interval, _FREQUENCIES)
     process = model(1j * w) * np.exp(-1j * w * loop.added_delay)
     tolerance = np.abs(loop.controller(1j * w) / (1.0 + process * loop.controller(1j * w)))

@@ -202,14 +202,13 @@ def _compared(
         begun = [c for name in names or _FIRST for c in ground.fit((name,), order)]
         asked = _of_all(ground, problem)
         if begun and (own := _in_its_own(_fitted_to(asked.problem, begun), asked)):
-            found.append((_joint(own) + _unasked(asked.problem), begun, ground))
+            found.append((_joint(own) + _unasked(asked.problem), begun, ground, asked))
     if not found:
         return []
-    _, begun, ground = min(found, key=lambda f: f[0])
+    _, begun, ground, asked = min(found, key=lambda f: f[0])
     if not names:
         tried = (*_OTHERS, *_INTEGRATING, *(_UNSTABLE if held else ()))
         begun += [c for name, n in tried for c in ground.fit((name,), n)]
-    asked = _of_all(ground, problem)
     simulated = _fitted_to(asked.problem, begun)
     once = _in_its_own(simulated, asked)
     slow = slow_colour(1.0 - _SLOWEST / problem.time.size)

@@ -37,9 +37,11 @@ _FEW_CHANGES = 64
 _MOST = 24
 _POWERS = np.maximum(np.subtract.outer(np.arange(_MOST), np.arange(_MOST)), 0)
 _BINOMIALS = np.array([[float(math.comb(i, j)) for j in range(_MOST)] for i in range(_MOST)])
+# From this number of changes on, arrays are quicker than plain numbers.
+MANY_CHANGES = 100
+# A state that has decayed to this share of itself is zero.
+_FORGOTTEN = 1e-20
 # exp() of it, and of its negative, is a normal number.
-# With fewer changes plain numbers are quicker than arrays; what is left of a state that is none.
-MANY_CHANGES, _FORGOTTEN = 100, 1e-20
 _BLOCK = 200.0
 _OVERFLOW = 300.0
 

@@ -1,0 +1,77 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Questions to the user of a terminal, and what a flag has answered already."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from relay_autotune.errors import LoopError
+
+
+def asked_for_file(what: str) -> str:
+    """Ask for a file to write; return its name, empty for none.
+
+    :param what: what would be written.
+    """
+    return _input(f"{what}, to which file? [none]: ") if sys.stdin.isatty() else ""
+
+
+def agrees(question: str, *, yes: bool) -> bool:
+    """Ask a question, unless ``--yes`` has answered it.
+
+    :param question: with its question mark.
+    :param yes: whether the flag was given.
+    :raises LoopError: if nobody can be asked.
+    """
+    if yes:
+        return True
+    _require_somebody("--yes")
+    return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
+
+
+def asked(what: str, flag: str, known: str, read: Callable[[str], Any]) -> Any:
+    """Ask for a value until it can be read.
+
+    :param what: what is asked for, with its unit.
+    :param flag: the flag that would have given it.
+    :param known: the value that Enter takes; empty: none.
+    :param read: returns the value of a text; None: it is none.
+    """
+    _require_somebody(flag)
+    shown = f"{what} [{known}]: " if known else f"{what}: "
+    while (value := read(_input(shown) or known)) is None:
+        print(f"expected {'two numbers' if read is pair_of else 'a number'}", file=sys.stderr)
+    return value
+
+
+def _require_somebody(flag: str) -> None:
+    if not sys.stdin.isatty():
+        raise LoopError(f"nobody can be asked here: give {flag}")
+
+
+def _input(shown: str) -> str:
+    try:
+        return input(shown).strip()
+    except EOFError:
+        raise LoopError("the input has ended: nothing was changed") from None
+
+
+def number_of(text: str) -> float | None:
+    """Return a finite number, or None if a text is something else."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def pair_of(text: str) -> list[float] | None:
+    """Return two finite numbers, or None if a text is something else."""
+    numbers = [number_of(word) for word in text.replace(",", " ").split()]
+    found = [number for number in numbers if number is not None]
+    return found if len(found) == len(numbers) == 2 else None
