@@ -51,6 +51,10 @@ class SelectionError(BagError):
     """A recording does not have the chosen topics or columns, or has them twice."""
 
 
+class FieldError(RelayAutotuneError, ValueError):
+    """A message has no such field, or its names do not tell which element is meant."""
+
+
 class MissingPackageError(RelayAutotuneError, ImportError):
     """An optional Python package is needed and not installed."""
 

@@ -11,23 +11,27 @@ fixed size do, a place is one number; else it is one for each message.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.bag.decode import decoded_message
+from relay_autotune.bag.field_path import Element, Step, reading
 from relay_autotune.bag.limits import MOST_STEPS
 from relay_autotune.bag.locate import Content, every_byte
 from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, FieldError
 from relay_autotune.record.record import IntArray
 
 _ENCAPSULATION = 4
 _UINT32 = Number("uint32", "u4")
+_EVERY_MESSAGE = np.ones(1, dtype=np.bool_)
 
 Place = int | IntArray
-Step = str | int
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class Path:
     """A number within a message type.
 
     :param root: the message type.
-    :param steps: names of fields and indices of elements, from the root on.
+    :param steps: names of fields, and elements, from the root on.
     """
 
     root: Struct
@@ -50,6 +54,7 @@ class Path:
         :param begin: where each begins, shape (n,).
         :param end: where it ends, shape (n,).
         :return: the numbers in their own type, shape (n,); a mask of those that are there.
+        :raises FieldError: if the names in a message do not tell which element is meant.
         """
         if begin.size == 0:
             return np.empty(0), np.empty(0, dtype=np.bool_)
@@ -67,12 +72,81 @@ class Path:
                 values[at], good[at] = self._of_one_order(content, begin[at], end[at], order)
         return values, good
 
+    def why(self, message: bytes) -> str:
+        """Return why a message does not have the number, "" where the message cannot say.
+
+        :param message: serialized.
+        """
+        try:
+            reading(self.steps)(decoded_message(self.root, message))
+        except FieldError as error:
+            return str(error)
+        except BagError:
+            pass
+        return ""
+
     def _of_one_order(
         self, content: Content, begin: IntArray, end: IntArray, order: str
-    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        cursor = _Cursor(content, begin + _ENCAPSULATION, end, order)
-        values = cursor.find(self.root, self.steps)
-        return values, cursor.good
+    ) -> tuple[NDArray[Any], Mask]:
+        def cursor() -> _Cursor:
+            return _Cursor(content, begin + _ENCAPSULATION, end, order)
+
+        def refuse(unclear: Mask) -> None:
+            if bool(unclear.any()):
+                k = int(np.flatnonzero(unclear)[0])
+                raise FieldError(self.why(bytes(content[int(begin[k]) : int(end[k])])))
+
+        good = np.ones(begin.size, dtype=np.bool_)
+        way: list[str | Place] = []
+        for step in self.steps:
+            if isinstance(step, str):
+                way.append(step)
+                continue
+            place, found = self._place(cursor, way, step, refuse)
+            way.append(place)
+            good &= found
+        last = cursor()
+        kind = last.go(self.root, way)
+        assert isinstance(kind, Number)
+        values = last.take(kind)
+        return values, good & last.good
+
+    def _place(
+        self,
+        cursor: Callable[[], _Cursor],
+        way: list[str | Place],
+        element: Element,
+        refuse: Callable[[Mask], None],
+    ) -> tuple[Place, Mask]:
+        """Return the place of an element in each message, and which messages have it."""
+        by, chosen = element.names, element.chosen
+        if by is None:
+            assert isinstance(chosen, int)
+            return chosen, _EVERY_MESSAGE
+        named = cursor()
+        kind = named.go(self.root, way if by.depth is None else [*way[: by.depth], by.field])
+        assert isinstance(kind, Repeated)
+        if isinstance(chosen, int):
+            has = named.count(kind)
+        else:
+            place, hits, has = named.named(kind, by.field, chosen)
+        known = named.good
+        if by.depth is not None:
+            array = cursor()
+            elements = array.go(self.root, way)
+            assert isinstance(elements, Repeated)
+            # Only a list of as many names as elements names them.
+            count = array.count(elements)
+            known = known & array.good & (np.asarray(count) == has)
+        if isinstance(chosen, int):
+            refuse(known & (np.asarray(has) > chosen))
+            return chosen, _EVERY_MESSAGE
+        refuse(named.good & (hits > 1))
+        found = known & (hits == 1)
+        place = np.where(found, place, 0)
+        if bool((place == place[0]).all()):
+            return int(place[0]), found
+        return place, found
 
 
 class _Cursor:
@@ -88,23 +162,83 @@ class _Cursor:
         self._passed = 0
         self.good = np.ones(origin.size, dtype=np.bool_)
 
-    def find(self, kind: Type, steps: tuple[Step, ...]) -> NDArray[Any]:
-        """Return the number to which the steps lead."""
-        if isinstance(kind, Number):
-            return self._take(kind)
-        if isinstance(kind, Struct):
-            for name, inner in kind.fields:
-                if name == steps[0]:
-                    return self.find(inner, steps[1:])
-                self._skip(inner)
-        assert isinstance(kind, Repeated)
-        index = int(steps[0])
-        count = self._count(kind)
-        self.good &= np.asarray(count) > index
-        self._skip_items(kind.item, index)
-        return self.find(kind.item, steps[1:])
+    def go(self, kind: Type, way: Sequence[str | Place]) -> Type:
+        """Go to what fields and places of elements lead to; return its type."""
+        for step in way:
+            if isinstance(step, str):
+                assert isinstance(kind, Struct)
+                kind = self._field(kind, step)
+            else:
+                assert isinstance(kind, Repeated)
+                self.good &= np.asarray(self.count(kind)) > step
+                self._skip_items(kind.item, step)
+                kind = kind.item
+        return kind
 
-    def _take(self, kind: Number) -> NDArray[Any]:
+    def count(self, kind: Repeated) -> Place:
+        """Return the number of elements of an array, and go on to the first of them."""
+        return self._length() if kind.count is None else kind.count
+
+    def named(self, kind: Repeated, field: str, name: str) -> tuple[IntArray, IntArray, Place]:
+        """Look for a name in an array.
+
+        :param kind: of texts, or of structures.
+        :param field: the structures' field with the name.
+        :param name: what is looked for.
+        :return: the first place of the name, how often it is there, and the number of elements.
+        """
+        count = self.count(kind)
+        place = np.zeros(self.good.size, dtype=np.int64)
+        hits = np.zeros(self.good.size, dtype=np.int64)
+        for number in self._each(count):
+            is_it = self._is_named(kind.item, field, name) & self.good & (number < count)
+            place[is_it & (hits == 0)] = number
+            hits += is_it
+        return place, hits, count
+
+    def _is_named(self, item: Type, field: str, name: str) -> Mask:
+        """Pass an element; return in which messages it has the name."""
+        if isinstance(item, Text):
+            return self._is_text(name.encode())
+        assert isinstance(item, Struct)
+        found = np.zeros(self.good.size, dtype=np.bool_)
+        for own, inner in item.fields:
+            if own != field:
+                self._skip(inner)
+            elif isinstance(inner, Text):
+                found = self._is_text(name.encode())
+            else:
+                assert isinstance(inner, Number)
+                values = self.take(inner)
+                found = np.array([str(int(value)) == name for value in values])
+        return found
+
+    def _is_text(self, wanted: bytes) -> Mask:
+        """Pass a text; return in which messages it is the one that is wanted."""
+        length = self._length()
+        size = len(wanted)
+        # The zero at the end counts where it is written, as ROS does.
+        fits = ((length == size) | (length == size + 1)) & (self._place + length <= self._room)
+        found = np.zeros(self.good.size, dtype=np.bool_)
+        at = np.flatnonzero(fits & self.good)
+        if at.size:
+            begin = (self._origin + self._place)[at]
+            rows = every_byte(self._content, "u1")[begin[:, np.newaxis] + np.arange(size)]
+            found[at] = (rows == np.frombuffer(wanted, dtype=np.uint8)).all(axis=1)
+            ends = np.broadcast_to(np.asarray(length), found.shape)[at] > size
+            zero = every_byte(self._content, "u1")[np.where(ends, begin + size, begin)] == 0
+            found[at] &= zero | ~ends
+        self._advance(length)
+        return found
+
+    def _field(self, kind: Struct, wanted: str) -> Type:
+        for name, inner in kind.fields:
+            if name == wanted:
+                return inner
+            self._skip(inner)
+        raise AssertionError(f"{kind.name} has no {wanted}")
+
+    def take(self, kind: Number) -> NDArray[Any]:
         """Return the numbers here, and go on behind them; where there are none it is zero."""
         self._align(kind.size)
         after = self._place + kind.size
@@ -128,15 +262,12 @@ class _Cursor:
             self._place = np.where(self.good, self._place, 0)
 
     def _length(self) -> Place:
-        lengths = self._take(_UINT32).astype(np.int64)
+        lengths = self.take(_UINT32).astype(np.int64)
         lengths = np.where(self.good, lengths, 0)
         known = lengths[self.good]
         if known.size and bool((known == known[0]).all()):
             return int(known[0])
         return lengths
-
-    def _count(self, kind: Repeated) -> Place:
-        return self._length() if kind.count is None else kind.count
 
     def _skip(self, kind: Type) -> None:
         self._passed += 1
@@ -159,7 +290,7 @@ class _Cursor:
             for _, inner in kind.fields:
                 self._skip(inner)
         else:
-            self._skip_items(kind.item, self._count(kind))
+            self._skip_items(kind.item, self.count(kind))
 
     def _advance_by_length(self) -> None:
         length = self._length()
@@ -179,12 +310,17 @@ class _Cursor:
             self._place = np.where(count > 0, self._place, before)
             self._advance(count * item.size)
             return
+        for _ in self._each(count):
+            self._skip(item)
+
+    def _each(self, count: Place) -> Iterator[int]:
+        """Yield the number of each element; passing one counts in the messages that have it."""
         most = count if isinstance(count, int) else int(count.max(initial=0))
         # A string, or a structure, takes a byte at least.
         most = min(most, int(self._room.max()) + 1)
         for number in range(most):
             before, good = self._place, self.good.copy()
-            self._skip(item)
+            yield number
             if not isinstance(count, int):
                 more = number < count
                 self._place = np.where(more, self._place, before)

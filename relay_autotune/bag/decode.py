@@ -109,6 +109,20 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
     return messages
 
 
+def decoded_message(root: Struct, data: bytes) -> Any:
+    """Decode one message of any type.
+
+    :param root: its type.
+    :param data: the serialized message.
+    :return: an object with the fields as attributes.
+    :raises BagError: if it does not fit its type.
+    """
+    try:
+        return _decoded(root, data, _Budget())
+    except (ValueError, struct.error, MemoryError) as error:
+        raise BagError(f"a message does not fit its definition: {first_line(error)}") from None
+
+
 class _Budget:
     """Counts what takes memory of its own."""
 

@@ -5,14 +5,11 @@
 
 from __future__ import annotations
 
-import itertools
-import re
-from collections.abc import Iterator
-
-from relay_autotune.bag.cdr import Path, Step
+from relay_autotune.bag.cdr import Path
+from relay_autotune.bag.field_path import first_numbers, some_numbers, steps_of
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.schema import Number, Repeated, Struct, Type, numeric_paths
-from relay_autotune.errors import SelectionError
+from relay_autotune.bag.schema import Struct, Type
+from relay_autotune.errors import FieldError, SelectionError
 
 # The field that a message of several numbers is there for.
 _MEANT = {
@@ -24,12 +21,7 @@ _MEANT = {
     "sensor_msgs/msg/BatteryState": "voltage",
 }
 
-_STEP = re.compile(r"\.?([A-Za-z]\w*)|\[(\d{1,9})\]")
-
 _FIELDS_OF_SINGLE = 2
-
-# Fields that a message of an error lists at most.
-_LISTED = 12
 
 
 def split_name(wanted: str) -> tuple[str, str]:
@@ -42,50 +34,31 @@ def named_field(root: Struct, field: str, topic: str) -> Path:
     """Return the number that a field's name means.
 
     :param root: type of the topic's messages.
-    :param field: names joined by dots, elements in brackets; empty: the only number.
+    :param field: a path, see `relay_autotune.bag.field_path`; empty: the only number.
     :param topic: for the error.
     :raises SelectionError: if there is no such number, or no name was given and there are several.
     """
     if not field:
         only = only_field(root)
-        if only is None and not any(True for _ in _listed(root)):
+        if only is None and not first_numbers(root, 1):
             raise SelectionError(f"{topic} is of type {root.name}, which holds no numbers")
         if only is None:
             raise SelectionError(
                 f"{topic} is of type {root.name}, which holds several numbers; name one, as in "
-                f"{topic}:{next(_listed(root), 'FIELD')}; it has {_some(root)}"
+                f"{topic}:{first_numbers(root, 1)[0]}; it has {some_numbers(root)}"
             )
         field = only
-    kind: Type = root
-    steps: list[Step] = []
-    for step in _steps(field, topic):
-        if isinstance(kind, Struct) and isinstance(step, str) and step in dict(kind.fields):
-            kind = dict(kind.fields)[step]
-        elif isinstance(kind, Repeated) and isinstance(step, int):
-            if kind.count is not None and step >= kind.count:
-                raise SelectionError(
-                    f"{topic} has no {field!r}: an array of {kind.count} elements ends at "
-                    f"[{kind.count - 1}]"
-                )
-            kind = kind.item
-        else:
-            raise SelectionError(f"{topic} has no field {field!r}; it has {_some(root)}")
-        steps.append(step)
-    if not isinstance(kind, Number):
-        some = itertools.islice(_listed(kind), _LISTED)
-        inner = [f"{field}{'' if p[:1] == '[' else '.'}{p}" for p in some]
-        raise SelectionError(
-            f"{field!r} of {topic} is not a number; expected the name of one"
-            + (f", such as {', '.join(inner)}" if inner else "")
-        )
-    return Path(root, tuple(steps))
+    try:
+        return Path(root, steps_of(root, field, topic))
+    except FieldError as error:
+        raise SelectionError(str(error)) from None
 
 
 def only_field(root: Struct) -> str | None:
     """Return the number that a message is there for; None if it may be any of several."""
     if root.name in _MEANT:
         return _MEANT[root.name]
-    found = list(itertools.islice(_listed(root), 2))
+    found = first_numbers(root, 2)
     return found[0] if len(found) == 1 and "[" not in found[0] else None
 
 
@@ -111,28 +84,3 @@ def stamp_of(root: Struct) -> tuple[Path, Path] | None:
         if isinstance(kind, Struct) and {"sec", "nanosec"} <= dict(kind.fields).keys():
             return Path(root, (*steps, "sec")), Path(root, (*steps, "nanosec"))
     return None
-
-
-def _steps(field: str, topic: str) -> Iterator[Step]:
-    at = 0
-    while at < len(field):
-        match = _STEP.match(field, at)
-        if match is None:
-            raise SelectionError(
-                f"{field!r} is not the name of a field of {topic}; expected one such as "
-                f"linear_acceleration.x or position[3]"
-            )
-        yield match[1] if match[1] else int(match[2])
-        at = match.end()
-
-
-def _listed(kind: Type) -> Iterator[str]:
-    """Yield the names of numbers, without those of the header."""
-    return numeric_paths(kind, without=("header", "stamp"))
-
-
-def _some(root: Struct) -> str:
-    names = list(itertools.islice(_listed(root), _LISTED + 1))
-    if not names:
-        return "no numbers"
-    return ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")

@@ -108,6 +108,11 @@ _SCALARS = {
 }
 
 
+def number_named(name: str) -> Number:
+    """Return the number that ROS calls so, such as ``float64``."""
+    return Number(name, _NUMBERS[name])
+
+
 def message_type(channel: Channel) -> Struct:
     """Return the type of a channel's messages.
 

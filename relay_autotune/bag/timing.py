@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.bag.columns import Column
 from relay_autotune.bag.signals import Signal
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.record import IntArray
 
 # Which time of a message counts; the first is the default.
@@ -47,7 +47,7 @@ class SignalReader:
     """
 
     def __init__(self, name: str, clock: str, *, both: bool = False, expected: int = 0) -> None:
-        self._name = name
+        self.name = name
         self.clock = clock
         self._values: Column[np.float64] = Column(np.float64, expected)
         self._times: Column[np.int64] = Column(np.int64, expected)
@@ -57,6 +57,8 @@ class SignalReader:
         self._rising = True
         self._all_dated = True
         self._unfit = 0
+        self.why_unfit = ""
+        """Why a message has no value, as far as it says."""
 
     def take(
         self,
@@ -95,20 +97,26 @@ class SignalReader:
     def signal(self) -> TimedSignal:
         """Return what was collected; nothing can be added after that.
 
-        :raises BagError: if messages came, and none of them had a value.
+        :raises SelectionError: if messages came, and say why none of them has a value.
+        :raises BagError: if none of them has one otherwise.
         """
         values, times = self._values.values(), self._times.values()
         notes: list[str] = []
         if self._unfit:
+            if values.size == 0 and self.why_unfit:
+                raise SelectionError(
+                    f"none of the {self._unfit} messages of {self.name} has it: {self.why_unfit}"
+                )
             if values.size == 0:
                 raise BagError(
-                    f"none of the {self._unfit} messages of {self._name} fits its definition; if "
+                    f"none of the {self._unfit} messages of {self.name} fits its definition; if "
                     f"they are compressed one by one, and not by zstd, convert the bag with: "
                     f"ros2 bag convert"
                 )
             notes.append(
-                f"{self._unfit} of {self._unfit + values.size} messages of {self._name} do not "
+                f"{self._unfit} of {self._unfit + values.size} messages of {self.name} do not "
                 f"fit their definition, or lack the field; they are left out"
+                + (f" ({self.why_unfit})" if self.why_unfit else "")
             )
         lag = 0 if self.clock == "log" or values.size == 0 else self._lag
         if self._log_times is not None:
@@ -120,7 +128,7 @@ class SignalReader:
                 times, lag = log_times, 0
             if back and self._all_dated and self.clock != "log":
                 notes.append(
-                    f"the {self.clock} times of {self._name} go backwards; "
+                    f"the {self.clock} times of {self.name} go backwards; "
                     f"its log times are used instead"
                 )
-        return TimedSignal(Signal(self._name, times, values), lag, tuple(notes))
+        return TimedSignal(Signal(self.name, times, values), lag, tuple(notes))

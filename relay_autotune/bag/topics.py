@@ -22,7 +22,7 @@ from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Struct, message_type
 from relay_autotune.bag.timing import SignalReader, TimedSignal
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, FieldError, SelectionError
 from relay_autotune.record.record import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class Topics:
         parts: dict[str, list[tuple[NDArray[Any], ...]]] = {}
         for key, before, messages in self._messages(wanted):
             name, path = wanted[key]
-            values, good = _values(path, messages)
+            values, good = _values(path, messages, name)
             order = (messages.order + before)[good]
             times = (messages.log_time[good], messages.publish_time[good])
             parts.setdefault(name, []).append((order, *times, values[good].astype(np.float64)))
@@ -206,7 +206,9 @@ class Topics:
                 wanted.setdefault((key, channel.id), []).append((reader, path, stamp))
         for place, _, messages in self._messages(wanted):
             for reader, path, stamp in wanted[place]:
-                values, good = _values(path, messages)
+                values, good = _values(path, messages, reader.name)
+                if not reader.why_unfit:
+                    reader.why_unfit = _why_unfit(path, messages, good)
                 times = messages.log_time if reader.clock == "log" else messages.publish_time
                 if stamp is not None:
                     times, dated = _stamps(stamp, messages)
@@ -260,8 +262,21 @@ class Topics:
         return self._types[key]
 
 
-def _values(path: Path, messages: Messages) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    return path.read(messages.content, messages.begin, messages.end)
+def _values(
+    path: Path, messages: Messages, name: str = ""
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    try:
+        return path.read(messages.content, messages.begin, messages.end)
+    except FieldError as error:
+        raise SelectionError(f"{split_name(name)[0]}: {error}") from None
+
+
+def _why_unfit(path: Path, messages: Messages, good: NDArray[np.bool_]) -> str:
+    """Return why the first message without the number has none, "" where it cannot be said."""
+    if bool(good.all()):
+        return ""
+    k = int(np.argmin(good))
+    return path.why(bytes(messages.content[int(messages.begin[k]) : int(messages.end[k])]))
 
 
 def _stamps(stamp: tuple[Path, Path], messages: Messages) -> tuple[IntArray, NDArray[np.bool_]]:

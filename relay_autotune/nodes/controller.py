@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 from relay_autotune.control.controller import GainBounds, PidController, is_usable
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Step
-from relay_autotune.errors import ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.errors import FieldError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
@@ -177,7 +177,14 @@ class ControllerNode(ServedNode):
     # The loop.
 
     def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
-        value = self._value(message)
+        try:
+            value = self._value(message)
+        except FieldError as error:
+            self.get_logger().error(
+                f"the measurement cannot be read: {error}: the command is held",
+                throttle_duration_sec=5.0,
+            )
+            value = math.nan
         if self._repeater is not None:
             self._repeater.hear(value)
         if self._period > 0.0:

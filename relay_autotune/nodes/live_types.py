@@ -6,14 +6,17 @@
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+from rosidl_parser import definition
 from std_msgs.msg import Float32, Float64, Float64MultiArray
 
-from relay_autotune.errors import ParameterError
+from relay_autotune.bag.field_path import reading, steps_of
+from relay_autotune.bag.schema import Repeated, Struct, Text, Type, number_named
+from relay_autotune.errors import FieldError, ParameterError
 
 FLOAT64 = "std_msgs/msg/Float64"
 FLOAT32 = "std_msgs/msg/Float32"
@@ -22,7 +25,8 @@ ARRAY = "std_msgs/msg/Float64MultiArray"
 COMMAND_TYPES = (FLOAT64, FLOAT32, ARRAY)
 _COMMANDS = {FLOAT64: Float64, FLOAT32: Float32, ARRAY: Float64MultiArray}
 
-_STEP = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
+# Names of numbers in IDL that ROS calls otherwise.
+_PLAIN = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class Reader:
 
     :param kind: the message class.
     :param type_name: its name, such as ``sensor_msgs/msg/Temperature``.
-    :param value: returns the number.
+    :param value: returns the number; raises `FieldError` where a message does not tell it.
     :param stamp_ns: returns the header's stamp [ns since the epoch]; None: it has no header.
     """
 
@@ -45,31 +49,60 @@ def reader_of(type_name: str, field: str) -> Reader:
     """Return the reader of the measurement for a message type.
 
     :param type_name: such as ``sensor_msgs/msg/Temperature``.
-    :param field: path of a numeric field, such as ``position[2]`` or ``twist.linear.x``.
+    :param field: path of a numeric field, such as ``velocity[left_wheel]`` or ``twist.linear.x``.
     :raises ParameterError: if the type does not exist, or the field is not a number.
+    """
+    kind = message_class(type_name, "measurement_type")
+    try:
+        steps = steps_of(struct_of(kind), field, type_name)
+    except FieldError as error:
+        raise ParameterError(f"measurement_field: {error}") from None
+    example = kind()
+    is_plain = steps == ("data",) and isinstance(example.data, float)
+    stamp = _header_stamp if hasattr(example, "header") else None
+    return Reader(kind, type_name, _data if is_plain else reading(steps), stamp)
+
+
+def message_class(type_name: str, parameter: str) -> Any:
+    """Return the class of a message type.
+
+    :param type_name: such as ``sensor_msgs/msg/Temperature``.
+    :param parameter: which parameter names it, for the error.
+    :raises ParameterError: if no such type is installed.
     """
     package, _, rest = type_name.partition("/")
     try:
         kind = getattr(importlib.import_module(f"{package}.msg"), rest.removeprefix("msg/"))
-        example = kind()
+        kind()
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ParameterError(
-            f"measurement_type is {type_name!r}, expected an installed message type such as "
-            f"{FLOAT64}"
+            f"{parameter} is {type_name!r}, expected an installed message type such as {FLOAT64}"
         ) from error
-    path = _path(field)
-    _check(example, path, type_name, field)
-    if path == ["data"]:
-        value: Callable[[Any], float] = _data
-    else:
+    return kind
 
-        def value(message: Any) -> float:
-            found = message
-            for step in path:
-                found = found[step] if isinstance(step, int) else getattr(found, step)
-            return float(found)
 
-    return Reader(kind, type_name, value, _header_stamp if hasattr(example, "header") else None)
+@cache
+def struct_of(kind: Any) -> Struct:
+    """Return the fields of a message class.
+
+    :param kind: as rosidl generates them.
+    """
+    module = kind.__module__.split(".")
+    names = kind.get_fields_and_field_types()
+    fields = zip(names, map(_type_of, kind.SLOT_TYPES), strict=True)
+    return Struct("/".join((*module[:2], kind.__name__)), tuple(fields))
+
+
+def _type_of(slot: Any) -> Type:
+    if isinstance(slot, definition.NamespacedType):
+        module = importlib.import_module(".".join(slot.namespaces))
+        return struct_of(getattr(module, slot.name))
+    if isinstance(slot, definition.AbstractNestedType):
+        count = slot.size if isinstance(slot, definition.Array) else None
+        return Repeated(_type_of(slot.value_type), count)
+    if isinstance(slot, definition.AbstractGenericString):
+        return Text(wide=isinstance(slot, definition.AbstractWString))
+    return number_named(_PLAIN.get(slot.typename, slot.typename))
 
 
 def command_setter(type_name: str) -> tuple[Any, Callable[[Any, float], None]]:
@@ -96,35 +129,3 @@ def _set_array(message: Any, command: float) -> None:
 def _header_stamp(message: Any) -> int:
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _path(field: str) -> list[str | int]:
-    path: list[str | int] = []
-    for part in field.split("."):
-        found = _STEP.fullmatch(part)
-        if found is None:
-            raise ParameterError(
-                f"measurement_field is {field!r}, expected a path such as data or position[2]"
-            )
-        path.append(found[1])
-        path += [int(number) for number in re.findall(r"\d+", found[2])]
-    return path
-
-
-def _check(example: Any, path: list[str | int], type_name: str, field: str) -> None:
-    found = example
-    for step in path:
-        if isinstance(step, int):
-            # An array's length is known only when a message comes.
-            return
-        if not hasattr(found, step) or step.startswith("_"):
-            known = ", ".join(getattr(found, "get_fields_and_field_types", dict)())
-            raise ParameterError(
-                f"measurement_field is {field!r}, which {type_name} does not have; expected a "
-                f"number, the fields there are: {known}"
-            )
-        found = getattr(found, step)
-    if isinstance(found, bool) or not isinstance(found, (int, float)):
-        raise ParameterError(
-            f"measurement_field is {field!r}, which is not a number in {type_name}"
-        )

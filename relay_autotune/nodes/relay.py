@@ -19,7 +19,7 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import FieldError, RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
@@ -136,6 +136,7 @@ class RelayNode(ServedNode):
             self, self._reader, self._counter, repeat=self._on_silence, stop=self._stop_now
         )
         self._hear = self._sensor.hear
+        self._topic = self._ends.measurement.topic_name
         if not self._simulated:
             self.favour(self._ends.measurement)
         self.create_timer(FOLLOW_EVERY, self._follow_sensor, clock=self._steady)
@@ -157,8 +158,15 @@ class RelayNode(ServedNode):
     # The hot path.
 
     def _on_measurement(self, message: Any, info: dict[str, Any]) -> None:
-        session = self._session
-        value = self._value(message)
+        session, sensor = self._session, self._sensor
+        try:
+            value = self._value(message)
+        except FieldError as error:
+            sensor.misread = f"the measurement on {self._topic} cannot be read: {error}"
+            self._stop_now(sensor.misread)
+            return
+        if sensor.misread:
+            sensor.misread = ""
         if self._hear is not None:
             self._hear(value)
         if self._ahead:
@@ -529,7 +537,9 @@ class RelayNode(ServedNode):
     def _publish_diagnostics(self) -> None:
         session = self._session
         problems = [self._alarm] if self._alarm else []
-        if self._sensor.age > self.get_parameter("measurement_timeout").value:
+        if self._sensor.misread:
+            problems.append(self._sensor.misread)
+        elif self._sensor.age > self.get_parameter("measurement_timeout").value:
             why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from rclpy.clock import Clock
@@ -16,7 +17,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from relay_autotune.errors import ParameterError
+from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.experiment.faults.repetition import Repetition
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import Reader
@@ -107,7 +108,9 @@ class Repeater:
 
     def _on_kept(self, message: Any) -> None:
         if not self._direct:
-            self._repetition.hear(self._now(), self._reader.value(message))
+            # The subscription of the node says why a message cannot be read.
+            with suppress(FieldError):
+                self._repetition.hear(self._now(), self._reader.value(message))
 
     def _look(self) -> None:
         if self._ear is not None and self._direct:
@@ -163,6 +166,8 @@ class Sensor:
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.hear = self._repeater.hear if self._repeater else None
         """To be called with each measurement; None: no call needed."""
+        self.misread = ""
+        """Why the last message could not be read; empty: it could."""
 
     @property
     def age(self) -> float:
@@ -171,8 +176,8 @@ class Sensor:
         return age if self._repeater is None else self._repeater.age(age)
 
     def why_dead(self) -> str:
-        """Return a sentence if the sensor must be dead, since its publisher has left, else ""."""
-        return "" if self._repeater is None else self._repeater.why_dead()
+        """Return why nothing can be measured: its messages, or its publisher has left; else ""."""
+        return self.misread or ("" if self._repeater is None else self._repeater.why_dead())
 
     @property
     def _timeout(self) -> float:

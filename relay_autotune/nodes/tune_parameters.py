@@ -156,7 +156,10 @@ FIXED_PARAMETERS = (
         "Message type of the measurement; its header's stamp, if it has one, is the time.",
     ),
     Quantity(
-        "measurement_field", "data", "", "Path of the measurement in it, such as position[2]."
+        "measurement_field",
+        "data",
+        "",
+        "Path of the measurement in it, such as velocity[left_wheel].",
     ),
     Quantity(
         "repeat_period",

@@ -262,3 +262,17 @@ def test_a_record_that_begins_with_its_step_is_an_experiment(tmp_path):
     (record,) = read_experiments(write(tmp_path / "a.csv", text)).experiments
     held = record.input()
     assert (held.initial, held.values.tolist()) == (0.0, [5.0])
+
+
+def test_columns_are_called_as_exports_call_the_joints(tmp_path):
+    rng = np.random.default_rng(1)
+    y = rng.standard_normal((20, 2)).tolist()
+    head = "t,/joint_states:velocity[left],/joint_states:velocity[right],/effort:data[1]"
+    rows = "".join(f"{0.1 * k:g},{a!r},{b!r},{k // 5}\n" for k, (a, b) in enumerate(y))
+    path = write(tmp_path / "a.csv", f"{head}\n{rows}")
+    for column, name in enumerate(("left", "right")):
+        wanted = Selection(f"/joint_states:velocity[{name}]", "/effort:data[1]", start=0.0)
+        (record,) = read_experiments(path, wanted).experiments
+        assert record.measurement.tolist() == [row[column] for row in y]
+    with pytest.raises(SelectionError, match=r"no column '/joint_states:velocity\[arm\]'"):
+        read_experiments(path, Selection("/joint_states:velocity[arm]", "/effort:data[1]"))

@@ -107,20 +107,22 @@ def test_a_topic_without_a_header_keeps_its_publish_times(tmp_path):
 
 
 def test_an_element_of_a_sequence_behind_strings(tmp_path):
-    names = [["a"], ["left", "right_wheel"], [], ["x", "yy", "zzz"]]
+    name = "x_msgs/msg/Labelled"
+    text = "std_msgs/Header header\nstring[] labels\nfloat64[] position\nfloat64[] velocity\n"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(text, name))
+    labels = [["a"], ["left", "right_wheel"], [], ["x", "yy", "zzz"]]
     messages = [
-        ros(
-            "sensor_msgs/msg/JointState",
+        store.types[name](
             header(k),
-            names[k % 4],
-            np.arange(len(names[k % 4])) + 10.0 * k,
+            labels[k % 4],
+            np.arange(len(labels[k % 4])) + 10.0 * k,
             np.arange(k % 3) - 1.0 * k,
-            np.zeros(0),
         )
         for k in range(40)
     ]
-    text, data = made("sensor_msgs/msg/JointState", *messages)
-    path = write(tmp_path / "bag.mcap", "sensor_msgs/msg/JointState", text, data)
+    data = [store.serialize_cdr(message, name) for message in messages]
+    path = write(tmp_path / "bag.mcap", name, store.generate_msgdef(name)[0], data)
     for field in ("position", "velocity"):
         for index in (0, 1):
             signal, notes = read(path, f"/topic:{field}[{index}]")

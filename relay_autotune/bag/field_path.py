@@ -1,0 +1,367 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The path of a number in a message: fields, and elements by their place or by their name.
+
+=============================== =================================================================
+``linear.x``                    a field of a field
+``ranges[3]``                   an element by its place, where nothing names the elements
+``velocity[left_wheel]``        the element that a list of names in the message calls so
+``values[dof_names=arm_2]``     the same, with the list that is meant
+``dof_states[name=left].error`` the element of an array of messages of which a field has this value
+=============================== =================================================================
+
+A path means the same for messages of a running loop (:func:`reading`) and for the bytes of
+recorded ones (:class:`relay_autotune.bag.cdr.Path`). The names are those of each message, because
+their order may change from one to the next.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type, numeric_paths
+from relay_autotune.errors import FieldError
+from relay_autotune.escape import visible
+
+# Lists of texts that name the elements of the arrays beside them, and of those in structures
+# beside them; and the field by which an element of an array of messages is named.
+_NAME_LISTS = ("name", "joint_names", "dof_names", "interface_names", "interface_groups", "names")
+_OWN_NAME = "name"
+
+_STEP = re.compile(r"\.?([A-Za-z]\w*)|\[(\d{1,9})\]|\[(?:([A-Za-z]\w*)=)?([^\[\]]+)\]")
+
+# Fields that are no quantity of a process.
+_HEADER = ("header", "stamp")
+
+# Fields or names that a message of an error lists at most.
+_LISTED = 12
+
+
+@dataclass(frozen=True)
+class Names:
+    """What names the elements of an array.
+
+    :param field: a list of texts, or a field of each element.
+    :param depth: number of steps of the path to the structure with that list; None: the field is
+        one of each element.
+    """
+
+    field: str
+    depth: int | None
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of an array.
+
+    :param chosen: its place, or its name.
+    :param names: what names the elements; None: nothing does.
+    """
+
+    chosen: int | str
+    names: Names | None
+
+    def shown(self, name: str = "NAME") -> str:
+        """Return how it is written with a name.
+
+        :param name: the name.
+        """
+        if self.names is None:
+            return f"[{self.chosen}]"
+        # Digits alone would be a place.
+        by = f"{self.names.field}=" if self.names.depth is None or name.isdecimal() else ""
+        return f"[{by}{name}]"
+
+
+Step = str | Element
+
+
+def steps_of(root: Struct, path: str, of: str) -> tuple[Step, ...]:
+    """Return the steps from a message to the number that a path names.
+
+    :param root: type of the message.
+    :param path: such as ``linear.x`` or ``velocity[left_wheel]``.
+    :param of: what has the field, for the error.
+    :raises FieldError: if the type has no such number.
+    """
+    kind: Type = root
+    steps: list[Step] = []
+    # The structures on the way since the last array, each with the number of steps to it.
+    around: list[tuple[int, Struct]] = []
+    for step in _parsed(path, of):
+        if isinstance(kind, Struct) and isinstance(step, str) and step in dict(kind.fields):
+            around.append((len(steps), kind))
+            kind = dict(kind.fields)[step]
+            steps.append(step)
+        elif isinstance(kind, Repeated) and isinstance(step, tuple):
+            steps.append(_element(kind, step, around, path, of))
+            kind, around = kind.item, []
+        else:
+            raise FieldError(f"{of} has no field {path!r}; it has {some_numbers(root)}")
+    if not isinstance(kind, Number):
+        some = itertools.islice(numeric_paths(kind, without=_HEADER), _LISTED)
+        inner = [_spelt(root, f"{path}{'' if p[:1] == '[' else '.'}{p}") for p in some]
+        raise FieldError(
+            f"{path!r} of {of} is not a number; expected the name of one"
+            + (f", such as {', '.join(inner)}" if inner else "")
+        )
+    return tuple(steps)
+
+
+def some_numbers(root: Struct) -> str:
+    """Return the paths of some numbers of a type, for an error."""
+    found = list(itertools.islice(_listed(root), _LISTED + 1))
+    if not found:
+        return "no numbers"
+    return ", ".join(found[:_LISTED]) + (", ..." if len(found) > _LISTED else "")
+
+
+def first_numbers(root: Struct, count: int) -> list[str]:
+    """Return the paths of the first numbers of a type, without those of its header."""
+    return list(itertools.islice(_listed(root), count))
+
+
+def _listed(root: Struct) -> Iterator[str]:
+    return (_spelt(root, path) for path in numeric_paths(root, without=_HEADER))
+
+
+def _spelt(root: Struct, path: str) -> str:
+    """Return a path with NAME in place of each 0 where the elements have names."""
+    if "[" not in path:
+        return path
+    return "".join(
+        f".{step}"
+        if isinstance(step, str)
+        else step.shown(step.chosen if isinstance(step.chosen, str) else "NAME")
+        for step in steps_of(root, path, "")
+    ).removeprefix(".")
+
+
+def _parsed(path: str, of: str) -> Iterator[str | tuple[str, str]]:
+    """Yield the fields of a path, and what is in its brackets: a key or "", and the rest."""
+    at = 0
+    while at < len(path):
+        match = _STEP.match(path, at)
+        if match is None:
+            raise FieldError(
+                f"{path!r} is not the name of a field of {of}; expected one such as "
+                f"linear_acceleration.x, position[3] or velocity[left_wheel]"
+            )
+        field, place, key, name = match.groups()
+        yield field if field else ("", place) if place else (key or "", name.strip())
+        at = match.end()
+
+
+def _element(
+    array: Repeated,
+    asked: tuple[str, str],
+    around: Sequence[tuple[int, Struct]],
+    path: str,
+    of: str,
+) -> Element:
+    key, name = asked
+    by_place = not key and name.isdecimal()
+    if by_place and array.count is not None and int(name) >= array.count:
+        raise FieldError(
+            f"{of} has no {path!r}: an array of {array.count} elements ends at [{array.count - 1}]"
+        )
+    names = _said_names(array, key, around) if key else _own_names(array, around)
+    if by_place:
+        return Element(int(name), names if isinstance(names, Names) else None)
+    if isinstance(names, Names):
+        return Element(name, names)
+    if key:
+        raise FieldError(
+            f"{of} has no names {key!r} for {path!r}: expected a field of texts or whole numbers "
+            f"in each element, or a list of texts beside the array"
+        )
+    if names:
+        raise FieldError(
+            f"{of} has several lists of names, so that {path!r} is not clear; write "
+            f"[{names[0]}={name}] or [{names[1]}={name}]"
+        )
+    raise FieldError(
+        f"{of} has no list of names for {path!r}, such as {', '.join(_NAME_LISTS[:4])}; expected "
+        f"the place of the element, as in [0], or the list, as in [LIST={name}]"
+    )
+
+
+def _said_names(array: Repeated, key: str, around: Sequence[tuple[int, Struct]]) -> Names | None:
+    if isinstance(array.item, Struct):
+        own = dict(array.item.fields).get(key)
+        whole = isinstance(own, Number) and own.form[0] in "ui"
+        if whole or (isinstance(own, Text) and not own.wide):
+            return Names(key, None)
+    for depth, struct in reversed(around):
+        if _is_list(dict(struct.fields).get(key)):
+            return Names(key, depth)
+    return None
+
+
+def _own_names(array: Repeated, around: Sequence[tuple[int, Struct]]) -> Names | list[str] | None:
+    if isinstance(array.item, Struct):
+        own = dict(array.item.fields).get(_OWN_NAME)
+        if isinstance(own, Text) and not own.wide:
+            return Names(_OWN_NAME, None)
+    for depth, struct in reversed(around):
+        fields = dict(struct.fields)
+        found = [name for name in _NAME_LISTS if _is_list(fields.get(name))]
+        if len(found) == 1:
+            return Names(found[0], depth)
+        if found:
+            return found
+    return None
+
+
+def _is_list(kind: Type | None) -> bool:
+    return isinstance(kind, Repeated) and isinstance(kind.item, Text) and not kind.item.wide
+
+
+# Messages that are Python objects.
+
+
+def reading(steps: Sequence[Step]) -> Callable[[Any], float]:
+    """Return the function that reads the number from a message.
+
+    It raises `FieldError` where the message does not tell which element is meant: its names lack
+    the one that is wanted, or have it twice, or it names its elements and a place was given. The
+    names are looked at in each message, and searched again when they have changed.
+
+    :param steps: of the path, as :func:`steps_of` returns them.
+    """
+    way = _way(steps)
+
+    def value(message: Any) -> float:
+        found = _walk(message, way)[-1]
+        # A byte comes as a text of bytes.
+        return float(found[0] if isinstance(found, bytes) else found)
+
+    return value
+
+
+def setting(steps: Sequence[Step]) -> Callable[[Any, float], None]:
+    """Return the function that writes the number into a message; it raises as a reading does.
+
+    :param steps: of the path, as :func:`steps_of` returns them.
+    """
+    *way, last = _way(steps)
+
+    def put(message: Any, number: float) -> None:
+        trail = _walk(message, way)
+        if isinstance(last, str):
+            setattr(trail[-1], last, number)
+        else:
+            trail[-1][last.place(trail[-1], trail)] = number
+
+    return put
+
+
+def _way(steps: Sequence[Step]) -> list[str | _Finder]:
+    return [step if isinstance(step, str) else _Finder(steps, k) for k, step in enumerate(steps)]
+
+
+def _walk(message: Any, way: Sequence[str | _Finder]) -> list[Any]:
+    """Return a message, and what each step leads to."""
+    found, trail = message, [message]
+    for step in way:
+        found = getattr(found, step) if isinstance(step, str) else found[step.place(found, trail)]
+        trail.append(found)
+    return trail
+
+
+class _Finder:
+    """Find an element in the arrays of messages.
+
+    :param steps: of the path.
+    :param at: which of them the element is.
+    """
+
+    def __init__(self, steps: Sequence[Step], at: int) -> None:
+        element = steps[at]
+        assert isinstance(element, Element)
+        self._element = element
+        self._steps, self._at = steps, at
+        self._seen: list[Any] | None = None
+        self._count = -1
+        self._place = 0
+
+    def place(self, array: Any, trail: Sequence[Any]) -> int:
+        """Return the place of the element.
+
+        :param array: the array.
+        :param trail: the message, and what each step before has led to.
+        :raises FieldError: if it is not there, or not clear.
+        """
+        by = self._element.names
+        if by is None:
+            names: list[Any] = []
+        elif by.depth is None:
+            names = [getattr(item, by.field) for item in array]
+        else:
+            names = getattr(trail[by.depth], by.field)
+        count = len(array)
+        if names != self._seen or count != self._count:
+            self._place = self._found(names, count)
+            self._seen, self._count = list(names), count
+        return self._place
+
+    def _found(self, names: Sequence[Any], count: int) -> int:
+        chosen, by = self._element.chosen, self._element.names
+        if isinstance(chosen, int):
+            if chosen >= count:
+                raise FieldError(f"{self._shown()}: the array has length {count}")
+            if by is not None and len(names) == count:
+                right = self._shown(self._element.shown(_text(names[chosen])))
+                raise FieldError(
+                    f"{self._shown()}: this message names its elements; write {right}"
+                )
+            return chosen
+        assert by is not None
+        wanted = [_text(name) for name in names]
+        where = [k for k, name in enumerate(wanted) if name == chosen]
+        told = f"the list {by.field}" if by.depth is not None else f"the elements' {by.field}"
+        if len(where) > 1:
+            raise FieldError(
+                f"{self._shown()}: {told} has {chosen!r} {len(where)} times, so that it is not "
+                f"clear which element is meant"
+            )
+        if not where:
+            near = difflib.get_close_matches(chosen, wanted, n=1)
+            meant = f"; write {self._shown(self._element.shown(near[0]))}" if near else ""
+            raise FieldError(
+                f"{self._shown()}: {told} has no {chosen!r}; it has {_some_of(wanted)}{meant}"
+            )
+        if len(wanted) != count:
+            raise FieldError(
+                f"{self._shown()}: {told} has length {len(wanted)}, but the array {count}"
+            )
+        return where[0]
+
+    def _shown(self, last: str = "") -> str:
+        """Return the path up to the element, with something else in its place if given."""
+        text = ""
+        for step in self._steps[: self._at]:
+            text += f".{step}" if isinstance(step, str) else _as_written(step)
+        return visible((text + (last or _as_written(self._element))).removeprefix("."))
+
+
+def _as_written(element: Element) -> str:
+    chosen = element.chosen
+    return element.shown(chosen) if isinstance(chosen, str) else f"[{chosen}]"
+
+
+def _text(name: Any) -> str:
+    return name if isinstance(name, str) else str(int(name))
+
+
+def _some_of(names: Sequence[str]) -> str:
+    if not names:
+        return "no names"
+    shown = ", ".join(map(visible, names[:_LISTED]))
+    return shown + (", ..." if len(names) > _LISTED else "")
