@@ -10,6 +10,7 @@ A page asks for it with a pair of comments, and what is between them is replaced
     <!-- parameters of relay_node -->    <!-- end -->    a table of the node's parameters
     <!-- text of FILE -->                <!-- end -->    a file, in a fenced block
     <!-- checks of judgement -->         <!-- end -->    the table of checks behind a verdict
+    <!-- laws of equations -->           <!-- end -->    a table of the laws that gains are for
 
 It also writes config/parameters.yaml, in which every parameter of every node has its default.
 """
@@ -24,6 +25,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from relay_autotune.identification.judgement.table import CHECKS
+from relay_autotune.loop.laws import LAWS, Law
 from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.identifier_parameters import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
@@ -43,7 +45,7 @@ TABLES: Mapping[str, Sequence[Quantity]] = {
 }
 
 _BLOCK = re.compile(
-    r"<!-- (?P<kind>parameters|text|checks) of (?P<what>\S+) -->\n.*?<!-- end -->", re.DOTALL
+    r"<!-- (?P<kind>parameters|text|checks|laws) of (?P<what>\S+) -->\n.*?<!-- end -->", re.DOTALL
 )
 
 
@@ -63,6 +65,7 @@ def _block(asked: re.Match[str]) -> str:
         "parameters": lambda name: table(TABLES[name]),
         "text": text_of,
         "checks": lambda _: checks_table(CHECKS),
+        "laws": laws_table,
     }
     content = kinds[asked["kind"]](what)
     return f"<!-- {asked['kind']} of {what} -->\n\n{content}\n\n<!-- end -->"
@@ -98,6 +101,33 @@ def checks_table(checks: Iterable[Check]) -> str:
     for check in checks:
         limits = (limit_text(check, limit) for limit in (check.doubtful, check.failed))
         cells = (f"`{check.name}`", check.what, *limits, check.remedy)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def laws_table(what: str) -> str:
+    """Return a table of the laws, a row for each.
+
+    :param what: "programs", "equations" or "properties".
+    """
+    columns: dict[str, dict[str, Callable[[Law], str]]] = {
+        "programs": {
+            "program, in the version whose source was read": lambda law: law.program,
+            "command": lambda law: law.command,
+        },
+        "equations": {"in each sample": lambda law: f"`{law.equation}`"},
+        "properties": {
+            "derivative of": lambda law: law.slope.value,
+            "filter": lambda law: law.smoothing.words,
+            "weight b": lambda law: " or ".join(f"{w:g}" for w in law.weights) or "0 to 1",
+            "at a limit of the command": lambda law: law.limits,
+            "its parameters": lambda law: ", ".join(f"`{s.name}`" for s in law.settings),
+        },
+    }
+    chosen = columns[what]
+    lines = [f"| law | {' | '.join(chosen)} |", "|---" * (1 + len(chosen)) + "|"]
+    for law in LAWS.values():
+        cells = (f"`{law.name}`", *(cell(law) for cell in chosen.values()))
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

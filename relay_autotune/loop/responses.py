@@ -29,11 +29,11 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 _POINTS = 4096
 _MOST_POINTS = 1 << 18
 _DECAY = math.log(1e8)
-_TURNS, _RESETS, _LONGEST = 6.0, 8.0, 64.0
+_TURNS, _RESETS, LONGEST = 6.0, 8.0, 64.0
 # The horizon is long enough if the tail of a response is below this part of the whole.
 _SETTLED = 1e-3
 # A smaller final error counts as zero.
-_NO_OFFSET = 1e-3
+NO_OFFSET = 1e-3
 BAND = 0.02
 
 
@@ -123,8 +123,13 @@ def integral_gain(law: ControlLaw, frequency: float) -> float:
     return gain if abs(gain) > 1e-9 * frequency * proportional else 0.0
 
 
-def _horizon(law: ControlLaw, model: TransferFunction, frequency: float) -> float:
-    """Return a first guess of how long the responses last [s]."""
+def horizon(law: ControlLaw, model: TransferFunction, frequency: float) -> float:
+    """Return a first guess of how long the responses last [s].
+
+    :param law: the controller.
+    :param model: the process, with all dead time of the loop.
+    :param frequency: about which the loop is closed [rad/s].
+    """
     integral = abs(integral_gain(law, frequency))
     reset = max((abs(t) for t in model.time_constants), default=0.0)
     if integral > 0.0:
@@ -199,39 +204,63 @@ def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> 
     if integral == 0.0:
         final = float(to.measurement_from_setpoint(rest)[0].real)
         offset = float(to.measurement_from_load(rest)[0].real)
-    duration = _horizon(law, model, frequency)
+    duration = horizon(law, model, frequency)
     # Twenty instants per period of this frequency, if the number of points allows it.
     finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
     points = max(_POINTS, 1 << finest.bit_length())
-    longest = _LONGEST * duration
+    longest = LONGEST * duration
     while True:
         setpoint, load = step_responses(law, model, duration, points)
         tails = (setpoint.measurement - final, load.measurement - offset)
-        if all(_has_settled(tail) for tail in tails):
+        if all(has_settled(tail) for tail in tails):
             break
         duration, points = 2.0 * duration, min(2 * points, _MOST_POINTS)
         if duration > longest:
             raise TuningError(
                 "the responses of the closed loop do not die away in any reasonable time"
             )
-    error = final - setpoint.measurement
-    step = duration / points
-    iae_load = _iae(1.0 / integral, load.measurement, step) if integral else math.inf
+    iae_load = 1.0 / integral if integral else math.inf
     iae_setpoint = math.inf
-    if abs(1.0 - final) < _NO_OFFSET:
+    if abs(1.0 - final) < NO_OFFSET:
         whole = (1.0 - to.measurement_from_setpoint(rest)) / rest
-        iae_setpoint = _iae(float(whole[0].real), error, step)
+        iae_setpoint = float(whole[0].real)
+    first = abs(to.first_command())
+    return figures_of(setpoint, load, final, (iae_setpoint, iae_load), first)
+
+
+def figures_of(
+    setpoint: StepResponse,
+    load: StepResponse,
+    final: float,
+    integrals: tuple[float, float],
+    first_command: float,
+) -> StepFigures:
+    """Return the features of responses that have settled.
+
+    :param setpoint: to a unit step of the set-point.
+    :param load: to a unit step of the load.
+    :param final: measurement at the end of the first.
+    :param integrals: of the error after each [y s]; infinite where an error remains.
+    :param first_command: size of the command's own jump at the step of the set-point [u].
+    """
+    error = final - setpoint.measurement
+    step = float(setpoint.time[1])
+    iae_setpoint, iae_load = (
+        _iae(whole, e, step) if math.isfinite(whole) else math.inf
+        for whole, e in zip(integrals, (error, load.measurement), strict=True)
+    )
     return StepFigures(
         iae_load=iae_load,
         iae_setpoint=iae_setpoint,
         overshoot=max(float(np.max(-error / final)), 0.0),
         settling_time=_settling_time(setpoint.time, error, BAND * abs(final)),
-        effort_setpoint=abs(to.first_command()) + _variation(setpoint.command),
+        effort_setpoint=first_command + _variation(setpoint.command),
         effort_load=_variation(load.command),
     )
 
 
-def _has_settled(tail: FloatArray) -> bool:
+def has_settled(tail: FloatArray) -> bool:
+    """Return True if the late part of a deviation is negligible, shape (n,)."""
     late = tail[3 * tail.size // 4 : -tail.size // 16]
     return float(np.abs(late).max()) <= _SETTLED * float(np.abs(tail).max())
 

@@ -249,6 +249,23 @@ class Modes:
         """
         return np.asarray(self.propagators(np.array([time]))[0] @ z)
 
+    def step_transform(
+        self, z: NDArray[np.complexfloating[Any, Any]], first: float, period: float
+    ) -> NDArray[np.complexfloating[Any, Any]]:
+        """Return the z-transform of the first output after a unit step of the input.
+
+        ``sum_n s(first + n period) z^-n``, s being the step response.
+
+        :param z: outside the unit circle or on it, no pole of the sum, shape (n,).
+        :param first: time of the first sample after the step [s].
+        :param period: of the samples [s].
+        """
+        begin, move = self.propagators(np.array([first, period]))
+        row = np.concatenate([cluster.output[0, 0] for cluster in self._clusters])
+        matrices = np.eye(self.size) - move / z[:, None, None]
+        start = np.broadcast_to(begin @ self.input_direction, (z.size, self.size))
+        return np.asarray(np.linalg.solve(matrices, start[..., None])[..., 0] @ row)
+
     def weights(self, z: Coordinates) -> list[Coordinates]:
         """Return, for each cluster, the coefficients of the outputs' polynomials.
 

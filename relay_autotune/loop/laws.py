@@ -1,0 +1,650 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+r"""The control laws that other programs run, sample by sample, as rows of one table.
+
+Every law has the form, with the error ``e = r - y`` and the sampling period h,
+
+    u = kc (b r - V y) + (kc/ti) I (r - V y) - kc td S (y, or y - r),
+
+where V is a filter on the measurement, I the integral and S the derivative, each a rational
+function of z. A row says which these are. From it follow the law's transfer functions in z, a
+controller that runs, the names of its parameters, and the table in the guide. A row is written
+from the source of the program, in the version that it names.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.errors import TuningError, look_up
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import filter_matrices, require_period
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+
+# A weight that is larger by less than this counts as the same.
+_SAME_WEIGHT = 0.005
+
+
+@dataclass(frozen=True)
+class Rational:
+    """A rational function of z, in powers of ``z^-1``.
+
+    :param top: coefficients of 1, z^-1, z^-2 and so on.
+    :param bottom: likewise; the first one is 1.
+    """
+
+    top: tuple[float, ...]
+    bottom: tuple[float, ...] = (1.0,)
+
+    def __call__(self, z: ComplexArray) -> ComplexArray:
+        """Return the value at each z, any shape."""
+        back = 1.0 / z
+        above, below = (
+            np.polynomial.polynomial.polyval(back, part) for part in (self.top, self.bottom)
+        )
+        return np.asarray(above / below)
+
+    def __mul__(self, other: Rational) -> Rational:
+        return Rational(
+            tuple(np.convolve(self.top, other.top).tolist()),
+            tuple(np.convolve(self.bottom, other.bottom).tolist()),
+        )
+
+    def times(self, factor: float) -> Rational:
+        """Return the function times a number."""
+        return Rational(tuple(factor * c for c in self.top), self.bottom)
+
+
+_ONE = Rational((1.0,))
+_NOTHING = Rational((0.0,))
+
+
+class _Running:
+    """A rational function of z, run sample by sample from rest."""
+
+    def __init__(self, function: Rational) -> None:
+        self._function = function
+        self._inputs = [0.0] * len(function.top)
+        self._outputs = [0.0] * (len(function.bottom) - 1)
+
+    def step(self, value: float) -> float:
+        self._inputs = [value, *self._inputs[:-1]]
+        found = sum(b * x for b, x in zip(self._function.top, self._inputs, strict=True))
+        past = zip(self._function.bottom[1:], self._outputs, strict=True)
+        found -= sum(a * y for a, y in past)
+        if self._outputs:
+            self._outputs = [found, *self._outputs[:-1]]
+        return found
+
+
+class Integral(enum.Enum):
+    """When a law adds a sample's error to its integral; the value is the lead in half periods."""
+
+    BEFORE = 1.0
+    TRAPEZOID = 0.0
+    AFTER = -1.0
+
+    def over(self, period: float) -> Rational:
+        """Return the integral of a unit signal, ``h (z + 1)/(z - 1)/2 + lead h/2``.
+
+        :param period: h [s].
+        """
+        half = 0.5 * period
+        return Rational(
+            (half * (1.0 + self.value), half * (1.0 - self.value)),
+            (1.0, -1.0),
+        )
+
+
+class Slope(enum.Enum):
+    """Of what a law takes the derivative."""
+
+    MEASUREMENT = "the measurement"
+    ERROR = "the error"
+    NONE = "none"
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """How a law smooths its derivative, or the whole measurement.
+
+    :param words: for people.
+    :param setting: the time constant that it has, from the one that is wanted and the period [s].
+    :param slope: the derivative of a signal, for its own time constant and the period.
+    :param value: the filter on the measurement in the other parts; likewise.
+    :param adjustable: True if the time constant can be chosen.
+    """
+
+    words: str
+    setting: Callable[[float, float], float]
+    slope: Callable[[float, float], Rational]
+    value: Callable[[float, float], Rational] = lambda _tf, _period: _ONE
+    adjustable: bool = True
+
+
+def _measurement_filter(tf: float, period: float) -> tuple[Rational, Rational]:
+    """Return value and slope of the second-order filter of controller_node."""
+    turn, past, present = filter_matrices(tf, period)
+    (f11, f12), (f21, f22) = turn.tolist()
+    bottom = (1.0, -(f11 + f22), f11 * f22 - f12 * f21)
+    (p1, p2), (n1, n2) = past.tolist(), present.tolist()
+    value = (n1, p1 - f22 * n1 + f12 * n2, f12 * p2 - f22 * p1)
+    slope = (n2, p2 - f11 * n2 + f21 * n1, f21 * p1 - f11 * p2)
+    return Rational(value, bottom), Rational(slope, bottom)
+
+
+def _first_order(tf: float, period: float) -> Rational:
+    """Return ``d_k = (1 - a) d_{k-1} + a (y_k - y_{k-1})/h`` with ``a = h/tf``."""
+    a = period / max(tf, period)
+    return Rational((a / period, -a / period), (1.0, a - 1.0))
+
+
+def averaged_over(tf: float, period: float) -> int:
+    """Return of how many differences the mean has the lag ``tf`` more than one difference.
+
+    :param tf: s.
+    :param period: of the samples [s].
+    """
+    return 1 + round(2.0 * tf / period)
+
+
+def _mean(tf: float, period: float) -> Rational:
+    count = averaged_over(tf, period)
+    last = -1.0 / (count * period)
+    return Rational((-last, *[0.0] * (count - 1), last))
+
+
+_PLAIN = Smoothing(
+    "none",
+    lambda _tf, _period: 0.0,
+    lambda _tf, period: Rational((1.0 / period, -1.0 / period)),
+    adjustable=False,
+)
+_ON_MEASUREMENT = Smoothing(
+    "second order, on the measurement",
+    lambda tf, _period: tf,
+    lambda tf, period: _measurement_filter(tf, period)[1],
+    lambda tf, period: _measurement_filter(tf, period)[0],
+)
+_FIRST_ORDER = Smoothing(
+    "first order, on the derivative",
+    lambda tf, period: tf if tf > period else 0.0,
+    _first_order,
+)
+_MEAN = Smoothing(
+    "mean of the last N differences",
+    lambda tf, period: 0.5 * period * (averaged_over(tf, period) - 1),
+    _mean,
+)
+_FOUR_SAMPLES = Smoothing(
+    "fixed, over four samples",
+    lambda _tf, _period: 0.0,
+    lambda _tf, period: Rational(tuple(c / (10.0 * period) for c in (3.0, 1.0, -1.0, -3.0))),
+    adjustable=False,
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A parameter of the program that runs a law.
+
+    :param name: its name there.
+    :param value: its value, or what it is from the gains and the period; a text stands as it is.
+    """
+
+    name: str
+    value: float | str | Callable[[SampledLaw], float | str]
+
+    def of(self, law: SampledLaw) -> float | str:
+        """Return the value for a law with its gains."""
+        return self.value(law) if callable(self.value) else self.value
+
+
+@dataclass(frozen=True)
+class Law:
+    """A control law that some program runs.
+
+    :param name: by which it is chosen.
+    :param program: the program and the version whose source was read.
+    :param equation: the difference equation.
+    :param integral: when the error is added to the integral.
+    :param slope: of what the derivative is taken.
+    :param smoothing: of the derivative, or of the measurement.
+    :param limits: what happens at the limits of the command.
+    :param settings: its parameters.
+    :param weights: set-point weights that it can have; (): any from 0 to 1.
+    :param delay: samples until a command takes effect.
+    :param command: unit and scale of the command.
+    :param only_positive: True if it has no gains for a process of negative gain.
+    :param needs_integral: True if it does not run without integral action.
+    :param line: how a setting is written, with ``{name}`` and ``{value}``.
+    :param remark: what begins a line that the program does not read.
+    """
+
+    name: str
+    program: str
+    equation: str
+    integral: Integral
+    slope: Slope
+    smoothing: Smoothing
+    limits: str
+    settings: tuple[Setting, ...]
+    weights: tuple[float, ...] = (1.0,)
+    delay: int = 0
+    command: str = "any"
+    only_positive: bool = False
+    needs_integral: bool = False
+    line: str = "{name}: {value}"
+    remark: str = "#"
+
+    def best(self, wanted: Controller, period: float) -> Controller:
+        """Return the nearest controller that this law can be.
+
+        :param wanted: the gains that are wanted.
+        :param period: of the samples [s].
+        :raises TuningError: if it cannot run gains of this sign, or without integral action.
+        """
+        require_period(period)
+        if self.only_positive and wanted.kc < 0.0:
+            raise TuningError(
+                f"{self.name} takes positive gains only, found kc = {wanted.kc:g}: a higher "
+                "command has to raise the measurement; turn the direction of the actuator"
+            )
+        if self.needs_integral and wanted.ti == 0.0:
+            raise TuningError(
+                f"{self.name} does not run without integral action, found ti = 0: choose a rule "
+                "with integral action"
+            )
+        td = 0.0 if self.slope is Slope.NONE else wanted.td
+        filtered = td > 0.0 or self.smoothing is _ON_MEASUREMENT
+        tf = self.smoothing.setting(wanted.tf, period) if filtered else 0.0
+        return replace(wanted, td=td, tf=tf, b=self.weight(wanted.b))
+
+    def weight(self, wanted: float) -> float:
+        """Return the largest set-point weight up to the wanted one, or the least.
+
+        :param wanted: from 0 to 1.
+        """
+        allowed = [w for w in self.weights if w <= wanted + _SAME_WEIGHT]
+        return wanted if not self.weights else max(allowed, default=min(self.weights))
+
+    def at(self, gains: Controller, period: float) -> SampledLaw:
+        """Return the law with gains, at a sampling period.
+
+        :param gains: what :meth:`best` returns.
+        :param period: of the samples [s].
+        """
+        return SampledLaw(self, gains, period)
+
+
+@dataclass(frozen=True)
+class SampledLaw:
+    """A law with its gains, at its sampling period.
+
+    :param law: the law.
+    :param gains: its gains, in the ISA form.
+    :param period: of the samples [s].
+    """
+
+    law: Law
+    gains: Controller
+    period: float
+
+    @property
+    def value(self) -> Rational:
+        """The filter V on the measurement."""
+        return self.law.smoothing.value(self.gains.tf, self.period)
+
+    @property
+    def integral(self) -> Rational:
+        """The integral action, from error to command."""
+        if self.gains.i == 0.0:
+            return _NOTHING
+        return self.law.integral.over(self.period).times(self.gains.i)
+
+    @property
+    def derivative(self) -> Rational:
+        """The derivative action, from measurement to -command."""
+        if self.gains.td == 0.0:
+            return _NOTHING
+        return self.law.smoothing.slope(self.gains.tf, self.period).times(self.gains.d)
+
+    def from_measurement(self, z: ComplexArray) -> ComplexArray:
+        """Return -command per measurement, with the law's delay [u/y].
+
+        :param z: any shape.
+        """
+        through = (self.gains.kc + self.integral(z)) * self.value(z) + self.derivative(z)
+        return np.asarray(through * z ** float(-self.law.delay))
+
+    def from_setpoint(self, z: ComplexArray) -> ComplexArray:
+        """Return command per set-point, with the law's delay [u/y].
+
+        :param z: any shape.
+        """
+        through = self.gains.kc * self.gains.b + self.integral(z)
+        if self.law.slope is Slope.ERROR:
+            through = through + self.derivative(z)
+        return np.asarray(through * z ** float(-self.law.delay))
+
+    def running(self) -> RunningLaw:
+        """Return the law as it runs, from rest and without limits."""
+        return RunningLaw(self)
+
+
+class RunningLaw:
+    """A law that is called once for each sample, from rest and without limits.
+
+    :param law: the law with its gains.
+    """
+
+    def __init__(self, law: SampledLaw) -> None:
+        self.period = law.period
+        self._gains = law.gains
+        self._on_error = law.law.slope is Slope.ERROR
+        self._value = _Running(law.value)
+        self._integral = _Running(law.integral)
+        self._derivative = _Running(law.derivative)
+        self._waiting = [0.0] * law.law.delay
+
+    def step(self, setpoint: float, measurement: float) -> float:
+        """Return the command for this sample [u].
+
+        :param setpoint: y.
+        :param measurement: y.
+        """
+        value = self._value.step(measurement)
+        moved = measurement - setpoint if self._on_error else measurement
+        command = (
+            self._gains.kc * (self._gains.b * setpoint - value)
+            + self._integral.step(setpoint - value)
+            - self._derivative.step(moved)
+        )
+        self._waiting.append(command)
+        return self._waiting.pop(0)
+
+
+def _tracking(law: SampledLaw) -> float:
+    """Return the time constant that control_toolbox itself would use for 0."""
+    gains = law.gains
+    return math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
+
+
+def _field(name: str) -> Setting:
+    """Return a setting that is a field of the gains."""
+    return Setting(name, lambda law: float(getattr(law.gains, name)))
+
+
+def _parallel(names: str, scale: float = 1.0) -> tuple[Setting, ...]:
+    """Return the settings of a parallel form, by their names."""
+    p, i, d = names.split()
+    return (
+        Setting(p, lambda law: scale * law.gains.p),
+        Setting(i, lambda law: scale * law.gains.i),
+        Setting(d, lambda law: scale * law.gains.d),
+    )
+
+
+def _sizes(names: str) -> tuple[Setting, ...]:
+    """Return the settings of a parallel form whose sign is set otherwise."""
+    p, i, d = names.split()
+    return (
+        Setting(p, lambda law: abs(law.gains.p)),
+        Setting(i, lambda law: abs(law.gains.i)),
+        Setting(d, lambda law: abs(law.gains.d)),
+    )
+
+
+def _strategy(name: str) -> Setting:
+    """Return the anti-windup strategy of control_toolbox; none without an integral."""
+    return Setting("antiwindup_strategy", lambda law: name if law.gains.ti > 0.0 else "none")
+
+
+_TOOLBOX = "control_toolbox::Pid of ros-controls, 4.11.0 (branch jazzy)"
+_LATE = "u_k = p e_k + I_k + d (e_k - e_{k-1})/h, then I_{k+1} = I_k + i h e_k"
+_EARLY = "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d (e_k - e_{k-1})/h"
+_ON_Y = "I_k = I_{k-1} + i h e_k, then u_k = p (b r_k - y_k) + I_k - d (y_k - y_{k-1})/h"
+
+_BACK_CALCULATION = Law(
+    "control_toolbox_back_calculation",
+    _TOOLBOX,
+    _LATE,
+    Integral.AFTER,
+    Slope.ERROR,
+    _PLAIN,
+    "I also gets h (u limited - u)/tracking_time_constant",
+    (
+        *_parallel("p i d"),
+        _strategy("back_calculation"),
+        Setting("tracking_time_constant", _tracking),
+    ),
+)
+
+_ROWS = (
+    Law(
+        "controller_node",
+        "controller_node of this package",
+        "I_k = I_{k-1} + i h (r_k - v_k), then u_k = kc (b r_k - v_k - td s_k) + I_k; v and s are "
+        "y and its derivative after 1/(1 + tf s + (tf s)^2/2), exact for a y that is linear "
+        "between samples",
+        Integral.BEFORE,
+        Slope.MEASUREMENT,
+        _ON_MEASUREMENT,
+        "back-calculation with sqrt(ti td), without derivative ti",
+        tuple(_field(name) for name in ("kc", "ti", "td", "tf", "b")),
+        weights=(),
+    ),
+    _BACK_CALCULATION,
+    replace(
+        _BACK_CALCULATION,
+        name="control_toolbox_conditional_integration",
+        limits="no integration while u is limited and e u > 0",
+        settings=(
+            *_parallel("p i d"),
+            _strategy("conditional_integration"),
+        ),
+    ),
+    replace(
+        _BACK_CALCULATION,
+        name="control_toolbox_none",
+        limits="the integral winds up",
+        settings=(*_parallel("p i d"), _strategy("none")),
+    ),
+    replace(
+        _BACK_CALCULATION,
+        name="control_toolbox_legacy",
+        equation=_EARLY,
+        integral=Integral.BEFORE,
+        limits="I stays between i_clamp_min and i_clamp_max",
+        settings=(*_parallel("p i d"), _strategy("legacy")),
+    ),
+    replace(
+        _BACK_CALCULATION,
+        name="pid_controller",
+        program="pid_controller of ros2_controllers, 4.42.1 (branch jazzy), with one state "
+        f"interface; it runs {_TOOLBOX}",
+    ),
+    Law(
+        "arduino_pid_v1",
+        "PID_v1 of br3ttb/Arduino-PID-Library, 1.2.1",
+        f"{_ON_Y}; b is 1, with P_ON_M 0",
+        Integral.BEFORE,
+        Slope.MEASUREMENT,
+        _PLAIN,
+        "I stays within the output limits",
+        (
+            *_sizes("Kp Ki Kd"),
+            Setting("SampleTime", lambda law: f"{1000.0 * law.period:.10g}"),
+            Setting("POn", lambda law: "P_ON_E" if law.gains.b > 0.5 else "P_ON_M"),
+            Setting(
+                "ControllerDirection", lambda law: "DIRECT" if law.gains.kc > 0.0 else "REVERSE"
+            ),
+        ),
+        weights=(0.0, 1.0),
+        line="const auto {name} = {value};",
+        remark="//",
+    ),
+    Law(
+        "simple_pid",
+        "simple-pid of m-lundberg, 2.0.1",
+        f"{_ON_Y}; b is 1, with proportional_on_measurement 0",
+        Integral.BEFORE,
+        Slope.MEASUREMENT,
+        _PLAIN,
+        "I stays within output_limits",
+        (
+            *_parallel("Kp Ki Kd"),
+            Setting("sample_time", lambda law: law.period),
+            Setting("proportional_on_measurement", lambda law: str(law.gains.b < 0.5)),
+        ),
+        weights=(0.0, 1.0),
+        line="{name} = {value}",
+    ),
+    Law(
+        "esphome_pid",
+        "the PID climate of ESPHome, 2024.11.0-dev",
+        "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k - d (y_k - y_{k-N})/(N h), "
+        "N = derivative_averaging_samples; without deadband, output_averaging_samples 1",
+        Integral.BEFORE,
+        Slope.MEASUREMENT,
+        _MEAN,
+        "I stays between min_integral and max_integral",
+        (
+            *_parallel("kp ki kd"),
+            Setting(
+                "derivative_averaging_samples",
+                lambda law: str(averaged_over(law.gains.tf, law.period)),
+            ),
+            Setting("output_averaging_samples", "1"),
+        ),
+        command="level of the output, -1 (cool) to 1 (heat)",
+    ),
+    Law(
+        "klipper_heater",
+        "the pid heater of Klipper, v0.13.0-730-g84104bbb",
+        "I_k = I_{k-1} + h e_k, then u_k = (Kp e_k + Ki I_k - Kd s_k)/255; s_k = (1 - a) s_{k-1} "
+        "+ a (y_k - y_{k-1})/h, a = h/smooth_time, at most 1; u acts one report later",
+        Integral.BEFORE,
+        Slope.MEASUREMENT,
+        _FIRST_ORDER,
+        "the integral keeps its value while u is limited; small changes of u may be left out",
+        (
+            *_parallel("pid_Kp pid_Ki pid_Kd", 255.0),
+            Setting("smooth_time", lambda law: max(law.gains.tf, law.period)),
+        ),
+        delay=1,
+        command="power of the heater, 0 to 1; the gains are in parts of 255",
+        only_positive=True,
+    ),
+    Law(
+        "marlin_heater",
+        "PID_t of Marlin's temperature.h, commit 000b34772776",
+        "I_k = I_{k-1} + e_k, then u_k = (Kp e_k + Ki h I_k - Kd s_k)/255; s_k = K1 s_{k-1} + "
+        "(1 - K1) (y_k - y_{k-1})/h, K1 = PID_K1; within PID_FUNCTIONAL_RANGE",
+        Integral.BEFORE,
+        Slope.MEASUREMENT,
+        _FIRST_ORDER,
+        "Ki h I stays between 0 and the largest output",
+        (
+            *_parallel("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", 255.0),
+            Setting("PID_K1", lambda law: 1.0 - law.period / max(law.gains.tf, law.period)),
+        ),
+        command="power of the heater, 0 to 1; the output is 0 to 255",
+        only_positive=True,
+        line="#define {name} {value}",
+        remark="//",
+    ),
+    Law(
+        "px4_rate",
+        "RateControl of PX4, rate_control.cpp of commit 0155b3a86295, for small errors; its D "
+        "acts on an acceleration that another module filters, and is left at 0",
+        "u_k = p e_k + I_k, then I_{k+1} = I_k + i h e_k",
+        Integral.AFTER,
+        Slope.NONE,
+        _PLAIN,
+        "no integration further into the limit of the allocator; I within its own limit",
+        _parallel("MC_ROLLRATE_P MC_ROLLRATE_I MC_ROLLRATE_D"),
+        command="normalised torque",
+        line="param set {name} {value}",
+    ),
+    Law(
+        "ardupilot_rate",
+        "AC_PID::update_all of ArduPilot, commit 00e79c1a8aca, with FLTT, FLTE, SMAX and FF at 0",
+        "s_k = s_{k-1} + a ((e_k - e_{k-1})/h - s_{k-1}), a = h/(h + 1/(2 pi FLTD)); "
+        "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d s_k",
+        Integral.BEFORE,
+        Slope.ERROR,
+        _FIRST_ORDER,
+        "I may only shrink while the limit flag is set; I within IMAX",
+        (
+            *_parallel("ATC_RAT_RLL_P ATC_RAT_RLL_I ATC_RAT_RLL_D"),
+            Setting(
+                "ATC_RAT_RLL_FLTD",
+                lambda law: (
+                    1.0 / (2.0 * math.pi * (law.gains.tf - law.period))
+                    if law.gains.tf > law.period
+                    else 0.0
+                ),
+            ),
+            Setting("ATC_RAT_RLL_FLTT", 0.0),
+            Setting("ATC_RAT_RLL_FLTE", 0.0),
+            Setting("ATC_RAT_RLL_FF", 0.0),
+        ),
+        command="normalised torque",
+        line="{name},{value}",
+    ),
+    Law(
+        "iec_61131_3_pid",
+        "the example PID of IEC 61131-3, final draft of the 2nd edition (2001)",
+        "its error is y - r: X_k = X_{k-1} + h (y_k - r_k), then u_k = KP (E_k + X_k/TR + TD "
+        "(3 (E_k - E_{k-3}) + E_{k-1} - E_{k-2})/(10 h)), E = y - r",
+        Integral.BEFORE,
+        Slope.ERROR,
+        _FOUR_SAMPLES,
+        "none: the integral winds up",
+        (
+            Setting("KP", lambda law: -law.gains.kc),
+            Setting("TR", lambda law: law.gains.ti),
+            Setting("TD", lambda law: law.gains.td),
+            Setting("CYCLE", lambda law: f"T#{1000.0 * law.period:.10g}ms"),
+        ),
+        needs_integral=True,
+        line="{name} := {value};",
+        remark="//",
+    ),
+    Law(
+        "oscat_ft_pid",
+        "FT_PID 2.1 of OSCAT BASIC 3.33, with the error as IN",
+        "u_k = KP (e_k + I_k + TV (e_k - e_{k-1})/h), I_k = I_{k-1} + h (e_k + e_{k-1})/(2 TN)",
+        Integral.TRAPEZOID,
+        Slope.ERROR,
+        _PLAIN,
+        "I stays between ILIM_L and ILIM_H",
+        (
+            Setting("KP", lambda law: law.gains.kc),
+            Setting("TN", lambda law: law.gains.ti),
+            Setting("TV", lambda law: law.gains.td),
+        ),
+        line="{name} := {value};",
+        remark="//",
+    ),
+)
+
+LAWS: dict[str, Law] = {law.name: law for law in _ROWS}
+
+
+def law_named(name: str) -> Law:
+    """Return a law by its name.
+
+    :raises TuningError: if the name is unknown; the message lists the known names.
+    """
+    return look_up(LAWS, name, "law", TuningError)

@@ -1,0 +1,308 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The laws of other programs, each beside the loop of its source, written out here again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from fopdt_plant import FopdtPlant
+
+from relay_autotune.errors import TuningError
+from relay_autotune.loop.closed_loop import simulate_closed_loop
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS, law_named
+from relay_autotune.loop.sampled import SampledPid
+from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
+from relay_autotune.process.transfer_function import TransferFunction
+
+PERIOD = 0.25
+WANTED = Controller(kc=1.3, ti=2.0, td=0.6, tf=0.7, b=0.4)
+PROCESS = TransferFunction.fopdt(0.9, 2.0, 0.8)
+
+
+def toolbox(s, h):
+    """control_toolbox::Pid: u first, then the integral; legacy the other way round."""
+    integral = last = 0.0
+    while True:
+        r, y = yield
+        e = r - y
+        d, last = (e - last) / h, e
+        if s["antiwindup_strategy"] == "legacy":
+            integral += s["i"] * h * e
+        u = s["p"] * e + integral + s["d"] * d
+        if s["antiwindup_strategy"] != "legacy":
+            integral += h * s["i"] * e
+        yield u
+
+
+def sum_and_clamp(names):
+    """Arduino's PID_v1 and simple-pid: a sum that may hold the proportional part too."""
+
+    def law(s, h):
+        kp, ki, kd = (s[n] for n in names)
+        if s.get("ControllerDirection") == "REVERSE":
+            kp, ki, kd = -kp, -ki, -kd
+        on_measurement = "P_ON_M" in s.values() or "True" in s.values()
+        total = last = 0.0
+        while True:
+            r, y = yield
+            total += ki * h * (r - y)
+            if on_measurement:
+                total -= kp * (y - last)
+            u = total - kd * (y - last) / h + (0.0 if on_measurement else kp * (r - y))
+            last = y
+            yield u
+
+    return law
+
+
+def esphome(s, h):
+    total = last_error = last_setpoint = 0.0
+    seen = [0.0] * int(s["derivative_averaging_samples"])
+    while True:
+        r, y = yield
+        e = r - y
+        total += e * h * s["ki"]
+        last_error -= last_setpoint - r
+        seen = [(e - last_error) / h, *seen[:-1]]
+        last_error, last_setpoint = e, r
+        yield s["kp"] * e + total + s["kd"] * sum(seen) / len(seen)
+
+
+def klipper(s, h):
+    p, i, d = (s[f"pid_K{n}"] / 255.0 for n in "pid")
+    total = last = slope = waiting = 0.0
+    while True:
+        r, y = yield
+        t = s["smooth_time"]
+        slope = (y - last) / h if h >= t else (slope * (t - h) + y - last) / t
+        total += (r - y) * h
+        now, waiting = waiting, p * (r - y) + i * total - d * slope
+        last = y
+        yield now
+
+
+def marlin(s, h):
+    total = last = work = 0.0
+    ki, kd = s["DEFAULT_Ki"] * h, s["DEFAULT_Kd"] / h
+    while True:
+        r, y = yield
+        total += r - y
+        work += (1.0 - s["PID_K1"]) * (kd * (last - y) - work)
+        last = y
+        yield (s["DEFAULT_Kp"] * (r - y) + ki * total + work) / 255.0
+
+
+def px4(s, h):
+    total = 0.0
+    while True:
+        r, y = yield
+        u = s["MC_ROLLRATE_P"] * (r - y) + total
+        total += s["MC_ROLLRATE_I"] * (r - y) * h
+        yield u
+
+
+def ardupilot(s, h):
+    total = error = slope = 0.0
+    cutoff = s["ATC_RAT_RLL_FLTD"]
+    alpha = h / (h + 1.0 / (2.0 * math.pi * cutoff)) if cutoff else 1.0
+    while True:
+        r, y = yield
+        last, error = error, r - y
+        slope += alpha * ((error - last) / h - slope)
+        total += error * s["ATC_RAT_RLL_I"] * h
+        yield s["ATC_RAT_RLL_P"] * error + total + s["ATC_RAT_RLL_D"] * slope
+
+
+def iec(s, h):
+    total = x1 = x2 = x3 = 0.0
+    while True:
+        r, y = yield
+        error = y - r
+        total += error * h
+        slope = (3.0 * (error - x3) + x1 - x2) / (10.0 * h)
+        x3, x2, x1 = x2, x1, error
+        yield s["KP"] * (error + total / s["TR"] + slope * s["TD"])
+
+
+def oscat(s, h):
+    total = last = 0.0
+    while True:
+        r, y = yield
+        e = r - y
+        total += (e + last) * 0.5 * h / s["TN"]
+        slope, last = (e - last) / h * s["TV"], e
+        yield s["KP"] * (total + slope + e)
+
+
+def our_own(s, h):
+    gains = Controller(**s)
+    law = SampledPid(gains, h)
+    while True:
+        r, y = yield
+        yield law.step(r, y)
+
+
+SOURCES = {
+    "controller_node": our_own,
+    **{f"control_toolbox_{s}": toolbox for s in ("none", "legacy", "back_calculation")},
+    "control_toolbox_conditional_integration": toolbox,
+    "pid_controller": toolbox,
+    "arduino_pid_v1": sum_and_clamp(("Kp", "Ki", "Kd")),
+    "simple_pid": sum_and_clamp(("Kp", "Ki", "Kd")),
+    "esphome_pid": esphome,
+    "klipper_heater": klipper,
+    "marlin_heater": marlin,
+    "px4_rate": px4,
+    "ardupilot_rate": ardupilot,
+    "iec_61131_3_pid": iec,
+    "oscat_ft_pid": oscat,
+}
+
+
+class Source:
+    """A law as its source has it, with the parameters that are exported for it."""
+
+    def __init__(self, name, gains, period=PERIOD):
+        self.period = period
+        law = LAWS[name].at(gains, period)
+        settings = {s.name: s.of(law) for s in law.law.settings}
+        self._law = SOURCES[name](settings, period)
+        next(self._law)
+
+    def step(self, setpoint, measurement):
+        command = self._law.send((setpoint, measurement))
+        next(self._law)
+        return command
+
+
+def test_every_law_has_its_source_here():
+    assert set(SOURCES) == set(LAWS)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_does_what_its_source_does(name, sign):
+    law = law_named(name)
+    wanted = Controller(sign * WANTED.kc, WANTED.ti, WANTED.td, WANTED.tf, WANTED.b)
+    if sign < 0.0 and law.only_positive:
+        with pytest.raises(TuningError, match="positive gains only"):
+            law.best(wanted, PERIOD)
+        return
+    gains = law.best(wanted, PERIOD)
+    rng = np.random.default_rng(4)
+    source, running = Source(name, gains), law.at(gains, PERIOD).running()
+    for r, y in rng.standard_normal((50, 2)):
+        assert running.step(r, y) == pytest.approx(source.step(r, y), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("tf", [0.0, 0.7])
+@pytest.mark.parametrize("name", LAWS)
+def test_its_transfer_functions_are_those_of_its_source(name, tf):
+    law = law_named(name)
+    gains = law.best(Controller(1.3, 2.0, 0.6, tf, 1.0), PERIOD)
+    sampled = law.at(gains, PERIOD)
+    # Outside of the unit circle the sum over an impulse's response ends soon.
+    z = 1.15 * np.exp(1j * np.linspace(0.0, math.pi, 7))
+    powers = z[:, None] ** -np.arange(400.0)
+    for function, impulse, sign in (
+        (sampled.from_measurement, (0.0, 1.0), -1.0),
+        (sampled.from_setpoint, (1.0, 0.0), 1.0),
+    ):
+        source = Source(name, gains)
+        answers = [source.step(*impulse), *(source.step(0.0, 0.0) for _ in range(399))]
+        assert function(z) == pytest.approx(sign * powers @ answers, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_its_ms_is_that_of_a_sinusoidal_test_of_its_source(name):
+    law = law_named(name)
+    gains = law.best(WANTED, PERIOD)
+    loop = SampledLoop(law.at(gains, PERIOD), PROCESS)
+    found = loop.margins()
+    plant, source, command = FopdtPlant(0.9, 2.0, 0.8), Source(name, gains), 0.0
+    turns, count = found.ms_frequency * PERIOD, 1200
+    seen = np.empty(count)
+    for k in range(count):
+        seen[k] = plant.advance(k * PERIOD, command) + math.sin(turns * k)
+        command = source.step(0.0, seen[k])
+    k = np.arange(count // 2, count)
+    waves = np.column_stack((np.sin(turns * k), np.cos(turns * k)))
+    (a, b), *_ = np.linalg.lstsq(waves, seen[k], rcond=None)
+    assert math.hypot(a, b) == pytest.approx(found.ms, rel=1e-5)
+
+
+@pytest.mark.parametrize("period", [0.3, 1.7])
+@pytest.mark.parametrize(
+    ("model", "ti"),
+    [
+        (PROCESS, 2.0),
+        (TransferFunction(1.0, (-0.3,), (1.0, 1.0, 1.0)), 2.0),
+        (TransferFunction.integrator_lag(0.3, 0.5, 0.7), 20.0),
+        (TransferFunction.oscillator(1.0, 2.0, 0.3, 0.5), 2.0),
+    ],
+    ids=["fopdt", "inverse", "integrating", "oscillating"],
+)
+def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
+    law = law_named("arduino_pid_v1")
+    sampled = law.at(Controller(0.25, ti, 0.3, 0.0, 1.0), period)
+    found = analyse_sampled(sampled, model)
+    count = int(200.0 / period)
+    setpoint, load = (
+        simulate_closed_loop(
+            sampled.running(), model, period=period, duration=count * period, **step
+        )
+        for step in ({"setpoint": 1.0}, {"load": 1.0, "load_time": -1.0})
+    )
+    responses = SampledLoop(sampled, model).step_responses(2 * count)
+    for run, response in zip((setpoint, load), responses, strict=True):
+        assert run.command[:count] == pytest.approx(response.command[:count], abs=1e-6)
+    errors = period * np.abs(1.0 - setpoint.measurement).sum()
+    assert found.iae_setpoint == pytest.approx(errors, rel=2e-3)
+    assert found.overshoot == pytest.approx(max(setpoint.measurement.max() - 1.0, 0.0), abs=1e-4)
+
+
+def test_noise_reaches_the_command_as_said():
+    law = law_named("marlin_heater")
+    gains = law.best(WANTED, PERIOD)
+    sampled = law.at(gains, PERIOD)
+    noise = np.random.default_rng(1).standard_normal(6000)
+    run = simulate_closed_loop(
+        sampled.running(), PROCESS, period=PERIOD, duration=5999 * PERIOD, noise=noise
+    )
+    said = analyse_sampled(sampled, PROCESS).noise_gain
+    assert np.std(run.command) == pytest.approx(said, rel=0.04)
+
+
+def test_stability_is_that_of_the_roots_of_the_characteristic_polynomial():
+    rng = np.random.default_rng(7)
+    decided = []
+    for _ in range(60):
+        pole, wait = math.exp(-PERIOD / 2.0), int(rng.integers(1, 8))
+        model = TransferFunction.fopdt(1.0, 2.0, (wait - 1) * PERIOD)
+        gains = Controller(float(rng.uniform(0.1, 12.0)), float(rng.uniform(0.3, 5.0)))
+        loop = SampledLoop(law_named("control_toolbox_none").at(gains, PERIOD), model)
+        # (z - 1)(z - a) z^(wait - 1) + (1 - a)(p (z - 1) + i h) = 0
+        roots = np.roots(
+            np.polyadd(
+                np.convolve(np.poly([1.0, pole]), [1.0, *[0.0] * (wait - 1)]),
+                (1.0 - pole) * np.array([gains.p, gains.i * PERIOD - gains.p]),
+            )
+        )
+        assert loop.unstable == np.sum(np.abs(roots) > 1.0)
+        decided.append(loop.unstable)
+    assert 10 < sum(n == 0 for n in decided) < 50
+
+
+def test_gains_that_a_law_cannot_run_are_refused():
+    with pytest.raises(TuningError, match="without integral action"):
+        law_named("iec_61131_3_pid").best(Controller(1.0, 0.0), PERIOD)
+    with pytest.raises(TuningError, match="unknown law 'pid'"):
+        law_named("pid")
+    wild = law_named("simple_pid").at(Controller(30.0, 1.0), PERIOD)
+    with pytest.raises(TuningError, match="simple_pid runs it every"):
+        analyse_sampled(wild, PROCESS)
