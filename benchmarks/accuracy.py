@@ -25,7 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import Identification, Known, identify
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
+from relay_autotune.identification.result import Identification
 
 FloatArray = NDArray[np.float64]
 

@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.confidence import NORMAL_95
-from relay_autotune.identification import Identification, Known, identify
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import TABLE
 
 RECORDS = 2_000

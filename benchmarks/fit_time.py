@@ -17,7 +17,8 @@ from reference import Timing, take_turns
 import numpy as np
 from cases import CASES
 
-from relay_autotune.identification import Known, identify
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.record.record import Record
 

@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Identification, Known, identify, identify_jointly
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify, identify_jointly
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import TABLE
 from relay_autotune.record.record import PiecewiseConstant, Record

@@ -33,7 +33,7 @@ from simulated_summary import summary
 
 import relay_autotune
 from relay_autotune.analysis import Analysis, analyse_alone
-from relay_autotune.identification import Known
+from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome

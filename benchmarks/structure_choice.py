@@ -22,7 +22,7 @@ import numpy as np
 
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import identify
+from relay_autotune.identification.methods import identify
 
 RECORDS = 30
 RATIO = 0.1

@@ -24,8 +24,9 @@ from markdown import table, three
 from numpy.typing import NDArray
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Known, identify
 from relay_autotune.identification.judgement.validation import integrated_error, validate
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.thyagarajan2003 import (
     flat_fopdt,
     fopdt,

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from relay_autotune.exchange.python_control import to_control
     from relay_autotune.experiment.experiment import RelayExperiment
     from relay_autotune.experiment.parameters import ExperimentParameters
-    from relay_autotune.identification import METHODS, Identification, Known, identify
+    from relay_autotune.identification.known import Known
+    from relay_autotune.identification.methods import METHODS, identify
+    from relay_autotune.identification.result import Identification
     from relay_autotune.loop.closed_loop import simulate_closed_loop
     from relay_autotune.process.structures import STRUCTURES
     from relay_autotune.process.transfer_function import TransferFunction
@@ -49,7 +51,9 @@ _HOMES = {
     "analysis": ("Analysis", "analyse", "analyse_jointly"),
     "bag.records": ("read_records",),
     "errors": ("RelayAutotuneError",),
-    "identification": ("METHODS", "Identification", "Known", "identify"),
+    "identification.known": ("Known",),
+    "identification.methods": ("METHODS", "identify"),
+    "identification.result": ("Identification",),
     "process.structures": ("STRUCTURES",),
     "process.transfer_function": ("TransferFunction",),
     "exchange.python_control": ("to_control",),

@@ -13,22 +13,21 @@ import numpy as np
 
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError, defect
 from relay_autotune.experiment.early_end import Finding
-from relay_autotune.identification import (
-    DEFAULT_METHOD,
-    METHODS,
-    Identification,
-    Known,
-    identify,
-    identify_jointly,
-    method_named,
-)
 from relay_autotune.identification.judgement.assessment import assess
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.quality import is_far_off
 from relay_autotune.identification.judgement.table import LOOP_CHECKS, MODEL_CHECKS
-from relay_autotune.identification.known import NOTHING
+from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods import (
+    DEFAULT_METHOD,
+    METHODS,
+    identify,
+    identify_jointly,
+    method_named,
+)
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint

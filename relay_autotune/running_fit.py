@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 from relay_autotune.analysis import Analysis, model_so_far, prediction_so_far
 from relay_autotune.experiment.early_end import MS
-from relay_autotune.identification import DEFAULT_METHOD, Identification, Known
-from relay_autotune.identification.known import NOTHING
+from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods import DEFAULT_METHOD
+from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Record
 from relay_autotune.tuning import DEFAULT_RULE, DesignOptions
 

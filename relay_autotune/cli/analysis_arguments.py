@@ -82,7 +82,7 @@ def jobs_of(
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
     from relay_autotune.analysis import check_names
-    from relay_autotune.identification import ONLY_JOINT
+    from relay_autotune.identification.methods import ONLY_JOINT
 
     try:
         check_names(options.method, options.rule)

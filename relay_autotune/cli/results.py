@@ -19,7 +19,7 @@ from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.escape import cell
 from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
-from relay_autotune.identification import FitReport, Identification
+from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.loop.gains import Gains
 from relay_autotune.quantities import told_fields
 

@@ -20,8 +20,7 @@ from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
-    from relay_autotune.identification import Identification
-    from relay_autotune.identification.judgement.validation import Validation
+    from relay_autotune.identification.result import Identification, Validation
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import Gains
 

@@ -30,7 +30,7 @@ from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, Rel
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 if TYPE_CHECKING:
-    from relay_autotune.identification import Identification
+    from relay_autotune.identification.result import Identification
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.tuning import Gains
 
@@ -299,7 +299,7 @@ def identification_from_message(message: Any) -> Identification:
         one, or the numbers that tell how sure it is cannot be.
     """
     from relay_autotune.exchange import models  # noqa: F401  (it says how they are read)
-    from relay_autotune.identification import Identification
+    from relay_autotune.identification.result import Identification
 
     found: Identification = of_message(Identification, message, ModelError, "of the model")
     return found

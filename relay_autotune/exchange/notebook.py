@@ -14,7 +14,7 @@ from relay_autotune.text import digits, plus_minus, process_mathml, process_text
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
-    from relay_autotune.identification import Identification
+    from relay_autotune.identification.result import Identification
     from relay_autotune.loop.gains import Gains
 
 

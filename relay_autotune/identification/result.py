@@ -15,14 +15,39 @@ from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.validation import Validation
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.quantities import told
+from relay_autotune.quantities import told, told_fields
 from relay_autotune.text import process_text
 
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How a model's limit cycle differs from the record's, relative to the latter.
+
+    Differences of times are relative to the period, those of y to half of the record's peak to
+    peak; NaN: the model has no limit cycle. The shape compares the two curves, each from its own
+    mean over its own half of peak to peak, with the half periods laid upon each other, and
+    without what noise leaves of itself in the record's curve.
+    """
+
+    period: float = told("", "Difference of the whole period.", math.nan)
+    period_high: float = told("", "Of the time with the command high.", math.nan)
+    period_low: float = told("", "Of the time with the command low.", math.nan)
+    peak_max: float = told("", "Of the highest measurement.", math.nan)
+    peak_min: float = told("", "Of the lowest measurement.", math.nan)
+    shape: float = told("", "Root mean square difference of the two curves.", math.nan, lower=0.0)
+    reason: str = told("", "Why there is no limit cycle; empty if there is one.", "")
+
+    @property
+    def worst(self) -> float:
+        """Return the largest of them; infinite where the model has no limit cycle."""
+        if self.reason:
+            return math.inf
+        return max(abs(getattr(self, f.name)) for f in told_fields(Validation) if f.kind is float)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from relay_autotune.exchange.messages import (
     start_nanoseconds,
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
-from relay_autotune.identification import ONLY_JOINT
+from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, known_from, options_from
 from relay_autotune.nodes.lifetime import ServedNode, run

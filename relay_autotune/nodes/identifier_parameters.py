@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from relay_autotune.identification import DEFAULT_METHOD, METHODS, Known
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import DEFAULT_METHOD, METHODS
 from relay_autotune.quantities import Quantity, declared
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune.tuning.task import DesignOptions

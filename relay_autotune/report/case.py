@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from relay_autotune.analysis import Analysis
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import FitReport, Identification
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.judgement.validation import Validation
-from relay_autotune.identification.result import Rival
+from relay_autotune.identification.result import FitReport, Identification, Rival, Validation
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of

@@ -16,7 +16,7 @@ from relay_autotune.escape import visible
 from relay_autotune.exchange.document import judgement_of_fields
 from relay_autotune.exchange.fields import number, of_document
 from relay_autotune.exchange.models import model_of_fields
-from relay_autotune.identification import Identification
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Outcome, RelaySettings

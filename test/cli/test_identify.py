@@ -12,7 +12,7 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.cli.chart import CHART_METHODS, NUMBERS, option
-from relay_autotune.identification import METHODS
+from relay_autotune.identification.methods import METHODS
 
 EXAMPLE = "--period 33.271862630047444 --amplitude 0.025968976458966186 --relay 0.04"
 

@@ -18,7 +18,7 @@ from relay_autotune.bag.names import EXPERIMENT
 from relay_autotune.bag.writer import BagWriter, Topic
 from relay_autotune.cli import replay
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Known
+from relay_autotune.identification.known import Known
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings

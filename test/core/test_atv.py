@@ -13,8 +13,8 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import (
     atv_from_numbers,
     identify_atv,

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from relay_autotune.analysis import analyse, analyse_alone, model_so_far
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Known, identify
 from relay_autotune.identification.judgement.disturbance import last_cycles
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

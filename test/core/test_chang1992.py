@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.chang import (
     chang_from_numbers,
     gain_and_time_constant,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import METHODS, identify
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import METHODS, identify
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import JOINT_METHODS, identify, identify_jointly
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import JOINT_METHODS, identify, identify_jointly
 from relay_autotune.identification.methods.lag_models import MODEL_1, MODEL_4, MODEL_5
 from relay_autotune.identification.methods.li import (
     fit_jointly,

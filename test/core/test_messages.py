@@ -29,10 +29,9 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
     without_impossible,
 )
-from relay_autotune.identification import Estimate, Identification
 from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.judgement.validation import Validation
-from relay_autotune.identification.result import FitReport
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import FitReport, Identification, Validation
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import GivenModel

@@ -13,8 +13,8 @@ import pytest
 
 from relay_autotune.analysis import Analysis, analyse, analyse_alone
 from relay_autotune.errors import RecordError
-from relay_autotune.identification import identify
 from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import identified
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import FOPDT

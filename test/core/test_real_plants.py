@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.identification import Known, identify
 from relay_autotune.identification.judgement.disturbance import without_disturbance
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point

@@ -13,7 +13,8 @@ import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.faults.repetition import Repetition, SilenceWatch
-from relay_autotune.identification import Known, identify
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess

@@ -14,8 +14,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import atv_from_numbers
 from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle

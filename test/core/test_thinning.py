@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.analysis import analyse_alone
-from relay_autotune.identification import Known, identify
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification import identify
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import IdentificationError, ParameterError
-from relay_autotune.identification import Known, identify
 from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import identified
 from relay_autotune.identification.waveform.fit_covariance import quantisation_step
 from relay_autotune.identification.waveform.profiles import profile_ends

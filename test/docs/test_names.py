@@ -20,7 +20,7 @@ from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import apply_gains, csv_to_bag, replay, tune_loop
 from relay_autotune.exchange.document import document
-from relay_autotune.identification import METHODS
+from relay_autotune.identification.methods import METHODS
 from relay_autotune.nodes.plant import MODES
 from relay_autotune.process.structures import STRUCTURES
 from relay_autotune.tuning import RULES

@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import fill_experiment
-from relay_autotune.identification import Known
+from relay_autotune.identification.known import Known
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.executor import Executor
 from relay_autotune.nodes.identifier import IdentifierNode

@@ -12,7 +12,7 @@ from fopdt_plant import FopdtPlant
 from loop_rig import LATCHED, RELIABLE, Rig
 from loop_rig import Process as Running
 from made_experiments import experiment_of
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Temperature
@@ -129,9 +129,7 @@ class HandLoop:
         return self.rig.call(SetParametersAtomically, name, request).result
 
     def gains_shown(self) -> tuple[float, float]:
-        request = GetParameters.Request(names=["kc", "ti"])
-        answer = self.rig.call(GetParameters, "controller_node/get_parameters", request)
-        kc, ti = (value.double_value for value in answer.values)
+        kc, ti = self.rig.values("controller_node", "kc", "ti")
         return kc, ti
 
     def verify(

@@ -23,6 +23,7 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_domain import mapped_segments, remove_leftovers
 
@@ -206,17 +207,29 @@ class Rig:
         an answer to the last one shows that it knows the others.
         """
         last = self.node.create_client(GetParameters, f"{node}/get_parameters")
-        self.until(last.service_is_ready, f"{node}")
+        self._parameters(last)
+        self.node.destroy_client(last)
 
-        def answers() -> bool:
-            future = last.call_async(GetParameters.Request())
+    def values(self, node: str, *names: str) -> list[Any]:
+        """Return parameters of a node."""
+        name = f"{node}/get_parameters"
+        if name not in self.clients:
+            self.clients[name] = self.node.create_client(GetParameters, name)
+        return self._parameters(self.clients[name], *names)
+
+    def _parameters(self, client: Any, *names: str) -> list[Any]:
+        """Ask for parameters, and again each second, since an answer may be lost."""
+        self.until(client.service_is_ready, f"service {client.srv_name}")
+
+        def answer() -> Any:
+            future = client.call_async(GetParameters.Request(names=names))
             end = time.monotonic() + 1.0
             while not future.done() and time.monotonic() < end:
                 self.executor.spin_once(timeout_sec=0.05)
-            return bool(future.done())
+            return future.result() if future.done() else None
 
-        self.until(answers, f"an answer of {node}")
-        self.node.destroy_client(last)
+        values = self.until(answer, f"answer of {client.srv_name}").values
+        return [parameter_value_to_python(value) for value in values]
 
     def ask_for_tune(self, **request: Any) -> Any:
         return self.call(StartTune, "relay_node/start_tune", StartTune.Request(**request))

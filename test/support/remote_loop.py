@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 from loop_rig import LATCHED, RELIABLE, Rig
-from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -141,6 +140,4 @@ class Loop:
         return answer.result().status, answer.result().result
 
     def values(self) -> list[float]:
-        request = GetParameters.Request(names=[f"gains.heater.{name}" for name in "pid"])
-        answer = self.rig.call(GetParameters, "pid_controller/get_parameters", request)
-        return [v.double_value for v in answer.values]
+        return self.rig.values("pid_controller", *(f"gains.heater.{name}" for name in "pid"))

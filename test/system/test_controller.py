@@ -15,8 +15,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from loop_rig import LATCHED, RELIABLE, Rig
 from made_experiments import experiment_of
-from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import GetParameters, SetParameters
+from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
@@ -55,9 +54,7 @@ def trigger(rig: Rig, name: str) -> Any:
 
 
 def parameters_of(rig: Rig) -> list[float]:
-    request = GetParameters.Request(names=["kc", "ti"])
-    answer = rig.call(GetParameters, "controller_node/get_parameters", request)
-    return [v.double_value for v in answer.values]
+    return rig.values("controller_node", "kc", "ti")
 
 
 def verify(rig: Rig, **request: float) -> tuple[int, Any]:
@@ -254,10 +251,9 @@ rclpy.spin(node)
     gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
 
     def values() -> list[float]:
-        request = GetParameters.Request(names=[f"gains.heater.{name}" for name in "pid"])
-        answer = rig.call(GetParameters, "pid_controller/get_parameters", request)
-        assert {v.type for v in answer.values} == {ParameterType.PARAMETER_DOUBLE}
-        return [v.double_value for v in answer.values]
+        found = rig.values("pid_controller", *(f"gains.heater.{name}" for name in "pid"))
+        assert {type(value) for value in found} == {float}
+        return found
 
     assert values() == [1.0, 1.0, 1.0]
     gains.publish(

@@ -15,7 +15,6 @@ from faulty_loop import DEAD_TIME, DEFAULTS, LATCHED, TIME_CONSTANT, Loop
 from loop_rig import Rig
 from made_experiments import experiment_of
 from mcap.reader import make_reader
-from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 
 from relay_autotune.exchange.messages import float64_array
@@ -134,9 +133,7 @@ def test_forged_gains_are_not_applied(rig: Rig) -> None:
         rig.until(end.get_subscription_count, "the controller_node")
 
     def in_force() -> list[float]:
-        request = GetParameters.Request(names=["kc", "ti"])
-        answer = rig.call(GetParameters, "controller_node/get_parameters", request)
-        return [value.double_value for value in answer.values]
+        return rig.values("controller_node", "kc", "ti")
 
     def send(said: str, **messages: Any) -> None:
         # Messages of several topics come in any order, so they are sent until all have come.
@@ -219,9 +216,7 @@ def test_services_are_answered_while_a_fit_runs_and_results_keep_their_order(
     gains = rig.listen("pi_gains", PidGains)
     _, experiments = begin_slow(rig, flag)
     rig.until(lambda: status, "the fit")
-    request = GetParameters.Request(names=["method"])
-    answer = rig.call(GetParameters, "identifier_node/get_parameters", request)
-    assert answer.values[0].string_value == "waveform"
+    assert rig.values("identifier_node", "method") == ["waveform"]
     experiments.publish(experiment_of(PROCESS, "second"))
     client = rig.node.create_client(Identify, "identifier_node/identify")
     rig.until(client.service_is_ready, "the service")

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError, RecordError
 from relay_autotune.identification.judgement.validation import (
-    Validation,
     integrated_error,
     validate_fold,
 )
-from relay_autotune.identification.result import FitReport, Identification
+from relay_autotune.identification.result import FitReport, Identification, Validation
 from relay_autotune.identification.shown.fold import Fold, fold
 from relay_autotune.identification.shown.steady_state import steady_state
 from relay_autotune.identification.waveform.residuals import ljung_box, noise_to_signal

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Identification
 from relay_autotune.identification.judgement.quality import is_contradicted, misfit
+from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Cycle, Record
 
 # The end of a record alone is better if what it leaves beyond the noise is so much less.

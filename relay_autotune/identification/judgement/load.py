@@ -13,8 +13,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification import Estimate, Identification
 from relay_autotune.identification.differences import jacobian
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import FloatArray, PiecewiseConstant, Record

@@ -11,18 +11,18 @@ not the shape. Here the difference is a number, for the models of any method.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError
+from relay_autotune.identification.result import Validation
 from relay_autotune.identification.shown.fold import Fold, as_switched, fold
 from relay_autotune.identification.shown.steady_state import SteadyState, steady_state
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import told, told_fields
 from relay_autotune.record.record import Cycle, Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
@@ -32,32 +32,6 @@ _FREQUENCIES = 4001
 _CYCLES = (8, 32, 128)
 _TOLERANCE = 1e-6
 _KICK = 0.1
-
-
-@dataclass(frozen=True)
-class Validation:
-    """How a model's limit cycle differs from the record's, relative to the latter.
-
-    Differences of times are relative to the period, those of y to half of the record's peak to
-    peak; NaN: the model has no limit cycle. The shape compares the two curves, each from its own
-    mean over its own half of peak to peak, with the half periods laid upon each other, and
-    without what noise leaves of itself in the record's curve.
-    """
-
-    period: float = told("", "Difference of the whole period.", math.nan)
-    period_high: float = told("", "Of the time with the command high.", math.nan)
-    period_low: float = told("", "Of the time with the command low.", math.nan)
-    peak_max: float = told("", "Of the highest measurement.", math.nan)
-    peak_min: float = told("", "Of the lowest measurement.", math.nan)
-    shape: float = told("", "Root mean square difference of the two curves.", math.nan, lower=0.0)
-    reason: str = told("", "Why there is no limit cycle; empty if there is one.", "")
-
-    @property
-    def worst(self) -> float:
-        """Return the largest of them; infinite where the model has no limit cycle."""
-        if self.reason:
-            return math.inf
-        return max(abs(getattr(self, f.name)) for f in told_fields(Validation) if f.kind is float)
 
 
 def validate(model: TransferFunction, record: Record) -> Validation:
