@@ -32,7 +32,8 @@ from relay_autotune.identification.methods.chang import (
     time_constant_from_period,
     two_time_constants,
 )
-from relay_autotune.process.simulation import Plant, exact_limit_cycle
+from relay_autotune.process.plant import Plant
+from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import RelaySettings

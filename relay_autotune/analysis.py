@@ -44,9 +44,8 @@ from relay_autotune.tuning import (
     ensemble,
     rule_named,
 )
-from relay_autotune.tuning.ensemble import ensemble_peaks
+from relay_autotune.tuning.ensemble import PredictedMs, ensemble_peaks, predicted_ms
 from relay_autotune.tuning.model_set import ModelSet
-from relay_autotune.tuning.prediction import PredictedMs, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge
 

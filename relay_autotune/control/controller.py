@@ -27,7 +27,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.closed_loop import ClosedLoop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
-from relay_autotune.process.simulation import Plant
+from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import FloatArray
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.faults.repetition import SilenceWatch
-from relay_autotune.experiment.faults.sample_check import SampleCheck
-from relay_autotune.experiment.faults.sensor_watch import FrozenWatch
+from relay_autotune.experiment.faults.sensor import FrozenWatch, SampleCheck
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import Procedure, State
 from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy

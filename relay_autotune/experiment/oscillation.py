@@ -10,15 +10,16 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 
-from relay_autotune.experiment.faults.no_return import (
+from relay_autotune.experiment.faults.process import (
     NO_ANSWER,
+    TELL,
     RunawayWatch,
     count_cycles,
     has_moved,
     is_growing,
     why_no_return,
+    why_noise_alone,
 )
-from relay_autotune.experiment.faults.noise_alone import TELL, why_noise_alone
 from relay_autotune.experiment.levels import Levels, clear_swing
 from relay_autotune.experiment.narration import while_switching
 from relay_autotune.experiment.parameters import ExperimentParameters

@@ -24,7 +24,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from relay_autotune.experiment.faults.no_return import count_cycles
+from relay_autotune.experiment.faults.process import count_cycles
 from relay_autotune.experiment.kick import (
     LAST_LOOK,
     LAST_LOOK_SAMPLES,

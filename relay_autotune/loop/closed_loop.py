@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import SampledController, SampledPid
-from relay_autotune.process.simulation import Plant
+from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.float64]

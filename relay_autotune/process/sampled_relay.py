@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import ModelError
-from relay_autotune.process.simulation import Plant
+from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.process.actuator import Actuator
-from relay_autotune.process.simulation import Plant
+from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 
 

@@ -59,7 +59,7 @@ def write_picture(case: Case, path: Path | str, *, title: str = "") -> None:
     :param path: the picture; its ending says the format (.png, .svg, .pdf).
     :param title: of the picture; default: the case's source.
     """
-    from relay_autotune.report.picture import draw_picture
+    from relay_autotune.report.figures import draw_picture
 
     draw_picture(case, Path(path), title=title or case.source)
 

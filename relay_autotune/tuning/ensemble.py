@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,9 @@ from relay_autotune.loop.stability import (
 )
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.surroundings import allowed_outside
+from relay_autotune.tuning.task import DesignTask
 
 FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -133,3 +135,40 @@ def _loops(
 
 def _at_infinity(controller: Controller, model: TransferFunction) -> float:
     return 0.0 if model.dead_time > 0.0 else at_infinity(controller.loop(model))
+
+
+@dataclass(frozen=True)
+class PredictedMs:
+    """Largest magnitude of the sensitivity function with the gains of a rule.
+
+    :param ms: on the model.
+    :param low: lower end of its 95 % interval.
+    :param high: upper end; infinite where more than 2.5 % of the loops are unstable.
+    """
+
+    ms: float
+    low: float
+    high: float
+
+
+def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
+    """Return the Ms of the gains that a rule gives for the model alone, and its interval.
+
+    The interval holds 95 % of the Ms that the same gains have on the models within the
+    uncertainty.
+
+    :param task: the process, the models within its uncertainty, and what is asked for.
+    :param rule: gives the gains, from the model alone.
+    :return: None where the rule does not apply, or the uncertainty is not known.
+    """
+    if not task.models:
+        return None
+    try:
+        controller, _ = rule(replace(task, models=()))
+    except TuningError:
+        return None
+    models = ModelSet([task.in_loop(model) for model in (task.model, *task.models)])
+    own, *others = ensemble_peaks(controller, models).ms
+    # No interpolation: some values may be infinite.
+    low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")
+    return PredictedMs(float(own), float(low), float(high))

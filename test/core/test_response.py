@@ -14,8 +14,8 @@ from scipy.linalg import expm
 
 from relay_autotune.errors import RecordError
 from relay_autotune.identification.waveform.theta import columns_of
+from relay_autotune.process.plant import Plant
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import Plant
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
