@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import re
@@ -51,6 +52,18 @@ def add_new_loop(parser: argparse.ArgumentParser) -> None:
         help="the number in the messages of --measurement (%(default)s)",
     )  # fmt: skip
     group.add_argument(
+        "--command-field", metavar="PATH",
+        help="the number in the messages of --command, such as linear.x",
+    )  # fmt: skip
+    group.add_argument(
+        "--command-message", metavar="YAML",
+        help="what stands in their other elements, such as '{data: [0.0, 1.5]}'",
+    )  # fmt: skip
+    group.add_argument(
+        "--command-period", type=finite, metavar="S",
+        help="send the last command again after this time, for an actuator that stops without",
+    )  # fmt: skip
+    group.add_argument(
         "--at", type=finite, metavar="U", help="the present command, at which the process rests"
     )
     group.add_argument(
@@ -75,7 +88,10 @@ def is_new_loop(options: argparse.Namespace) -> bool:
     """
     if options.measurement and options.command:
         return True
-    for flag in ("measurement", "command", "at", "within", "command_within", "export"):
+    for flag in (
+        "measurement", "command", "command_field", "command_message", "command_period", "at",
+        "within", "command_within", "export",
+    ):  # fmt: skip
         if getattr(options, flag) is not None:
             raise SelectionError(
                 f"--{flag.replace('_', '-')} is for a loop without nodes: give --measurement and "
@@ -99,7 +115,9 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     with Working(f"looking at {options.measurement} and {options.command}"):
         kind = client.kind_of(options.measurement, options.wait, published=True)
         command_kind = client.kind_of(options.command, options.wait, published=False)
-        present = client.commanded(options.command, command_kind)
+        others = options.command_message or ""
+        command_field = options.command_field or "data"
+        present = client.commanded(options.command, command_kind, command_field, others)
         # Its mean command is the baseline where a controller commands through relay_node.
         controlled = client.is_controlled()
     told = "" if math.isnan(present) else f"{present:.6g}"
@@ -122,8 +140,14 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         "measurement_type": kind,
         "measurement_field": options.field,
         "command_type": command_kind,
+        "command_field": command_field,
         "amplitude": options.amplitude,
     }
+    if others:
+        # The value of a parameter is YAML itself, so that this text needs quotes.
+        values["command_message"] = json.dumps(others)
+    if options.command_period is not None:
+        values["command_period"] = options.command_period
     if command_within is not None:
         values |= {"command_min": command_within[0], "command_max": command_within[1]}
     named = ["-r", f"__ns:=/{own_namespace(options).strip('/')}"]

@@ -18,8 +18,9 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
 from relay_autotune.nodes import quality, signs_of_life
+from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.following import Following
-from relay_autotune.nodes.live_types import Reader, command_setter
+from relay_autotune.nodes.live_types import Reader
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
 # Interval and largest number of repeats of the safe command until it is acknowledged.
@@ -38,7 +39,7 @@ class Ends:
     :param on_status: called with each sign of life of the identifier.
     :param cycles_kept: number of cycles kept for late subscribers (depth of the latched topic).
     :param reader: how the measurement is read from its messages.
-    :param command_type: message type of the command.
+    :param commands: writes a command into its message.
     :param relay_on_setpoint: True if the relay publishes set-points.
     """
 
@@ -52,7 +53,7 @@ class Ends:
         on_status: Callable[[Any], None],
         cycles_kept: int,
         reader: Reader,
-        command_type: str,
+        commands: CommandMessage,
         relay_on_setpoint: bool = False,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
@@ -66,9 +67,10 @@ class Ends:
                 Float64, "setpoint", quality.COMMAND, event_callbacks=quiet
             )
         self._setpoint_message = Float64()
-        self._message, self._write = command_setter(command_type)
+        self.commands = commands
+        self._written = commands.written
         self.command = node.create_publisher(
-            type(self._message),
+            commands.kind,
             "command",
             quality.COMMAND,
             event_callbacks=quiet,
@@ -87,7 +89,6 @@ class Ends:
             DiagnosticArray, "/diagnostics", 1, event_callbacks=quiet
         )
         self.reader = reader
-        self.command_type = command_type
         self._sensor = Following(
             node, reader.kind, reader.type_name, "measurement", on_measurement, on_renewed
         )
@@ -108,6 +109,10 @@ class Ends:
         """Called with each command before it is published."""
         # Looked up once, because it is called for each measurement.
         self._publish = self.command.publish
+        self.last: float | None = None
+        """The last command that was published [u]; None: none was."""
+        self.is_fresh = False
+        """Set to True by each command."""
 
     @property
     def measurement(self) -> Subscription:
@@ -130,11 +135,14 @@ class Ends:
         }
 
     def send(self, command: float) -> None:
-        """Publish a command."""
+        """Publish a command, unless the other elements of its message are not known yet."""
+        message = self._written(command)
+        if message is None:
+            return
         if self.sent is not None:
             self.sent(command)
-        self._write(self._message, command)
-        self._publish(self._message)
+        self._publish(message)
+        self.last, self.is_fresh = command, True
 
     def send_setpoint(self, setpoint: float) -> None:
         """Publish a set-point."""

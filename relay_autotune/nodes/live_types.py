@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Message types of measurement and command: how value and stamp are read and written."""
+"""Message types that are installed: their fields, and how value and stamp are read."""
 
 from __future__ import annotations
 
@@ -12,18 +12,12 @@ from functools import cache
 from typing import Any
 
 from rosidl_parser import definition
-from std_msgs.msg import Float32, Float64, Float64MultiArray
 
 from relay_autotune.bag.field_path import reading, steps_of
 from relay_autotune.bag.schema import Repeated, Struct, Text, Type, number_named
 from relay_autotune.errors import FieldError, ParameterError
 
 FLOAT64 = "std_msgs/msg/Float64"
-FLOAT32 = "std_msgs/msg/Float32"
-ARRAY = "std_msgs/msg/Float64MultiArray"
-
-COMMAND_TYPES = (FLOAT64, FLOAT32, ARRAY)
-_COMMANDS = {FLOAT64: Float64, FLOAT32: Float32, ARRAY: Float64MultiArray}
 
 # Names of numbers in IDL that ROS calls otherwise.
 _PLAIN = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
@@ -105,25 +99,8 @@ def _type_of(slot: Any) -> Type:
     return number_named(_PLAIN.get(slot.typename, slot.typename))
 
 
-def command_setter(type_name: str) -> tuple[Any, Callable[[Any, float], None]]:
-    """Return a message of a command type, and the function that writes a command into it.
-
-    :param type_name: one of `COMMAND_TYPES`.
-    """
-    message = _COMMANDS[type_name]()
-    return message, _set_array if type_name == ARRAY else _set_data
-
-
 def _data(message: Any) -> float:
     return message.data
-
-
-def _set_data(message: Any, command: float) -> None:
-    message.data = command
-
-
-def _set_array(message: Any, command: float) -> None:
-    message.data = [command]
 
 
 def _header_stamp(message: Any) -> int:

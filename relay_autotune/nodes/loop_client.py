@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
@@ -24,9 +25,9 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
-from relay_autotune.errors import LoopError, ParameterError
+from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.live_types import ARRAY, reader_of
+from relay_autotune.nodes.command_message import CommandMessage
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
@@ -176,21 +177,26 @@ class LoopClient:
         """Tell whether a controller of this namespace publishes controller_command."""
         return self._node.count_publishers(self._resolved("controller_command")) > 0
 
-    def commanded(self, topic: str, type_name: str) -> float:
+    def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         """Return the mean of the commands that are published now; NaN: none are.
 
         :param topic: name of the command's topic.
         :param type_name: its message type.
+        :param field: path of the command in its messages.
+        :param others: what stands in their other elements, as for `CommandMessage`.
+        :raises ParameterError: if the messages of this type do not have such a command.
         """
+        commands = CommandMessage(type_name, field, others, taken=False, now_ns=time.time_ns)
         name = self._resolved(topic)
         if not self._node.count_publishers(name):
             return math.nan
         heard: list[float] = []
-        field = "data[0]" if type_name == ARRAY else "data"
-        reader = reader_of(type_name, field)
-        ear = self._node.create_subscription(
-            reader.kind, name, lambda m: heard.append(reader.value(m)), qos_profile_sensor_data
-        )
+
+        def hear(message: Any) -> None:
+            with suppress(FieldError):
+                heard.append(commands.value(message))
+
+        ear = self._node.create_subscription(commands.kind, name, hear, qos_profile_sensor_data)
         self._wait(lambda: False, time.monotonic() + _LISTEN)
         self._node.destroy_subscription(ear)
         return sum(heard) / len(heard) if heard else math.nan

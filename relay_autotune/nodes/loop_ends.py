@@ -16,6 +16,7 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from std_msgs.msg import Bool, Float64
 
+from relay_autotune.errors import FieldError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.ends import Ends
@@ -70,9 +71,13 @@ class LoopEnds:
         self._topic = ends.command.topic_name
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
         if takeover:
-            ends.sent = self._own.append
+            ends.sent = self._note_own
             node.create_subscription(
-                Float64, "command", self._on_command, quality.COMMAND, event_callbacks=unheard
+                ends.commands.kind,
+                "command",
+                self._on_command,
+                quality.COMMAND,
+                event_callbacks=unheard,
             )
         else:
             self._controller = node.create_subscription(
@@ -84,6 +89,23 @@ class LoopEnds:
             )
             node.create_timer(
                 _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            )
+        if self._value("command_others") == "other_commands":
+            node.create_subscription(
+                ends.commands.kind,
+                "other_commands",
+                self._on_others,
+                quality.MEASUREMENT,
+                event_callbacks=unheard,
+            )
+        self.repeat_period: float = self._value("command_period")
+        """Time without a command after which the last is sent again [s]; 0: never."""
+        if self.repeat_period > 0.0:
+            # A command is between one and two looks old when it is sent again.
+            node.create_timer(
+                0.5 * self.repeat_period,
+                self._send_again,
+                clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
         node.create_subscription(
             Float64,
@@ -230,18 +252,40 @@ class LoopEnds:
         elif self._gives_back and self._experiment is not None and self.is_connected:
             self._experiment.safe_command = self.handover.last
 
-    def _on_command(self, message: Float64) -> None:
+    def _note_own(self, command: float) -> None:
+        self._own.append(self._ends.commands.on_wire(command))
+
+    def _on_command(self, message: Any) -> None:
         """Take a message on the command topic, where other nodes may publish, too."""
-        if message.data in self._own:
+        try:
+            command = self._ends.commands.value(message)
+        except FieldError as error:
+            self._stop(f"another node commanded on {self._topic} during the tune: {error}")
+            return
+        if command in self._own:
             return
         if self._experiment is not None:
             self._stop(
-                f"another node commanded {message.data:g} on {self._topic} during the tune: the "
+                f"another node commanded {command:g} on {self._topic} during the tune: the "
                 "controller must hold or track"
             )
         # A foreign command means that its sender controls the loop again.
         self._driven = True
-        self.handover.note(message.data)
+        self.handover.note(command)
+
+    def _on_others(self, message: Any) -> None:
+        commands = self._ends.commands
+        commands.take_others(message)
+        if commands.why_unknown:
+            self._stop(f"the other elements of the command are not known: {commands.why_unknown}")
+
+    def _send_again(self) -> None:
+        """Send the last command again if none has gone out since the last look."""
+        ends = self._ends
+        if ends.is_fresh:
+            ends.is_fresh = False
+        elif ends.last is not None and not self.is_driven:
+            ends.send(ends.last)
 
     def _on_feedback(self, message: Float64) -> None:
         self._feedback_at = time.monotonic()

@@ -84,8 +84,13 @@ def require_actuator(node: Node, ends: Ends) -> None:
     # In takeover one of the subscriptions is the node's own.
     own = sum(s.topic_name == ends.command.topic_name for s in node.subscriptions)
     if ends.command.get_subscription_count() <= own:
-        why = why_no_subscriber(node, ends.command.topic_name, ends.command_type)
+        why = why_no_subscriber(node, ends.command.topic_name, ends.commands.type_name)
         raise NotReadyError(f"no command would arrive: {why}")
+    if unknown := ends.commands.why_unknown:
+        raise NotReadyError(
+            f"the other elements of the command are not known: {unknown}; publish there, or give "
+            f"command_message"
+        )
 
 
 def require_within_limits(parameters: ExperimentParameters, newest: float | None) -> None:

@@ -34,6 +34,7 @@ from relay_autotune.nodes.checklist import (
     look_at_recording,
     look_at_rest,
 )
+from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.following import FOLLOW_EVERY
 from relay_autotune.nodes.health import diagnostics
@@ -125,7 +126,13 @@ class RelayNode(ServedNode):
             on_status=lambda status: self._recordings.told(*said_by(status)),
             cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
             reader=self._reader,
-            command_type=fixed["command_type"],
+            commands=CommandMessage(
+                fixed["command_type"],
+                fixed["command_field"],
+                fixed["command_message"],
+                taken=fixed["command_others"] == "other_commands",
+                now_ns=self._now_ns if self._simulated else time.time_ns,
+            ),
             relay_on_setpoint=fixed["relay_on"] == "setpoint",
         )
         self._send, self._relay = self._ends.send, self._ends.relay
@@ -310,7 +317,7 @@ class RelayNode(ServedNode):
         return Ready(parameters, baseline, policy, self._from_small(parameters, baseline))
 
     def _require_alone(self, sample_period: float) -> None:
-        require_own_time(sample_period, self._sensor.repeat_period)
+        require_own_time(sample_period, self._sensor.repeat_period, self._loop.repeat_period)
         self._loop.require_alone()
 
     def _heard(self) -> str:
@@ -325,7 +332,8 @@ class RelayNode(ServedNode):
         """Say who takes the commands."""
         topic = self._ends.command.topic_name
         there = self.get_subscriptions_info_by_topic(topic)
-        return f"{topic} to {', '.join(described(e) for e in there if who(e) != self._name)}"
+        takers = ", ".join(described(e) for e in there if who(e) != self._name)
+        return f"{self._ends.commands.described} on {topic} to {takers}"
 
     def _from_small(self, parameters: ExperimentParameters, baseline: float) -> bool:
         # Who tells where the actuator is, tells of its ends, too.
@@ -335,7 +343,6 @@ class RelayNode(ServedNode):
     def _start(self, ready: Ready) -> tuple[str, str]:
         parameters, policy = ready.parameters, ready.policy
         identity = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{secrets.token_hex(4)}"
-        clock = self.get_clock()
         converged = self.get_parameter("stop_when").value == "converged"
         kind: Callable[..., Session] = Session
         if self._on_setpoint:
@@ -351,7 +358,7 @@ class RelayNode(ServedNode):
             ),
             identity,
             sample_period=parameters.sample_period,
-            clock=(lambda: int(clock.now().nanoseconds)) if self._simulated else None,
+            clock=self._now_ns if self._simulated else None,
             repeats=self._hear is not None,
         )
         sample, recorded = self._recordings.begin(
@@ -413,7 +420,7 @@ class RelayNode(ServedNode):
     def _on_result(self, name: str, message: Any) -> None:
         session = self._session
         running = session if session is not None and message.experiment_id == session.id else None
-        now = int(self.get_clock().now().nanoseconds)
+        now = self._now_ns()
         taken = self._results.take(
             name, message, None if running is None else running.experiment, self._on_setpoint
         )
@@ -534,6 +541,9 @@ class RelayNode(ServedNode):
         self._held, self._after = command, None
         self._send(command)
 
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
     def _publish_diagnostics(self) -> None:
         session = self._session
         problems = [self._alarm] if self._alarm else []
@@ -547,7 +557,7 @@ class RelayNode(ServedNode):
         running = "" if session is None else session.id
         values = state_values(self._counter, session, idle=idle, lost=self._lost())
         summary = f"tune {running}: {self._words()}" if running else self._summary
-        now = int(self.get_clock().now().nanoseconds)
+        now = self._now_ns()
         message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)
         self._ends.diagnostics.publish(message)
 

@@ -30,13 +30,22 @@ _LOOK_EVERY = 0.2
 _ROUNDING = 1e-6
 
 
-def require_own_time(sample_period: float, repeat_period: float) -> None:
-    """Refuse to repeat measurements if their number is the only clock.
+def require_own_time(
+    sample_period: float, repeat_period: float, command_period: float = 0.0
+) -> None:
+    """Refuse to repeat measurements, or commands, if their number is the only clock.
 
     :param sample_period: the parameter [s].
     :param repeat_period: the parameter [s].
-    :raises ParameterError: if both are given.
+    :param command_period: the parameter [s].
+    :raises ParameterError: if the first and one of the others are given.
     """
+    if sample_period > 0.0 and command_period > 0.0:
+        raise ParameterError(
+            f"command_period and sample_period {sample_period:g} s are both given: a plant in "
+            "lockstep would take each repeated command for the answer to a sample; set one of "
+            "them to 0"
+        )
     if sample_period > 0.0 and repeat_period > 0.0:
         raise ParameterError(
             f"repeat_period and sample_period {sample_period:g} s are both given: a sensor that "

@@ -9,7 +9,7 @@ import math
 
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
-from relay_autotune.nodes.live_types import COMMAND_TYPES, FLOAT64
+from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.quantities import Quantity
 
 __all__ = ["EXPERIMENT_PARAMETERS", "FIXED_PARAMETERS", "NODE_PARAMETERS", "TUNE_PARAMETERS"]
@@ -169,13 +169,36 @@ FIXED_PARAMETERS = (
         "counts as a new sample, and measurement_timeout does not apply; 0: silence is a fault.",
         0.0,
     ),
+    Quantity("command_type", FLOAT64, "", "Message type of the command."),
     Quantity(
-        "command_type",
-        FLOAT64,
+        "command_field",
+        "data",
         "",
-        "Message type of the command; an array has the command as its only element, as a "
-        "forward_command_controller of ros2_control wants it.",
-        choices=COMMAND_TYPES,
+        "Path of the command in it, such as linear.x or data[1]; data of an array is its only "
+        "element, as a forward_command_controller of ros2_control for one joint wants it.",
+    ),
+    Quantity(
+        "command_message",
+        "",
+        "",
+        "What stands in the other elements of each command, as ros2 topic pub takes it, such as "
+        "'{data: [0.0, 1.5]}'; empty: zeros.",
+    ),
+    Quantity(
+        "command_others",
+        "command_message",
+        "",
+        "Where they come from: that parameter, or the newest message on other_commands, so that "
+        "other joints hold what they were told last.",
+        choices=("command_message", "other_commands"),
+    ),
+    Quantity(
+        "command_period",
+        0.0,
+        "s",
+        "For an actuator that stops when no command comes, as a base does by cmd_vel: the last "
+        "command goes out again when none has for this time; 0: one command for each measurement.",
+        0.0,
     ),
 )
 TUNE_PARAMETERS: tuple[Quantity, ...] = (*EXPERIMENT_PARAMETERS, *NODE_PARAMETERS)

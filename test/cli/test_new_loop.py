@@ -26,7 +26,7 @@ class Looker:
     def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
         return {"/tank/level": "std_msgs/msg/Float32"}.get(topic, "std_msgs/msg/Float64")
 
-    def commanded(self, topic: str, type_name: str) -> float:
+    def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         return self.present
 
     def is_controlled(self) -> bool:
@@ -70,6 +70,7 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
         "measurement_type": "std_msgs/msg/Float32",
         "measurement_field": "data",
         "command_type": "std_msgs/msg/Float64",
+        "command_field": "data",
     }
     assert set(nodes_for(Looker(), given)._nodes) == {"relay_node", "identifier_node"}
 

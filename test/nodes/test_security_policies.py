@@ -25,7 +25,15 @@ FOLDER = Path(__file__).resolve().parents[2] / "config" / "security"
 PLANT = ["structure:=fopdt", "gain:=2.0", "time_constants:=[1.0]", "dead_time:=0.5"]
 # What each node may do depends on some of its parameters.
 VARIANTS: dict[str, tuple[Callable[[], Node], list[list[str]]]] = {
-    "relay_node": (RelayNode, [[], ["relay_on:=setpoint"], ["use_sim_time:=true"]]),
+    "relay_node": (
+        RelayNode,
+        [
+            [],
+            ["relay_on:=setpoint"],
+            ["use_sim_time:=true"],
+            ["command_others:=other_commands"],
+        ],
+    ),
     "identifier_node": (IdentifierNode, [[], ["use_sim_time:=true"]]),
     "controller_node": (
         ControllerNode,

@@ -330,6 +330,15 @@ def second_publisher(topic: str) -> Cause:
     return cause
 
 
+def joints(*names: str) -> Cause:
+    """Return a cause that changes the joints that the sensor names."""
+
+    def cause(loop: Loop, _: Random) -> None:
+        loop.joints = names
+
+    return cause
+
+
 def second_node(loop: Loop, _: Random) -> Callable[[], None]:
     """Add a second node with the relay's name."""
     other = Node("relay_node", context=loop.rig.context, start_parameter_services=False)
@@ -501,6 +510,25 @@ FAULTS = {
     "sensor on change, silent before a cycle": in_a_tune(
         before_a_cycle, "it does not respond", kind="on change", at_start=True, max_half_cycle=0.6
     ),
+    "joint that is missing": in_a_tune(
+        joints("right", "arm"), "cannot be read: velocity[left]: the list name has", kind="joint"
+    ),
+    "joint that is there twice": in_a_tune(
+        joints("left", "arm", "left"), "has 'left' 2 times", kind="joint"
+    ),
+    "silent sensor under a Twist": in_a_tune(
+        altered(lambda _, y: None),
+        "no measurement on /measurement for",
+        kind="joint",
+        measurement_timeout=1.2,
+    ),
+    "limits under a Twist": in_a_tune(
+        altered(lambda _, y: y + 100.0),
+        "is outside its limits",
+        kind="joint",
+        measurement_max=50.0,
+    ),
+    "abort under a Twist": in_a_tune(abort, "aborted on request", kind="joint"),
     "second publisher of command": in_a_tune(
         second_publisher("command"), "/command is also published by "
     ),

@@ -15,14 +15,17 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from random import Random
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
 from loop_rig import LATCHED, RELIABLE, Process, Rig
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32, Float64, Float64MultiArray
 
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment
@@ -71,12 +74,31 @@ KINDS: dict[str, dict[str, Any]] = {
     "clock": {"use_sim_time": True, "command_type": "std_msgs/msg/Float32"},
     # A busy machine may delay this loop for as long as 20 repetitions.
     "on change": {"repeat_period": 0.025},
+    # A joint in an order that changes with each message, and an axis of a Twist.
+    "joint": {
+        "measurement_type": "sensor_msgs/msg/JointState",
+        "measurement_field": "velocity[left]",
+        "command_type": "geometry_msgs/msg/TwistStamped",
+        "command_field": "twist.linear.x",
+        # The value of a parameter is YAML itself: a text of YAML needs quotes.
+        "command_message": "'{header: {frame_id: base}, twist: {angular: {z: 0.25}}}'",
+    },
+    # A joint of a group; the others hold what they were told.
+    "group": {
+        "command_type": "std_msgs/msg/Float64MultiArray",
+        "command_field": "data[1]",
+        "command_others": "other_commands",
+        "command_period": 0.05,
+    },
 }
+JOINTS = ("left", "right", "arm")
 _COMMANDS: dict[str, tuple[Any, Callable[[Any], float]]] = {
     "plain": (Float64, lambda message: message.data),
     "stamped": (Float64MultiArray, lambda message: message.data[0]),
     "clock": (Float32, lambda message: message.data),
     "on change": (Float64, lambda message: message.data),
+    "joint": (TwistStamped, lambda message: _of_twist(message)),
+    "group": (Float64MultiArray, lambda message: message.data[1]),
 }
 # A sensor that publishes on change has this resolution, and a slower process by this factor.
 _RESOLUTION, _SLOWER = 0.01, 2.0
@@ -90,6 +112,13 @@ _TYPES = {
 }
 
 
+def _of_twist(message: TwistStamped) -> float:
+    """Return the command, after a check of all that is beside it."""
+    assert message.header.frame_id == "base" and message.header.stamp.sec > 1_000_000_000
+    assert message.twist.angular.z == 0.25 and message.twist.linear.y == 0.0
+    return float(message.twist.linear.x)
+
+
 class Loop:
     """The process on the topics, and a record of the relay's messages.
 
@@ -101,20 +130,26 @@ class Loop:
     def __init__(self, rig: Rig, kind: str = "plain", *, slower: float = 1.0) -> None:
         self.rig, self.kind = rig, kind
         self.commands: list[float] = []
+        self.messages: list[Any] = []
+        self.joints = JOINTS
         self.experiments: list[Any] = rig.listen("relay_experiment", RelayExperiment)
         self.gains = rig.listen("pi_gains", PidGains)
         self.cycles = rig.listen("relay_cycle", RelayCycle)
         self.status = rig.listen("/diagnostics", DiagnosticArray, QoSProfile(depth=50))
         command, value = _COMMANDS[kind]
-        rig.node.create_subscription(
-            command, "command", lambda m: self.commands.append(value(m)), RELIABLE
-        )
+
+        def hear(message: Any) -> None:
+            self.messages.append(message)
+            self.commands.append(value(message))
+
+        rig.node.create_subscription(command, "command", hear, RELIABLE)
         self.speaks_on_change = kind == "on change"
         self.slower = _SLOWER if self.speaks_on_change else slower
         self.publisher: Any = None
         self.sensor_comes()
         self.clock = rig.node.create_publisher(Clock, "/clock", 10) if kind == "clock" else None
         self.process: Process | None = None
+        self.mixed = Random(1)
         self.values = dict(DEFAULTS)
         self.count = 0
         self.reset()
@@ -124,7 +159,7 @@ class Loop:
 
     def sensor_comes(self) -> None:
         """Create the sensor's publisher."""
-        kind = RelayCycle if self.kind == "stamped" else Float64
+        kind = {"stamped": RelayCycle, "joint": JointState}.get(self.kind, Float64)
         # A value published only on change must be latched for a relay that starts later.
         profile = LATCHED if self.speaks_on_change else 100
         self.publisher = self.rig.node.create_publisher(kind, "measurement", profile)
@@ -142,6 +177,7 @@ class Loop:
         self.clock_error = 0.0
         self.clock_stands = False
         self.stuck_at: float | None = None
+        self.joints = JOINTS
         self.now = time.monotonic()
         self.on_the_way = deque([(self.now, 0.0)])
 
@@ -194,6 +230,13 @@ class Loop:
             stamp = stamped.header.stamp
             stamp.sec, stamp.nanosec = divmod(ns, 1_000_000_000)
             self.publisher.publish(stamped)
+        elif self.kind == "joint":
+            names = self.mixed.sample(self.joints, len(self.joints))
+            state = JointState(
+                name=names, velocity=[value if n == "left" else -7.0 for n in names]
+            )
+            state.header.stamp = self.rig.node.get_clock().now().to_msg()
+            self.publisher.publish(state)
         else:
             self.publisher.publish(Float64(data=value))
 
@@ -210,6 +253,7 @@ class Loop:
             self.process = self.rig.start_python("broken_relay", code, **parameters)
         else:
             self.process = self.rig.relay(output=output, **parameters)
+        self.mixed = Random(1)
         self.values = dict(DEFAULTS)
         return self.process
 
