@@ -1,6 +1,7 @@
 # make setup   prepare .venv/ and install/; the other targets do it by themselves
 # make demo    tune a simulated loop over real DDS; leaves demo_output/
 # make test    lint, type check, and the tests in both environments
+# make test-web       the tests of the page in the browser, which need a Chromium
 # make lint    ruff and mypy alone
 # make test-nightly   the tests that take long and prove little more
 # make release lay the two packages side by side in release/, for tools that look there
@@ -13,7 +14,7 @@ SOURCES = setup.py docs/conf.py launch relay_autotune test tools $(wildcard bags
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 
-.PHONY: setup demo test test-nightly test-core test-oldest test-system test-rest lint docs release clean
+.PHONY: setup demo test test-nightly test-web test-core test-oldest test-system test-rest lint docs release clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
@@ -47,6 +48,9 @@ test-nightly: setup
 	@$(PYTHON) tools/prepare.py oldest
 	@if [ -d .venv-oldest ]; then \
 		.venv-oldest/bin/python -m pytest -q -m "nightly or long" test/core; fi
+
+test-web: setup
+	@$(ENTER) && python3 -m pytest -q --require-chromium test/web
 
 lint: setup
 	@$(ENTER) && ruff check $(SOURCES)

@@ -23,7 +23,7 @@ setup(
     maintainer="relay_autotune maintainers",
     maintainer_email="relay-autotune@users.noreply.github.com",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "report/templates/*"]},
+    package_data={PACKAGE: ["py.typed", "report/templates/*", "web/static/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -36,6 +36,7 @@ setup(
     extras_require={
         "fleet": ["distributed", "pyarrow"],
         "report": ["jinja2", "matplotlib"],
+        "web": ["tornado"],
         "test": ["control", "hypothesis", "pytest", "rosbags"],
     },
     zip_safe=True,

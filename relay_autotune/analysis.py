@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from relay_autotune.experiment.early_end import Finding
 from relay_autotune.identification.judgement.assessment import assess
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
-from relay_autotune.identification.judgement.evidence import Evidence, Loop
+from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.identification.judgement.quality import is_far_off
-from relay_autotune.identification.judgement.table import LOOP_CHECKS, MODEL_CHECKS
+from relay_autotune.identification.judgement.table import MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods import (
     DEFAULT_METHOD,
@@ -34,6 +34,7 @@ from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
+from relay_autotune.shaping import Shaping
 from relay_autotune.tuning import (
     DEFAULT_RULE,
     RULES,
@@ -44,8 +45,7 @@ from relay_autotune.tuning import (
     ensemble,
     rule_named,
 )
-from relay_autotune.tuning.ensemble import PredictedMs, ensemble_peaks, predicted_ms
-from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.tuning.ensemble import PredictedMs, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge
 
@@ -84,6 +84,7 @@ class Analysis:
     :param judgement: findings of the checks, and the verdict.
     :param predicted: for a running experiment, Ms with the gains of its model; None: not asked
         for, or no gains.
+    :param shaping: what the design of other gains takes; None: there may be no gains.
     """
 
     record: Record
@@ -96,6 +97,7 @@ class Analysis:
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
     predicted: PredictedMs | None = None
+    shaping: Shaping | None = field(default=None, compare=False)
 
     @property
     def model(self) -> Identification | None:
@@ -417,22 +419,13 @@ def _judged(
     judgement = Judgement(findings, refused=refused)
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
-    task = _task(found, rng, simple, options)
-    tuned = _tuned(found, task, rules)
+    shaping = Shaping(_task(found, rng, simple, options), evidence, findings)
+    found = replace(found, shaping=shaping)
+    tuned = _tuned(found, shaping.task, rules)
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
-    loop = Loop(
-        controller=gains,
-        ms_of=lambda models: (
-            ensemble_peaks(gains, ModelSet([task.in_loop(model) for model in models])).ms
-        ),
-        ms=gains.ms,
-        ms_95=gains.ms_95,
-        added_delay=task.options.added_delay,
-    )
-    findings = (*findings, *judge(LOOP_CHECKS, replace(evidence, loop=loop)))
-    judgement = Judgement(findings)
+    judgement = shaping.judgement(gains)
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     return replace(tuned, judgement=judgement)

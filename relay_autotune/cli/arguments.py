@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable
@@ -157,3 +158,34 @@ def given_quantities(
             raise SelectionError(flag_of(typed) + problem.removeprefix(typed.name))
         given[each.name] = value if typed is each else math.radians(value)
     return given
+
+
+def as_typed(
+    program: str, parser: argparse.ArgumentParser, options: argparse.Namespace, **changed: Any
+) -> str:
+    """Return the command line that gives some options, without those that have their defaults.
+
+    :param program: name of the command.
+    :param parser: that of the command.
+    :param options: as it parsed them.
+    :param changed: other values of some of them, by name; None: left out.
+    """
+    values = vars(options) | changed
+    flags: list[str] = []
+    given: list[str] = []
+    told = set()
+    for action in parser._actions:
+        value = values.get(action.dest)
+        if action.dest in told or value is None or value == action.default:
+            continue
+        told.add(action.dest)
+        words = [_typed(each) for each in (value if isinstance(value, list) else [value])]
+        if not action.option_strings:
+            given += words
+        else:
+            flags += [action.option_strings[-1], *(words if action.nargs != 0 else [])]
+    return shlex.join([program, *given, *flags])
+
+
+def _typed(value: Any) -> str:
+    return f"{value:.12g}" if isinstance(value, float) else str(value).strip()

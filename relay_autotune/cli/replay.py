@@ -17,6 +17,7 @@ from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
 from relay_autotune.cli.design_arguments import add_export, export_target
 from relay_autotune.cli.layout import width
+from relay_autotune.cli.page import add_web, check_web, show
 from relay_autotune.cli.progress import ProgressLine
 from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.cli.report import (
@@ -50,6 +51,7 @@ Examples, with the recordings that come with the package:
   replay --json --start 10 --rule simc bags/step_test
   replay --jobs 2 --output fleet.csv bags/*
   replay --ms 1.6 --export pid_controller --dof heater bags/step_test > g.yaml
+  replay --web bags/step_test
   replay --method chang --gain 1.65 bags/unbiased_relay_with_noise
   replay --joint bags/biased_relay bags/unbiased_relay_with_noise
 And with some of your own:
@@ -64,11 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
     options.command_line = command_line(PROGRAM, arguments)
     import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
 
-    return guarded(PROGRAM, lambda: _run(options))
+    return guarded(PROGRAM, lambda: _run(parser, options))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -99,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     add_export(parser).add_argument(
         "--accept-doubtful", action="store_true", help="also write gains that are doubtful"
     )
+    add_web(parser)
     return parser
 
 
@@ -108,14 +112,15 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     jobs = _jobs(options)
+    for flag, wanted in (("--report", options.report), ("--web", options.web)):
+        if wanted and (options.output or options.scheduler or options.jobs > 1):
+            raise SelectionError(f"{flag} cannot be combined with --output, --jobs or --scheduler")
     if options.report:
         check_output(PROGRAM, options.report)
-        if options.output or options.scheduler or options.jobs > 1:
-            raise SelectionError(
-                "--report cannot be combined with --output, --jobs or --scheduler"
-            )
+    if options.web:
+        check_web(options)
     if options.output:
         return _into_file(jobs, options)
     status = DONE
@@ -126,11 +131,15 @@ def _run(options: argparse.Namespace) -> int:
             print(done.text, flush=True)
         status = worst(status, done.status)
         analyses += [(done.name, analysis) for analysis in found]
-    if options.report and analyses:
+    if analyses and (options.report or options.web):
         from relay_autotune.report.case import case_of
 
-        cases = [case_of(analysis, name) for name, analysis in analyses]
-        write_report(as_asked(cases, options), options.report)
+        cases = as_asked([case_of(analysis, name) for name, analysis in analyses], options)
+        if options.report:
+            write_report(cases, options.report)
+        if options.web:
+            shapings = [analysis.shaping for _, analysis in analyses]
+            show(PROGRAM, parser, options, list(zip(cases, shapings, strict=True)))
     return status
 
 

@@ -19,9 +19,12 @@ from relay_autotune.cli.design_arguments import (
     export_target,
 )
 from relay_autotune.cli.layout import width
+from relay_autotune.cli.page import add_web, check_web, show
 from relay_autotune.errors import SelectionError, TuningError
 
 if TYPE_CHECKING:
+    from relay_autotune.report.case import Case
+    from relay_autotune.shaping import Shaping
     from relay_autotune.tuning import DesignTask, Gains, Performance
     from relay_autotune.tuning.compensators import Compensator
 
@@ -65,8 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else arguments
     # argparse takes -1e-3 for an option, but not an argument that begins with a blank.
-    options = _parser().parse_args([f" {a}" if _NEGATIVE.match(a) else a for a in given])
-    return guarded(PROGRAM, lambda: _run(options))
+    parser = _parser()
+    options = parser.parse_args([f" {a}" if _NEGATIVE.match(a) else a for a in given])
+    return guarded(PROGRAM, lambda: _run(parser, options))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -115,10 +119,11 @@ def _parser() -> argparse.ArgumentParser:
     add_export(parser).add_argument(
         "--output", metavar="FILE", help="write the file there, not to standard output"
     )
+    add_web(parser)
     return parser
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     from relay_autotune.cli.tune_model import model_of
     from relay_autotune.tuning import DEFAULT_RULE, RULES, task_of_model
 
@@ -129,10 +134,38 @@ def _run(options: argparse.Namespace) -> int:
     rule = options.rule or DEFAULT_RULE
     if rule not in RULES:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
+    if options.web:
+        check_web(options)
     task = task_of_model(model_of(options), design_options(options))
-    if options.table:
-        return _side_by_side(task, rule, options)
-    return _one(task, rule, options)
+    status = _side_by_side(task, rule, options) if options.table else _one(task, rule, options)
+    if options.web:
+        show(PROGRAM, parser, options, [_to_shape(task, rule)])
+    return status
+
+
+def _to_shape(task: DesignTask, rule: str) -> tuple[Case, Shaping]:
+    """Return a model that was given as a page shows it, and what the design of gains takes."""
+    from relay_autotune.identification.result import FitReport
+    from relay_autotune.record.record import Outcome
+    from relay_autotune.report.case import Case, ModelCase
+    from relay_autotune.shaping import Shaping
+    from relay_autotune.text import process_text
+
+    gains, _ = _by_all_rules(task, rule)
+    case = Case(
+        source=process_text(task.model),
+        experiment_id="",
+        start=0.0,
+        duration=0.0,
+        outcome=Outcome.UNKNOWN,
+        reason="",
+        models=(ModelCase("given", task.model, (), (), FitReport()),),
+        selected=0,
+        gains=tuple(gains),
+        recommended=0 if gains and gains[0].rule == rule else None,
+        added_delay=task.options.added_delay,
+    )
+    return case, Shaping(task)
 
 
 def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
@@ -155,15 +188,8 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
 
 def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     from relay_autotune.cli.tune_table import process_lines, refusal_lines, side_by_side
-    from relay_autotune.tuning import RULES, design
 
-    gains: list[Gains] = []
-    refused: dict[str, str] = {}
-    for name in sorted(RULES, key=lambda n: n != rule):
-        try:
-            gains.append(design(task, name))
-        except TuningError as error:
-            refused[name] = str(error)
+    gains, refused = _by_all_rules(task, rule)
     recommended = 0 if gains and gains[0].rule == rule else None
     inside = _compensators(task, refused)
     if options.json:
@@ -177,6 +203,20 @@ def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> i
         say(PROGRAM, "no rule gives gains for this model")
         return NOTHING_FOUND
     return DONE
+
+
+def _by_all_rules(task: DesignTask, rule: str) -> tuple[list[Gains], dict[str, str]]:
+    """Return the gains of every rule, the chosen one's first, and why others give none."""
+    from relay_autotune.tuning import RULES, design
+
+    gains: list[Gains] = []
+    refused: dict[str, str] = {}
+    for name in sorted(RULES, key=lambda n: n != rule):
+        try:
+            gains.append(design(task, name))
+        except TuningError as error:
+            refused[name] = str(error)
+    return gains, refused
 
 
 def _compensators(

@@ -58,7 +58,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     assert found is not None
     axes = figure.subplots()
     loop = gains.loop(in_loop(case, found.model))
-    w = _loop_frequencies(loop)
+    w = loop_frequencies(loop)
     turn = np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
     near_point = -1.0 + turn / gains.ms
     axes.plot(
@@ -112,10 +112,12 @@ def _margins(axes: Axes, gains: Gains, loop: ComplexArray) -> None:
         )  # fmt: skip
 
 
-def _loop_frequencies(loop: TransferFunction) -> FloatArray:
-    """Return frequencies from where the loop is large to where it is small.
+def loop_frequencies(loop: TransferFunction) -> FloatArray:
+    """Return frequencies from where a loop is large to where it is small [rad/s], shape (f,).
 
     A dead time turns the loop about the origin without end; a few turns are shown.
+
+    :param loop: controller times process.
     """
     from relay_autotune.loop.analysis import frequencies
 
@@ -126,16 +128,26 @@ def _loop_frequencies(loop: TransferFunction) -> FloatArray:
 
 
 def swept_area(values: ComplexArray) -> Path:
-    """Return the area that the 95 % ellipses of a curve's points sweep.
+    """Return the area of :func:`swept_parts` as one path.
+
+    :param values: of each model at each frequency, shape (m, f).
+    """
+    from matplotlib.path import Path
+
+    parts = swept_parts(values)
+    return Path.make_compound_path(*[Path(np.vstack((p, p[:1])), closed=True) for p in parts])
+
+
+def swept_parts(values: ComplexArray) -> list[FloatArray]:
+    """Return polygons that cover the area which the 95 % ellipses of a curve's points sweep.
 
     The points of the models at one frequency are taken as normally distributed in the plane, so
     that 95 % of them lie within ``(z - m)' C^-1 (z - m) = -2 ln 0.05``; between two frequencies
     the area is the convex hull of their ellipses.
 
     :param values: of each model at each frequency, shape (m, f).
+    :return: convex polygons, each of shape (n, 2): real and imaginary part of its corners.
     """
-    from matplotlib.path import Path
-
     angles = np.linspace(0.0, 2.0 * math.pi, _CORNERS, endpoint=False)
     turn = np.column_stack((np.cos(angles), np.sin(angles)))
     rings = []
@@ -144,8 +156,7 @@ def swept_area(values: ComplexArray) -> Path:
         spread, axes = np.linalg.eigh(np.cov(plane.T))
         scale = axes * (_ELLIPSE * np.sqrt(np.maximum(spread, 0.0)))
         rings.append(plane.mean(axis=0) + turn @ scale.T)
-    parts = [_hull(np.vstack(pair)) for pair in pairwise(rings)]
-    return Path.make_compound_path(*[Path(np.vstack((p, p[:1])), closed=True) for p in parts])
+    return [_hull(np.vstack(pair)) for pair in pairwise(rings)]
 
 
 def _hull(points: FloatArray) -> FloatArray:

@@ -36,7 +36,7 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
     model = in_loop(case, case.model.model)
-    half = _half(case.best_gains, model)
+    half = step_duration(case.best_gains, model)
     run = _run(case.best_gains, model, half)
     for other in case.models_around[:: max(1, len(case.models_around) // _SHOWN)]:
         around = _run(case.best_gains, in_loop(case, other), half)
@@ -77,7 +77,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     assert case.best_gains is not None
     assert case.model is not None
     model = in_loop(case, case.model.model)
-    half = _half(case.best_gains, model)
+    half = step_duration(case.best_gains, model)
     best = _run(case.best_gains, model, half)
     others = distinct_gains(case)[1:]
     columns = _columns(len(others), narrow=narrow)
@@ -147,17 +147,31 @@ def distinct_gains(case: Case) -> tuple[Gains, ...]:
     return tuple(found.values())
 
 
-def _half(gains: Gains, model: TransferFunction) -> float:
-    """Return how long a step is simulated [s]: until it has settled, with some margin."""
+def step_duration(gains: Gains, model: TransferFunction) -> float:
+    """Return how long a step is shown [s]: until it has settled, with some margin.
+
+    :param gains: of the loop.
+    :param model: the process, with all dead time of the loop.
+    """
     slowest = max((abs(t) for t in model.time_constants), default=0.0)
     reset = gains.ti / abs(gains.kc * model.gain) if model.is_stable and gains.ti else gains.ti
     return 2.5 * (2.0 * model.dead_time + max(slowest, gains.ti) + reset)
 
 
+def shown_load(gains: Gains, model: TransferFunction) -> float:
+    """Return the step of the load that is shown after one of the set-point [u].
+
+    It is about half of the command that the step of the set-point needs, in the other direction.
+
+    :param gains: of the loop.
+    :param model: the process, with all dead time of the loop.
+    """
+    return -0.5 / abs(model.gain) if model.is_stable else -0.2 * abs(gains.kc)
+
+
 @functools.lru_cache(maxsize=64)
 def _run(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop | None:
-    # About half of the command that the set-point step needs, in the other direction.
-    load = -0.5 / abs(model.gain) if model.is_stable else -0.2 * abs(gains.kc)
+    load = shown_load(gains, model)
     fine = min(half / _SAMPLES, max(gains.tf, model.dead_time) / 5.0 or math.inf)
     try:
         return simulate_closed_loop(

@@ -94,6 +94,22 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
     :param cases: at least one.
     :param title: of the page; default: the first case's source.
     """
+    environment = _environment()
+    sections = [_section(case, k, len(cases) > 1) for k, case in enumerate(cases, start=1)]
+    return environment.get_template("report.html").render(
+        title=visible(title or cases[0].source),
+        sections=sections,
+        version=relay_autotune.__version__,
+        **_colours(),
+    )
+
+
+def style_sheet() -> str:
+    """Return the report's style sheet, for pages that look like it."""
+    return _environment().get_template("report.css").render(**_colours())
+
+
+def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("relay_autotune.report"),
         autoescape=True,
@@ -111,14 +127,11 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
         "process_text": process_text,
         "mathml": lambda model: Markup(process_mathml(model)),
     }
-    sections = [_section(case, k, len(cases) > 1) for k, case in enumerate(cases, start=1)]
-    return environment.get_template("report.html").render(
-        title=visible(title or cases[0].source),
-        sections=sections,
-        version=relay_autotune.__version__,
-        light=Markup(_variables(0)),
-        night=Markup(f"{_variables(1)} {_NIGHT}"),
-    )
+    return environment
+
+
+def _colours() -> dict[str, Markup]:
+    return {"light": Markup(_variables(0)), "night": Markup(f"{_variables(1)} {_NIGHT}")}
 
 
 def _variables(column: int) -> str:

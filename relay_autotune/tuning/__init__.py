@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -38,6 +39,7 @@ __all__ = [
     "design",
     "ensemble",
     "is_stable",
+    "judged",
     "rule_named",
     "task_of_model",
     "tune",
@@ -126,7 +128,20 @@ def design(task: DesignTask, rule: str) -> Gains:
     :param rule: one of ``RULES``.
     :raises TuningError: as :func:`tune`.
     """
-    controller, reason = rule_named(rule)(task)
+    return judged(task, rule, *rule_named(rule)(task))
+
+
+def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> Gains:
+    """Return what a rule's controller does, with the set-point weight that the options ask for.
+
+    :param task: the process and what is asked of the controller.
+    :param rule: the rule's name.
+    :param controller: what it gives.
+    :param reason: why, a sentence.
+    :raises TuningError: if the loop is unstable on the model or on more than 5 % of those around.
+    """
+    if not math.isnan(task.options.setpoint_weight):
+        controller = replace(controller, b=task.options.setpoint_weight)
     performance = analyse_loop(controller, task.in_loop(task.model), task.options.sample_period)
     warnings = cautions(performance, task)
     if not task.models:

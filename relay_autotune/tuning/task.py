@@ -50,6 +50,9 @@ class DesignOptions:
         lower=1.0,
         open_ended=True,
     )
+    setpoint_weight: float = quantity(
+        math.nan, "", "Set-point weight b; NaN: the rule's own.", lower=0.0, upper=1.0
+    )
     sample_period: float = quantity(
         0.0,
         "s",

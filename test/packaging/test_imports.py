@@ -21,18 +21,20 @@ FLOORS = (
     {"identification"},
     {"loop"},
     {"control", "tuning"},
+    {"shaping"},
     {"analysis"},
     {"running_fit"},
     {"exchange"},
     {"bag"},
     {"report"},
     {"nodes"},
+    {"web"},
     {"cli"},
 )
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in names}
 # What brings ROS in; all else runs without it.
 NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "loop",
-           "control", "tuning", "analysis", "exchange")  # fmt: skip
+           "control", "tuning", "shaping", "analysis", "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

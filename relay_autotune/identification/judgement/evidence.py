@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,6 +73,16 @@ class Evidence:
     settled: bool = False
     loop: Loop | None = None
     driven: Record | None = None
+
+    def with_loop(self, loop: Loop) -> Evidence:
+        """Return the same experiment with some gains; what its record tells is found once.
+
+        :param loop: the gains.
+        """
+        found = replace(self, loop=loop)
+        for name in ("visible", "rivals", "halves", "plain"):
+            found.__dict__[name] = getattr(self, name)
+        return found
 
     @cached_property
     def other(self) -> OtherDirection | None:

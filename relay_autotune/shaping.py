@@ -1,0 +1,48 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A judged model with what the design of gains for it takes, so that other gains can follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from relay_autotune.identification.judgement.evidence import Evidence, Loop
+from relay_autotune.identification.judgement.table import LOOP_CHECKS
+from relay_autotune.tuning import DesignTask, Gains
+from relay_autotune.tuning.ensemble import ensemble_peaks
+from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, judge
+
+
+@dataclass(frozen=True)
+class Shaping:
+    """A model for which gains may be designed, and how these are judged.
+
+    :param task: the process, the models around it, and what was asked of the first gains.
+    :param evidence: the experiment and its model; None: the model was not identified.
+    :param findings: of the checks of the model.
+    """
+
+    task: DesignTask
+    evidence: Evidence | None = None
+    findings: tuple[Finding, ...] = ()
+
+    def judgement(self, gains: Gains) -> Judgement:
+        """Return the judgement of an experiment with some gains.
+
+        :param gains: designed for the task, with any options of the same added delay.
+        """
+        if self.evidence is None:
+            return NOT_JUDGED
+        loop = Loop(
+            controller=gains,
+            ms_of=lambda models: (
+                ensemble_peaks(gains, ModelSet([self.task.in_loop(m) for m in models])).ms
+            ),
+            ms=gains.ms,
+            ms_95=gains.ms_95,
+            added_delay=self.task.options.added_delay,
+        )
+        found = judge(LOOP_CHECKS, self.evidence.with_loop(loop))
+        return Judgement((*self.findings, *found))

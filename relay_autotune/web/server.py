@@ -1,0 +1,359 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The server of the page: a few files, a socket for what is asked, and files to keep."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import mimetypes
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from http import HTTPStatus
+from importlib.resources import files
+from typing import Any
+from urllib.parse import parse_qs
+
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import PeriodicCallback
+from tornado.netutil import bind_sockets
+from tornado.web import Application, HTTPError, RequestHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
+
+from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
+from relay_autotune.escape import visible
+from relay_autotune.loop.gains import Gains
+from relay_autotune.report.page import page as report_page
+from relay_autotune.report.page import style_sheet
+from relay_autotune.tuning import RULES
+from relay_autotune.verdict import Verdict
+from relay_autotune.web import wire
+from relay_autotune.web.address import Address
+from relay_autotune.web.shape import Asked, Subject, asked_of
+from relay_autotune.web.worker import Worker
+
+Export = Callable[[Gains, str, str], str]
+
+_STATIC = ("page.html", "page.css", "page.js", "plot.js")
+# No script, style or connection but those of this server, and no page around ours.
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_LARGEST_QUESTION = 1 << 16
+# Interval of what is told without being asked [s].
+_EVERY = 0.5
+# Answers that are kept beside those of the slider's positions.
+_MOST_KEPT = 2000
+
+
+class Page:
+    """All that a page shows, with the answers that are known.
+
+    :param subjects: the models, at least one.
+    :param exports: the kinds of files that gains can be written into.
+    :param export: returns gains as such a file, with its kind and what makes them doubtful.
+    :param address: where it is served.
+    """
+
+    def __init__(
+        self,
+        subjects: Sequence[Subject],
+        exports: Sequence[str],
+        export: Export,
+        address: Address,
+    ) -> None:
+        self.subjects = tuple(subjects)
+        self.exports = tuple(exports)
+        self.export = export
+        self.address = address
+        self.worker = Worker()
+        """Computes what is asked; what the page shows first, at once."""
+        self._known: dict[tuple[int, Asked], str] = {}
+        self._foreseen = False
+        self.open: set[WebSocketHandler] = set()
+        """Connections of the pages that are open."""
+        for number, subject in enumerate(self.subjects):
+            if subject.shaping is not None:
+                self.worker.later(partial(self._answer, number, subject.first))
+
+    def foresee(self) -> None:
+        """Compute in between what the slider can ask for, once a page is open."""
+        if self._foreseen:
+            return
+        self._foreseen = True
+        for number, subject in enumerate(self.subjects):
+            if subject.shaping is not None:
+                for asked in subject.positions():
+                    self.worker.later(partial(self._answer, number, asked))
+
+    async def answer(self, number: int, asked: Asked) -> str:
+        """Return the answer to what a page asks, as JSON.
+
+        :param number: of the model.
+        :param asked: what is asked for.
+        """
+        known = self._known.get((number, asked))
+        if known is not None:
+            return known
+        return await asyncio.wrap_future(self.worker.ask(partial(self._answer, number, asked)))
+
+    def _answer(self, number: int, asked: Asked) -> str:
+        known = self._known.get((number, asked))
+        if known is not None:
+            return known
+        subject = self.subjects[number]
+        try:
+            told = wire.to_text({"shaped": wire.of_shaped(subject, subject.shaped(asked))})
+        except RelayAutotuneError as error:
+            told = wire.to_text({"refused": visible(str(error))})
+        except Exception as error:  # noqa: BLE001  a defect must not leave the page waiting
+            told = wire.to_text({"refused": defect(error)})
+        if len(self._known) < _MOST_KEPT:
+            self._known[number, asked] = told
+        return told
+
+    def everything(self) -> str:
+        """Return what a page shows whatever is asked, as JSON."""
+        subjects = [wire.of_subject(subject) for subject in self.subjects]
+        return wire.to_text({"subjects": subjects, "exports": list(self.exports)})
+
+
+class _Guarded(RequestHandler):
+    """Answer those who may ask, and allow nothing foreign in what is answered."""
+
+    def initialize(self, page: Page) -> None:
+        """Take the page."""
+        self.page = page
+
+    def set_default_headers(self) -> None:
+        """Forbid all that the page does not need."""
+        self.set_header("Content-Security-Policy", _POLICY)
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.set_header("Referrer-Policy", "no-referrer")
+        self.set_header("Cache-Control", "no-store")
+        self.clear_header("Server")
+
+    def prepare(self) -> None:
+        """Refuse a request under a foreign name, or without the token."""
+        address = self.page.address
+        if not address.admits_host(self.request.headers.get("Host", "")):
+            raise HTTPError(HTTPStatus.FORBIDDEN, reason="This page is not served by that name")
+        if not address.token:
+            return
+        given = self.get_query_argument("token", "")
+        if not address.admits_token(given or self.get_cookie(self._cookie) or ""):
+            raise HTTPError(
+                HTTPStatus.FORBIDDEN, reason="Open the address that the command has printed"
+            )
+        if given:
+            self.set_cookie(self._cookie, given, httponly=True, samesite="Strict")
+
+    @property
+    def _cookie(self) -> str:
+        # Browsers share cookies between the ports of a machine.
+        port = self.request.host.rpartition(":")[2]
+        return f"relay_autotune_{port if port.isdecimal() else 80}"
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        """Answer with one line of text."""
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"{status_code}: {self._reason}\n")
+
+    def subject_and_asked(self) -> tuple[int, Asked]:
+        """Return the model and what is asked for, from the request's query."""
+        given = parse_qs(self.request.query, max_num_fields=10)
+        try:
+            fields = json.loads(given.get("asked", ["{}"])[0])
+            number = int(given.get("of", ["0"])[0])
+            asked = asked_of(fields, tuple(RULES))
+            if not 0 <= number < len(self.page.subjects):
+                raise TuningError("there is no such experiment")
+        except (ValueError, RecursionError) as error:
+            raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not understood") from error
+        return number, asked
+
+
+class _Static(_Guarded):
+    """The page itself, its script and its look."""
+
+    def get(self, name: str) -> None:
+        """Answer with a file."""
+        name = name or "page.html"
+        if name == "favicon.ico":
+            self.set_status(HTTPStatus.NO_CONTENT)
+            return
+        if name not in _STATIC:
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        if name == "page.html" and self.get_query_argument("token", ""):
+            # The token does not stay in the address bar, nor in a bookmark that is passed on.
+            self.redirect("/")
+            return
+        text = (files("relay_autotune.web") / "static" / name).read_text(encoding="utf-8")
+        if name == "page.css":
+            text = f"{style_sheet()}\n{text}"
+        kind = mimetypes.guess_type(name)[0] or "text/plain"
+        self.set_header("Content-Type", f"{kind}; charset=utf-8")
+        self.finish(text)
+
+
+class _Report(_Guarded):
+    """The report with the gains that are asked for, as one file."""
+
+    async def get(self) -> None:
+        """Answer with the report."""
+        number, asked = self.subject_and_asked()
+        subject = self.page.subjects[number]
+
+        def written() -> str:
+            if subject.shaping is None:
+                return report_page([subject.case])
+            return report_page([subject.case_with(subject.shaped(asked))])
+
+        # Figures take seconds to draw, for which the slider must not wait.
+        try:
+            text = await asyncio.to_thread(written)
+        except RelayAutotuneError as error:
+            raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
+        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.set_header("Content-Disposition", 'attachment; filename="tune.html"')
+        self.finish(text)
+
+
+class _Export(_Guarded):
+    """The gains in a file that another program loads."""
+
+    async def get(self, name: str) -> None:
+        """Answer with the file."""
+        if name not in self.page.exports:
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        number, asked = self.subject_and_asked()
+        subject = self.page.subjects[number]
+        try:
+            shaped = await asyncio.wrap_future(
+                self.page.worker.ask(partial(subject.shaped, asked))
+            )
+            judgement = shaped.judgement
+            doubt = judgement.reason if judgement.verdict is Verdict.DOUBTFUL else ""
+            if doubt and self.get_query_argument("accept_doubtful", "") != "yes":
+                raise TuningError("these gains are doubtful, and were not accepted")
+            text = self.page.export(shaped.gains, name, doubt)
+        except RelayAutotuneError as error:
+            raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.set_header("Content-Disposition", f'attachment; filename="{name}.yaml"')
+        self.finish(text)
+
+
+class _Socket(_Guarded, WebSocketHandler):
+    """What one open page asks, and what it is told."""
+
+    def open(self, *_: str, **__: str) -> None:
+        """Tell the page everything, and from then on what is new."""
+        self.set_nodelay(True)
+        self._told: list[int] = [-1] * len(self.page.subjects)
+        self.page.open.add(self)
+        self.page.foresee()
+        self.write_message(self.page.everything())
+        self._news = PeriodicCallback(self._tell_news, 1000.0 * _EVERY)
+        self._news.start()
+
+    def on_close(self) -> None:
+        """Stop telling."""
+        self.page.open.discard(self)
+        self._news.stop()
+
+    async def on_message(self, message: str | bytes) -> None:
+        """Answer what the page asks."""
+        begun = time.perf_counter()
+        try:
+            question = json.loads(message)
+            number, count = question["of"], question["n"]
+            if not (isinstance(number, int) and 0 <= number < len(self.page.subjects)):
+                raise TuningError("there is no such experiment")
+            asked = asked_of(question["asked"], tuple(RULES))
+            answer = await self.page.answer(number, asked)
+        except (TuningError, KeyError, TypeError, ValueError, RecursionError):
+            self.close(1008, "not understood")
+            return
+        took = 1000.0 * (time.perf_counter() - begun)
+        head = wire.to_text({"of": number, "n": count if isinstance(count, int) else 0,
+                             "took": round(took, 3)})  # fmt: skip
+        try:
+            await self.write_message(f'{head[:-1]},"answer":{answer}}}')
+        except WebSocketClosedError:
+            return
+
+    def _tell_news(self) -> None:
+        for number, subject in enumerate(self.page.subjects):
+            known = wire.of_trade_off(subject)
+            if len(known) != self._told[number]:
+                self._told[number] = len(known)
+                self.write_message(wire.to_text({"of": number, "trade_off": known}))
+
+
+def _one_line(error: Exception) -> str:
+    # A reason stands in the head of the answer, which is in Latin letters.
+    return visible(str(error)).encode("ascii", "replace").decode()[:300]
+
+
+def application(page: Page) -> Application:
+    """Return what answers requests.
+
+    :param page: what is shown.
+    """
+    given = {"page": page}
+    return Application(
+        [
+            (r"/socket", _Socket, given),
+            (r"/report.html", _Report, given),
+            (r"/gains/([a-z_]+)", _Export, given),
+            (r"/([a-z.]*)", _Static, given),
+        ],
+        websocket_max_message_size=_LARGEST_QUESTION,
+        websocket_ping_interval=20,
+        log_function=lambda _: None,
+    )
+
+
+async def serve(page: Page, tell: Callable[[str], None]) -> None:
+    """Serve a page until the task is cancelled.
+
+    :param page: what is shown.
+    :param tell: called with the address to open.
+    :raises SelectionError: if the address cannot be used.
+    """
+    address = page.address
+    try:
+        sockets = bind_sockets(address.port, address.host)
+    except OSError as error:
+        raise SelectionError(
+            f"the page cannot be served on {address.host}:{address.port}: {error.strerror}; "
+            "name another with --web-address"
+        ) from error
+    server = HTTPServer(application(page), max_body_size=_LARGEST_QUESTION)
+    server.add_sockets(sockets)
+    tell(address.url(sockets[0].getsockname()[1]))
+    try:
+        await asyncio.Event().wait()
+    finally:
+        page.worker.close()
+        server.stop()
+        for socket in list(page.open):
+            socket.close(1001, "the command has ended")
+        await server.close_all_connections()
+
+
+def run(page: Page, tell: Callable[[str], None]) -> None:
+    """Serve a page until Ctrl-C.
+
+    :param page: what is shown.
+    :param tell: called with the address to open.
+    :raises SelectionError: if the address cannot be used.
+    """
+    try:
+        asyncio.run(serve(page, tell))
+    except KeyboardInterrupt:
+        return

@@ -1,0 +1,366 @@
+// Copyright 2026 the developers of relay_autotune
+// SPDX-License-Identifier: Apache-2.0
+
+// The page: it asks for gains as the controls say, and shows what is answered. All text from the
+// server is set as text, never as markup.
+
+import { Plot } from "./plot.js";
+
+const $ = (id) => document.getElementById(id);
+const pick = (rule) => { asked.rule = rule; showControls(); ask(); };
+const plots = {
+  measurement: new Plot($("plot-measurement"), { label: "Measurement after both steps", y: "measurement [y]" }),
+  command: new Plot($("plot-command"), { label: "Command after both steps", x: "time [s]", y: "command [u]" }),
+  nyquist: new Plot($("plot-nyquist"), { label: "Nyquist curve of the loop", x: "real part", y: "imaginary part" }),
+  trade: new Plot($("plot-trade"), { label: "Robustness and speed of all rules", x: "Ms", y: "IAE after a load step [y s/u]", pick }),
+  record: new Plot($("plot-record"), { label: "Measurement of the experiment, and the model", y: "measurement [y]" }),
+  relay: new Plot($("plot-relay"), { label: "Command of the experiment", x: "time [s]", y: "command [u]" }),
+};
+
+let subjects = [];
+let exports_ = [];
+let chosen = 0;
+let asked = null; // what the controls say
+let shaped = null; // what was answered last
+let trade = [];
+let socket = null;
+let waiting = 0; // number of the question that has no answer yet; 0: none
+let number = 0;
+let changed = false; // the controls changed while an answer was awaited
+let begun = 0;
+
+function put(parent, name, text, kind) {
+  const made = document.createElement(name);
+  if (text !== undefined) made.textContent = text;
+  if (kind) made.className = kind;
+  parent.append(made);
+  return made;
+}
+
+function table(host, rows, cells) {
+  host.replaceChildren();
+  const body = host.tagName === "TBODY" ? host : put(host, "tbody");
+  for (const row of rows) {
+    const line = put(body, "tr");
+    row.forEach((text, k) => {
+      const cell = put(line, k === 0 ? "th" : "td", text, cells[k]);
+      if (k === 0) cell.scope = "row";
+    });
+  }
+}
+
+// What is asked stands in the address, so that a page that is loaded again shows the same.
+function remember() {
+  const words = new URLSearchParams();
+  if (subjects.length > 1) words.set("of", chosen);
+  for (const [name, value] of Object.entries(asked)) if (value !== null) words.set(name, value);
+  history.replaceState(null, "", `#${words}`);
+}
+
+function remembered(subject) {
+  const words = new URLSearchParams(location.hash.slice(1));
+  const found = { ...subject.first };
+  for (const name of Object.keys(found)) {
+    if (!words.has(name)) continue;
+    const text = words.get(name);
+    found[name] = name === "ms" || name === "setpoint_weight" ? Number(text) : text;
+  }
+  const weight = found.setpoint_weight;
+  const known = [subject.first.rule, ...subject.rules.map((each) => each.rule)];
+  const fine = known.includes(found.rule) && (weight === null || (weight >= 0 && weight <= 1)) && found.ms >= 1.2 && found.ms <= 4 && ["auto", "pi", "pid"].includes(found.controller);
+  return fine ? found : { ...subject.first };
+}
+
+function ask() {
+  const subject = subjects[chosen];
+  remember();
+  document.body.dataset.settled = "no";
+  if (!subject.may_shape || !socket || socket.readyState !== WebSocket.OPEN) return;
+  if (waiting) { changed = true; return; }
+  number += 1;
+  waiting = number;
+  changed = false;
+  begun = performance.now();
+  socket.send(JSON.stringify({ of: chosen, n: number, asked }));
+}
+
+function showControls() {
+  const subject = subjects[chosen];
+  const [low, high, step] = subject.slider;
+  const slider = $("ms");
+  Object.assign(slider, { min: Math.min(low, asked.ms), max: Math.max(high, asked.ms), step });
+  slider.value = asked.ms;
+  $("ms-value").textContent = asked.ms.toFixed(2);
+  for (const input of document.querySelectorAll("input[name=controller]")) {
+    input.checked = input.value === asked.controller;
+  }
+  const rules = subject.rules.map((each) => each.rule);
+  if (!rules.includes(asked.rule)) rules.unshift(asked.rule);
+  $("rule").replaceChildren();
+  for (const rule of rules) {
+    const option = put($("rule"), "option", rule);
+    option.value = rule;
+    option.selected = rule === asked.rule;
+  }
+  const own = asked.setpoint_weight === null;
+  $("own-weight").checked = own;
+  $("weight").disabled = own;
+  if (!own) $("weight").value = asked.setpoint_weight;
+}
+
+function showVerdict(verdict, checks) {
+  const chip = $("verdict");
+  if (chip.textContent !== verdict.text) chip.textContent = verdict.text;
+  chip.className = `chip ${verdict.tone}`;
+  $("marks").replaceChildren();
+  $("checks").replaceChildren();
+  for (const [mark, tone, name, value, meaning] of checks) {
+    const small = put($("marks"), "li", undefined, tone);
+    put(small, "span", mark, "mark").setAttribute("aria-hidden", "true");
+    put(small, "span", name, "check-name");
+    small.title = meaning;
+    small.setAttribute("aria-label", `${name}: ${{ good: "passed", warn: "doubtful", bad: "failed" }[tone]}`);
+    const item = put($("checks"), "li", undefined, tone);
+    put(item, "span", mark, "mark").setAttribute("aria-hidden", "true");
+    const what = put(item, "span", undefined, "what");
+    put(what, "b", name);
+    what.append(` ${value}`);
+    put(item, "span", meaning, "why");
+  }
+}
+
+function showTrade() {
+  const subject = subjects[chosen];
+  const marks = subject.rules
+    .filter((each) => each.rule !== "robust" && each.ms[0] !== null && each.ms[1] !== null && each.ms[0] <= 4)
+    .map((each) => ({ x: each.ms[0], y: each.ms[1], kind: each.rule === asked.rule ? "chosen" : "rule", name: each.rule }));
+  if (shaped) marks.push({ x: shaped.at[0], y: shaped.at[1], kind: "here", name: "" });
+  const curves = ["pi", "pid"].map((kind) => {
+    const points = trade.filter((p) => p[0] === kind && p[2] !== null).sort((a, b) => a[1] - b[1]);
+    return { x: points.map((p) => p[1]), y: points.map((p) => p[2]), kind, name: kind.toUpperCase() };
+  }).filter((curve) => curve.x.length > 1);
+  const said = shaped ? `here Ms ${shaped.at[0]}, IAE ${shaped.at[1]} y s/u` : "";
+  plots.trade.draw({ curves, marks, said });
+}
+
+function showShaped() {
+  const s = shaped;
+  showVerdict(s.verdict, s.checks);
+  $("gains").textContent = s.isa.filter(([name, value]) => value !== "0" && name !== "tf")
+    .map(([name, value, unit]) => `${name} ${value}${unit ? ` ${unit}` : ""}`).join("   ");
+  table($("isa"), s.isa, ["", "number", "unit", "meaning"]);
+  table($("parallel"), s.parallel, ["", "number", "unit"]);
+  table($("effects"), s.effects, ["", "", "interval"]);
+  $("beside-box").hidden = !s.beside.length;
+  table($("beside"), s.beside, ["", "", "", "text"]);
+  $("why").textContent = `Rule ${s.rule}: ${s.reason}`;
+  $("notes").hidden = !s.warnings.length;
+  $("warnings").replaceChildren();
+  for (const text of s.warnings) put($("warnings"), "li", text);
+  $("weight-value").textContent = s.b.toFixed(2);
+  if (asked.setpoint_weight === null) $("weight").value = s.b;
+  $("command").textContent = s.command;
+  const t = s.steps;
+  const end = t.time[t.time.length - 1];
+  const load = [{ x: t.load_time, kind: "load" }];
+  const highest = Math.max(...t.measurement.filter((v) => v !== null));
+  plots.measurement.draw({
+    xs: [0, end],
+    ys: [Math.max(-1, Math.min(-0.1, ...t.measurement)), Math.min(2.5, Math.max(1.6, 1.1 * highest))],
+    bands: [{ x: t.time, low: t.low, high: t.high, kind: "", name: "95 % of the models" }].filter((b) => b.low.length),
+    curves: [{ x: t.time, y: t.measurement, kind: "model", name: "the model" }],
+    lines: [...load, { y: 1, kind: "setpoint" }],
+    said: `highest ${highest.toFixed(2)} after a set-point step of 1`,
+  });
+  plots.command.draw({ xs: [0, end], curves: [{ x: t.time, y: t.command, kind: "command" }], lines: load });
+  const circle = { x: [], y: [], kind: "limit", name: `Ms ${s.ms.toFixed(2)}` };
+  for (let k = 0; k <= 90; k += 1) {
+    circle.x.push(-1 + Math.cos((k * Math.PI) / 45) / s.ms);
+    circle.y.push(Math.sin((k * Math.PI) / 45) / s.ms);
+  }
+  plots.nyquist.draw({
+    square: true, xs: [-2.3, 1.3], ys: [-2.0, 1.2], areas: s.nyquist.band,
+    curves: [circle, { x: s.nyquist.re, y: s.nyquist.im, kind: "loop", name: "loop" }],
+    marks: [{ x: -1, y: 0, kind: "point", name: "-1" }],
+    said: `it comes as near to -1 as ${(1 / s.ms).toFixed(2)}`,
+  });
+  showTrade();
+}
+
+function showRefused(text) {
+  $("refused").hidden = false;
+  $("refused").textContent = text;
+  $("gains").textContent = "no gains";
+  $("verdict").textContent = "no gains";
+  $("verdict").className = "chip bad";
+  for (const id of ["isa", "parallel", "effects", "beside"]) $(id).replaceChildren();
+  $("command").textContent = "";
+  for (const name of ["measurement", "command", "nyquist"]) plots[name].draw({ curves: [] });
+}
+
+function showSubject() {
+  const subject = subjects[chosen];
+  $("name").textContent = subject.name;
+  document.title = `${subject.name} - relay_autotune`;
+  $("facts").replaceChildren();
+  for (const text of subject.facts) put($("facts"), "li", text);
+  $("shape").hidden = !subject.may_shape;
+  $("calm-fast").hidden = !subject.may_shape;
+  $("reason").hidden = !subject.reason || subject.may_shape;
+  $("reason").textContent = subject.reason;
+  showVerdict(subject.verdict, subject.checks);
+  $("process").textContent = subject.process;
+  $("structure").textContent = subject.structure && `structure ${subject.structure}`;
+  table($("estimates"), subject.estimates, ["", "", "unit", "interval"]);
+  $("record").hidden = !subject.record;
+  if (subject.record) {
+    const r = subject.record;
+    const curves = [{ x: r.time, y: r.measurement, kind: "measured", name: "measurement" }];
+    if (r.model) curves.push({ x: r.model[0], y: r.model[1], kind: "model", name: "model" });
+    plots.record.draw({ curves });
+    plots.relay.draw({ curves: [{ x: r.command[0], y: r.command[1], kind: "command" }] });
+  }
+  $("keep").replaceChildren();
+  const keep = (words, work) => {
+    const button = put($("keep"), "button", words);
+    button.type = "button";
+    button.addEventListener("click", work);
+  };
+  keep("Report as one file", () => download("report.html", "tune.html", {}));
+  for (const name of exports_) keep(`Gains for ${name}`, () => exportGains(name));
+  $("tabs").hidden = subjects.length < 2;
+  $("tabs").replaceChildren();
+  subjects.forEach((each, k) => {
+    const button = put($("tabs"), "button", each.name);
+    button.type = "button";
+    button.setAttribute("aria-pressed", String(k === chosen));
+    button.addEventListener("click", () => choose(k));
+  });
+}
+
+function choose(k) {
+  chosen = k;
+  shaped = null;
+  trade = trades[k] || [];
+  asked = remembered(subjects[k]);
+  showSubject();
+  showControls();
+  ask();
+}
+const trades = [];
+
+// Resolves to true if the user agrees to what the question says will happen.
+function agreed(question, yes) {
+  const dialog = $("question");
+  $("question-text").textContent = question;
+  $("question-yes").textContent = yes;
+  dialog.showModal();
+  return new Promise((resolve) => {
+    const end = (answer) => { dialog.close(); resolve(answer); };
+    $("question-yes").onclick = () => end(true);
+    $("question-no").onclick = () => end(false);
+    dialog.oncancel = () => resolve(false);
+  });
+}
+
+async function exportGains(name) {
+  const more = {};
+  if (shaped && shaped.doubtful) {
+    if (!(await agreed(`These gains are doubtful: ${shaped.doubtful}. The file will say so.`, "Write them all the same"))) return;
+    more.accept_doubtful = "yes";
+  }
+  await download(`gains/${name}`, `${name}.yaml`, more);
+}
+
+async function download(path, file, more) {
+  const words = new URLSearchParams({ of: chosen, asked: JSON.stringify(asked), ...more });
+  $("kept").textContent = `writing ${file}`;
+  try {
+    const answer = await fetch(`${path}?${words}`);
+    if (!answer.ok) throw new Error(await answer.text());
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(await answer.blob());
+    link.download = file;
+    link.click();
+    URL.revokeObjectURL(link.href);
+    $("kept").textContent = `${file} is among your downloads`;
+  } catch (error) {
+    $("kept").textContent = `${file} was not written: ${error.message}`;
+  }
+}
+
+function take(message) {
+  if (message.subjects) {
+    subjects = message.subjects;
+    exports_ = message.exports;
+    const of = Number(new URLSearchParams(location.hash.slice(1)).get("of"));
+    choose(of >= 0 && of < subjects.length ? of : 0);
+    return;
+  }
+  if (message.trade_off) {
+    trades[message.of] = message.trade_off;
+    if (message.of === chosen) { trade = message.trade_off; showTrade(); }
+    return;
+  }
+  if (message.n === waiting) waiting = 0;
+  if (message.of === chosen) {
+    if (message.answer.shaped) {
+      shaped = message.answer.shaped;
+      $("refused").hidden = true;
+      showShaped();
+    } else {
+      shaped = null;
+      showRefused(message.answer.refused);
+    }
+    document.body.dataset.shown = message.n;
+    document.body.dataset.took = (performance.now() - begun).toFixed(1);
+  }
+  if (changed) ask();
+  else if (!waiting) document.body.dataset.settled = "yes";
+}
+
+function connect() {
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
+  socket.addEventListener("open", () => { $("gone").hidden = true; waiting = 0; });
+  socket.addEventListener("message", (event) => take(JSON.parse(event.data)));
+  socket.addEventListener("close", () => {
+    $("gone").hidden = false;
+    $("gone").textContent = "The command that serves this page has ended, or cannot be reached; the page shows what it knew last.";
+    setTimeout(connect, 1000);
+  });
+}
+
+$("ms").addEventListener("input", () => {
+  asked.ms = Number($("ms").value);
+  $("ms-value").textContent = asked.ms.toFixed(2);
+  ask();
+});
+for (const input of document.querySelectorAll("input[name=controller]")) {
+  input.addEventListener("change", () => { asked.controller = input.value; ask(); });
+}
+$("rule").addEventListener("change", () => { asked.rule = $("rule").value; ask(); });
+$("own-weight").addEventListener("change", () => {
+  asked.setpoint_weight = $("own-weight").checked ? null : Number($("weight").value);
+  showControls();
+  ask();
+});
+$("weight").addEventListener("input", () => {
+  asked.setpoint_weight = Number($("weight").value);
+  $("weight-value").textContent = asked.setpoint_weight.toFixed(2);
+  ask();
+});
+$("copy").addEventListener("click", async () => {
+  try {
+    await navigator.clipboard.writeText($("command").textContent);
+    $("kept").textContent = "The command is in the clipboard.";
+  } catch {
+    getSelection().selectAllChildren($("command"));
+    $("kept").textContent = "The command is selected: copy it.";
+  }
+});
+$("theme").addEventListener("click", () => {
+  const root = document.documentElement;
+  const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+  root.dataset.theme = dark ? "light" : "dark";
+});
+connect();

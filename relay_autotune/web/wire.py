@@ -1,0 +1,203 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What goes to the browser: words and numbers as the report has them, and curves as short lists.
+
+The page shows every text as text, so nothing is escaped here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.escape import visible
+from relay_autotune.report.case import Case, Estimate
+from relay_autotune.report.findings import (
+    beside_present,
+    checks_of,
+    facts_of,
+    verdict_of,
+    warnings_of,
+)
+from relay_autotune.report.style import in_steps, thinned
+from relay_autotune.text import digits, process_text
+from relay_autotune.verdict import Verdict
+from relay_autotune.web.shape import CALM, FAST, STEP, Asked, Shaped, Subject
+
+FloatArray = NDArray[np.floating]
+
+# Significant digits of a curve relative to its largest value: finer than a pixel.
+_DIGITS = 4
+
+
+def to_text(document: dict[str, Any]) -> str:
+    """Return a document as JSON without any number that JSON does not know."""
+    return json.dumps(document, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+
+
+def _short(values: FloatArray) -> list[float | None]:
+    """Return numbers with few digits; None stands for one that is not finite."""
+    finite = np.isfinite(values)
+    largest = float(np.abs(values[finite]).max(initial=0.0))
+    decimals = _DIGITS - math.floor(math.log10(largest)) if largest > 0.0 else 0
+    rounded = np.round(np.where(finite, values, 0.0), decimals).tolist()
+    return [v if f else None for v, f in zip(rounded, finite.tolist(), strict=True)]
+
+
+def of_subject(subject: Subject) -> dict[str, Any]:
+    """Return what a page shows of a model whatever the gains are.
+
+    :param subject: the model.
+    """
+    case = subject.case
+    model = case.model
+    return {
+        "name": visible(case.source),
+        "facts": [visible(fact) for fact in facts_of(case, with_id=True)] if case.samples else [],
+        "verdict": _verdict(case),
+        "checks": _checks(case),
+        "reason": visible(case.reason),
+        "process": "" if model is None else process_text(model.model),
+        "structure": "" if model is None else model.model.structure,
+        "estimates": []
+        if model is None
+        else [_estimate(e) for e in (*model.estimates, *model.ultimate)],
+        "record": _record(case),
+        "rules": [
+            {"rule": g.rule, "ms": _short(np.array([g.ms, g.iae_load]))} for g in case.gains
+        ],
+        "may_shape": subject.shaping is not None,
+        "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
+        "first": of_asked(subject.first),
+        "slider": [CALM, FAST, STEP],
+    }
+
+
+def of_asked(asked: Asked) -> dict[str, Any]:
+    """Return what is asked of the gains, as the page sends it back."""
+    return dict(vars(asked))
+
+
+def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
+    """Return gains and what they do.
+
+    :param subject: the model.
+    :param shaped: the gains.
+    """
+    case, gains, steps = subject.case_with(shaped), shaped.gains, shaped.steps
+    parallel = [("p", gains.p, "u/y"), ("i", gains.i, "u/(y s)"), ("d", gains.d, "u s/y")]
+    isa = [
+        ("kc", gains.kc, "u/y", "proportional gain"),
+        ("ti", gains.ti, "s", "integral time"),
+        ("td", gains.td, "s", "derivative time"),
+        ("tf", gains.tf, "s", "filter of the measurement"),
+        ("b", gains.b, "", "weight of the set-point"),
+    ]
+    notes = [visible(text) for text in warnings_of(case)]
+    if shaped.unstable:
+        count = len(subject.shaping.task.models) if subject.shaping is not None else 0
+        notes.append(f"On {shaped.unstable} of {count} models around, the loop is unstable.")
+    return {
+        "asked": of_asked(shaped.asked),
+        "rule": gains.rule,
+        "reason": visible(gains.reason),
+        "verdict": _verdict(case),
+        "checks": _checks(case),
+        "doubtful": visible(shaped.judgement.reason)
+        if shaped.judgement.verdict is Verdict.DOUBTFUL
+        else "",
+        "warnings": notes,
+        "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
+        "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
+        "effects": _effects(subject, shaped),
+        "beside": [[r.name, r.present, r.new, r.meaning] for r in beside_present(case)],
+        "at": _short(np.array([gains.ms, gains.iae_load])),
+        "b": gains.b,
+        "ms": gains.ms,
+        "steps": {
+            "time": _short(steps.time),
+            "measurement": _short(steps.measurement),
+            "command": _short(steps.command),
+            "low": _short(steps.low),
+            "high": _short(steps.high),
+            "load_time": steps.load_time,
+        },
+        "nyquist": {
+            "re": _short(shaped.curve.loop.real),
+            "im": _short(shaped.curve.loop.imag),
+            "band": [_short(part.ravel()) for part in shaped.curve.band],
+        },
+        "command": visible(case.command),
+    }
+
+
+def of_trade_off(subject: Subject) -> list[list[Any]]:
+    """Return Ms and IAE of the controllers that are known so far, each with its kind."""
+    return [
+        ["pid" if gains.td > 0.0 else "pi", *_short(np.array([gains.ms, gains.iae_load]))]
+        for _, gains in subject.trade_off()
+    ]
+
+
+def _effects(subject: Subject, shaped: Shaped) -> list[list[str]]:
+    gains = shaped.gains
+    rows = [
+        ["Ms", digits(gains.ms, 3), "below 1.4 careful, above 2 risky"],
+        ["Ms of 95 %", digits(gains.ms_95, 3), "of the models around stay below"],
+        ["Mt", digits(gains.mt, 3), ""],
+        ["gain margin", digits(gains.gain_margin, 3), "factor by which the gain may grow"],
+        ["phase margin", f"{digits(math.degrees(gains.phase_margin), 3)}°", ""],
+        ["delay margin", f"{digits(gains.delay_margin, 3)} s", "dead time that may be added"],
+        ["IAE, load", f"{digits(gains.iae_load, 3)} y s/u", "after a unit step of the load"],
+        ["overshoot", f"{digits(100.0 * gains.overshoot, 2)} %", "after a step of the set-point"],
+        ["settles in", f"{digits(gains.settling_time, 3)} s", "to within 2 %"],
+    ]
+    noise = math.nan
+    if subject.shaping is not None:
+        noise = gains.noise_gain * subject.shaping.task.options.noise_std
+    if math.isfinite(noise):
+        rows.append(["noise", f"{digits(noise, 2)} u", "standard deviation in the command"])
+    return rows
+
+
+def _verdict(case: Case) -> dict[str, str]:
+    chip = verdict_of(case)
+    return {"text": chip.text, "tone": chip.tone, "why": visible(case.judgement.reason)}
+
+
+def _checks(case: Case) -> list[list[str]]:
+    return [
+        [c.mark, c.tone, c.name, visible(c.value), visible(c.meaning)] for c in checks_of(case)
+    ]
+
+
+def _estimate(estimate: Estimate) -> list[str]:
+    interval = "not estimated"
+    if math.isfinite(estimate.low):
+        interval = f"{digits(estimate.low)} to {digits(estimate.high)}"
+    if not estimate.determined:
+        interval += ", not determined"
+    return [estimate.title, digits(estimate.value), estimate.unit, interval]
+
+
+def _record(case: Case) -> dict[str, Any] | None:
+    record = case.record
+    if record is None:
+        return None
+    time, measurement = thinned(record.time, record.measurement)
+    held, command = in_steps(record.time, record.command)
+    found = {
+        "time": _short(time),
+        "measurement": _short(measurement),
+        "command": [_short(part) for part in thinned(held, command)],
+        "model": None,
+    }
+    model = case.model
+    if model is not None and model.fitted.size == len(record):
+        found["model"] = [_short(part) for part in thinned(record.time, model.fitted)]
+    return found

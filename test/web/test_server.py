@@ -1,0 +1,217 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Who is served, with what, and what a page is told."""
+
+import asyncio
+from dataclasses import replace
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+from served import HOSTILE, analysed, conversation, hostile, served, subject_of
+from tornado.httpclient import HTTPClientError
+
+from relay_autotune.errors import SelectionError
+from relay_autotune.verdict import Judgement
+from relay_autotune.web.address import Address, address_of
+from relay_autotune.web.server import Page, serve
+from relay_autotune.web.shape import Subject
+
+
+@pytest.fixture(scope="module")
+def subject():
+    return subject_of(analysed())
+
+
+@pytest.fixture(scope="module")
+def url(subject):
+    with served([subject]) as found:
+        yield found
+
+
+def get(url: str, **headers: str):
+    try:
+        with urlopen(Request(url, headers=headers), timeout=60.0) as answer:
+            return answer.status, dict(answer.headers), answer.read().decode()
+    except HTTPError as error:
+        return error.code, dict(error.headers), error.read().decode()
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["", "page.css", "page.js", "plot.js", "report.html?of=7", "gains/yaml", "nothing"],
+)
+def test_every_answer_forbids_what_is_foreign(url, path):
+    _, headers, _ = get(url + path)
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src 'self';" in policy
+    assert "unsafe" not in policy
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert "Server" not in headers
+
+
+def test_the_page_has_no_script_or_style_of_its_own_and_names_no_other_server(url):
+    _, _, text = get(url)
+    assert "<style" not in text
+    assert " style=" not in text
+    assert " on" not in text.replace(" on the", "").replace(" one", "")
+    assert text.count("<script") == text.count('<script type="module" src="page.js">') == 1
+    for path in ("", "page.js", "plot.js", "page.css"):
+        assert "//" not in get(url + path)[2].replace("http://www.w3.org/2000/svg", "").replace(
+            '${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket', ""
+        ).replace("\n//", "").replace("// ", "")
+    script = get(url + "page.js")[2] + get(url + "plot.js")[2]
+    for markup in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("):
+        assert markup not in script
+
+
+def test_what_is_not_there_is_not_found(url):
+    assert get(url + "server.py")[0] == 404
+    assert get(url + "gains/exe")[0] == 404
+    assert get(url + "report.html?asked=%7B")[0] == 400
+    assert get(url + "report.html?of=7")[0] == 400
+
+
+def test_a_foreign_name_is_not_served(url):
+    assert get(url, Host="tank.example:80")[0] == 403
+    assert get(url, Host="localhost:8080")[0] == 200
+
+
+def test_a_page_of_a_stranger_cannot_open_the_socket(url):
+    with pytest.raises(HTTPClientError, match="403"):
+        conversation(url, headers={"Origin": "http://tank.example"})
+
+
+def test_the_socket_tells_everything_and_answers(url, subject):
+    first, answer, refused = conversation(
+        url,
+        {"of": 0, "n": 7, "asked": {"ms": 1.6, "controller": "pi"}},
+        {"of": 0, "n": 8, "asked": {"rule": "unstable"}},
+    )
+    assert first["subjects"][0]["name"] == "a bag"
+    assert first["subjects"][0]["around"] == 100
+    assert answer["n"] == 7
+    shaped = subject.shaped(
+        next(a for a in subject.positions() if (a.controller, a.ms) == ("pi", 1.6))
+    )
+    assert answer["answer"]["shaped"]["isa"][0][1] == f"{shaped.gains.kc:.4f}"
+    assert "unstable" in refused["answer"]["refused"]
+
+
+@pytest.mark.parametrize(
+    "question", ["no json", "[]", "{}", '{"of": 3, "n": 1, "asked": {}}', '{"of": "0", "n": 1}',
+                 {"of": 0, "n": 1, "asked": {"rule": "os.system"}}, "[" * 5000],
+)  # fmt: skip
+def test_a_question_that_cannot_be_ends_the_connection(url, question):
+    assert conversation(url, question)[-1] is None
+
+
+def test_five_pages_at_once_have_answers_of_their_own(url):
+    async def all_of_them():
+        asked = [{"of": 0, "n": k, "asked": {"ms": 1.3 + 0.1 * k}} for k in range(5)]
+        return await asyncio.gather(*(asyncio.to_thread(conversation, url, a) for a in asked))
+
+    found = [heard[1]["answer"]["shaped"]["ms"] for heard in asyncio.run(all_of_them())]
+    assert found == sorted(found)
+    assert len(set(found)) == 5
+
+
+def test_gains_are_kept_in_a_file(url):
+    status, headers, text = get(url + "gains/yaml?asked=%7B%22ms%22%3A1.6%7D")
+    assert status == 200
+    assert text.startswith("yaml 0.8")
+    assert headers["Content-Disposition"] == 'attachment; filename="yaml.yaml"'
+
+
+def test_the_report_has_the_gains_that_were_shaped(url, subject, monkeypatch):
+    # its figures take seconds, and have tests of their own
+    monkeypatch.setattr("relay_autotune.report.page.PLATES", ())
+    status, _, text = get(url + "report.html?asked=%7B%22rule%22%3A%22simc%22%7D")
+    assert status == 200
+    assert "rule <code>simc</code>" in text
+    assert "replay 1.4" in text
+
+
+def test_doubtful_gains_are_written_only_when_they_are_accepted(subject, monkeypatch):
+    finding = replace(subject.shaping.findings[0], result=1, sentence="the data drift", remedy="x")
+    doubtful = Subject(subject.case, subject.shaping, subject.first, subject.command)
+    monkeypatch.setattr(
+        type(subject.shaping), "judgement", lambda self, gains: Judgement((finding,))
+    )
+    with served([doubtful]) as url:
+        status, _, text = get(url + "gains/yaml")
+        assert status == 409
+        assert "doubtful" in text
+        status, _, text = get(url + "gains/yaml?accept_doubtful=yes")
+        assert status == 200
+        assert "the data drift" in text
+
+
+def test_hostile_names_travel_as_text(subject):
+    with served([hostile(subject)]) as url:
+        (first,) = conversation(url)
+        assert first["subjects"][0]["name"] == HOSTILE
+        assert HOSTILE not in get(url)[2]
+
+
+def test_another_address_needs_its_token(subject):
+    address = Address("127.0.0.1", 0, "right")
+    with served([subject], address) as url:
+        assert url.endswith("/?token=right")
+        base = url.partition("?")[0]
+        for wrong in ("", "?token=wrong", "?token="):
+            assert get(base + wrong)[0] == 403
+        for path in ("page.js", "report.html", "gains/yaml"):
+            assert get(base + path)[0] == 403
+        with pytest.raises(HTTPClientError, match="403"):
+            conversation(base)
+        port = base.rsplit(":")[-1].strip("/")
+        cookie = f"relay_autotune_{port}=right"
+        assert get(base, Cookie=cookie)[0] == 200
+        assert conversation(base, headers={"Cookie": cookie})[0]["subjects"]
+        assert get(base, Cookie=cookie + "x")[0] == 403
+
+
+def test_the_token_does_not_stay_in_the_address(subject):
+    with served([subject], Address("127.0.0.1", 0, "right")) as url:
+        import http.client
+
+        port = int(url.partition("?")[0].rsplit(":")[-1].strip("/"))
+        connection = http.client.HTTPConnection("127.0.0.1", port)
+        connection.request("GET", "/?token=right")
+        answer = connection.getresponse()
+        assert answer.status == 302
+        assert answer.headers["Location"] == "/"
+        assert "HttpOnly" in answer.headers["Set-Cookie"]
+        assert "SameSite=Strict" in answer.headers["Set-Cookie"]
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [("127.0.0.1", "127.0.0.1", 0), ("localhost:8080", "localhost", 8080), ("[::1]:9", "::1", 9)],
+)
+def test_a_loopback_address_needs_no_token(text, host, port):
+    assert address_of(text) == Address(host, port)
+
+
+def test_every_other_address_gets_a_token_of_its_own():
+    first, second = address_of("0.0.0.0:8080"), address_of("0.0.0.0:8080")
+    assert len(first.token) >= 20
+    assert first.token != second.token
+    assert first.token not in repr(first)
+    assert f"?token={first.token}" in first.url(8080)
+
+
+@pytest.mark.parametrize("text", ["", ":80", "a b", "host:port", "1.2.3.4:99999", "x/y", "a@b"])
+def test_what_is_no_address_is_refused(text):
+    with pytest.raises(SelectionError, match="not an address"):
+        address_of(text)
+
+
+def test_an_address_that_is_taken_is_refused_in_one_line(url, subject):
+    port = int(url.rsplit(":")[-1].strip("/"))
+    page = Page([subject], (), lambda *_: "", Address("127.0.0.1", port))
+    with pytest.raises(SelectionError, match="--web-address"):
+        asyncio.run(serve(page, lambda _: None))

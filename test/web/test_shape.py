@@ -1,0 +1,185 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The page's numbers are those of `replay`, and its curves those of an exact simulation."""
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from served import REPOSITORY, analysed, subject_of
+
+from relay_autotune.analysis import analyse
+from relay_autotune.cli import page, replay
+from relay_autotune.cli.arguments import as_typed
+from relay_autotune.errors import TuningError
+from relay_autotune.identification.result import FitReport
+from relay_autotune.loop.closed_loop import simulate_closed_loop
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Outcome
+from relay_autotune.report.case import Case, ModelCase
+from relay_autotune.report.loops import shown_load
+from relay_autotune.shaping import Shaping
+from relay_autotune.tuning import DesignOptions, task_of_model
+from relay_autotune.verdict import Verdict
+from relay_autotune.web import wire
+from relay_autotune.web.shape import Asked, Subject, asked_of
+
+
+@pytest.fixture(scope="module")
+def analysis():
+    return analysed()
+
+
+@pytest.fixture(scope="module")
+def subject(analysis):
+    return subject_of(analysis)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [Asked(controller="pi", ms=1.7), Asked("simc", setpoint_weight=0.25)],
+)
+def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
+    analysis, subject, asked
+):
+    weight = {} if asked.setpoint_weight is None else {"setpoint_weight": asked.setpoint_weight}
+    options = DesignOptions(controller=asked.controller, ms=asked.ms, **weight)
+    expected = analyse(analysis.record, rule=asked.rule, options=options)
+    found = subject.shaped(asked)
+    assert found.gains == expected.best_gains
+    assert found.judgement == expected.judgement
+
+
+def given(model: TransferFunction) -> Subject:
+    case = Case(
+        "a model", "", 0.0, 0.0, Outcome.UNKNOWN, "",
+        (ModelCase("given", model, (), (), FitReport()),), 0,
+    )  # fmt: skip
+    return Subject(case, Shaping(task_of_model(model)), Asked(), lambda _: "tune")
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        TransferFunction.fopdt(1.65, 20.0, 10.0),
+        TransferFunction.fopdt(-0.4, 3.0, 6.0),
+        TransferFunction(0.05, time_constants=(4.0,), integrators=1, dead_time=2.0),
+    ],
+    ids=["lag", "negative", "integrating"],
+)
+def test_the_steps_are_those_of_an_exact_simulation(model):
+    found = given(model).shaped(Asked(ms=1.6))
+    steps, gains = found.steps, found.gains
+    period = steps.load_time / 2000.0
+    exact = simulate_closed_loop(
+        gains, model, period=period, duration=2.0 * steps.load_time, setpoint=1.0,
+        load=shown_load(gains, model), load_time=steps.load_time,
+    )  # fmt: skip
+    expected = np.interp(steps.time, exact.time, exact.measurement)
+    assert np.max(np.abs(steps.measurement - expected)) < 0.02
+    later = steps.time > 0.02 * steps.load_time
+    expected = np.interp(steps.time, exact.time, exact.command)
+    assert np.median(np.abs(steps.command - expected)[later]) < 0.01 * np.ptp(exact.command)
+    assert steps.low.size == 0
+
+
+def test_the_band_holds_most_models_and_the_model_itself(subject):
+    found = subject.shaped(Asked())
+    steps = found.steps
+    assert np.all(steps.low <= steps.high)
+    inside = (steps.low <= steps.measurement) & (steps.measurement <= steps.high)
+    assert np.mean(inside) > 0.9
+    assert 0.0 < np.max(steps.high - steps.low) < 0.1
+
+
+def test_calmer_gains_are_slower_and_all_positions_are_asked_once(subject):
+    calm, fast = subject.shaped(Asked(ms=1.2)), subject.shaped(Asked(ms=2.0))
+    assert calm.gains.ms < fast.gains.ms
+    assert calm.gains.iae_load > fast.gains.iae_load
+    positions = list(subject.positions())
+    assert len(set(positions)) == len(positions) == 3 * 41
+    assert {kind for kind, _ in subject.trade_off()} <= {"auto", "pi", "pid"}
+
+
+def test_an_aborted_experiment_gives_no_gains(analysis):
+    from dataclasses import replace
+
+    aborted = analyse(replace(analysis.record, outcome=Outcome.ABORTED, reason="a button"))
+    assert aborted.shaping is None
+    shown = subject_of(aborted)
+    with pytest.raises(TuningError, match="aborted"):
+        shown.shaped(Asked())
+    assert wire.of_subject(shown)["may_shape"] is False
+    assert wire.of_subject(shown)["verdict"]["tone"] == "bad"
+
+
+def test_what_goes_to_the_browser_is_json_with_the_words_of_the_report(subject):
+    shaped = subject.shaped(Asked())
+    document = json.loads(wire.to_text(wire.of_shaped(subject, shaped)))
+    assert document["isa"][0][:3] == ["kc", f"{shaped.gains.kc:.4f}", "u/y"]
+    assert document["verdict"]["text"] == "gains ready to use"
+    assert len(document["checks"]) == len(shaped.judgement.findings)
+    assert len(wire.to_text(document)) < 100_000
+    assert shaped.judgement.verdict is Verdict.TRUSTED
+
+
+def test_no_number_that_json_does_not_know_goes_out():
+    found = given(TransferFunction(0.05, integrators=1, dead_time=2.0))
+    text = wire.to_text(wire.of_shaped(found, found.shaped(Asked(controller="pi"))))
+    assert not {"NaN", "Infinity"} & set(text.replace(":", " ").replace(",", " ").split())
+    assert wire.to_text(wire.of_subject(found))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [None, [], {"rule": "none"}, {"rule": ["simc"]}, {"controller": {}}, {"ms": "1"},
+     {"ms": True}, {"ms": float("nan")}, {"ms": 9}, {"setpoint_weight": -1}],
+)  # fmt: skip
+def test_what_cannot_be_asked_is_refused(fields):
+    with pytest.raises(TuningError):
+        asked_of(fields, ("robust", "simc"))
+
+
+def test_the_command_line_that_is_shown_gives_the_same_again(tmp_path):
+    parser = replay._parser()
+    bag = str(REPOSITORY / "bags" / "biased_relay")
+    options = parser.parse_args(["--web", "--pi", "--present", "0.4", "20", "0", bag])
+    typed = as_typed(
+        "replay", parser, options, web=None, web_address=None,
+        **vars(Asked("robust", "pid", 1.62, 0.3)),
+    )  # fmt: skip
+    words = shlex.split(typed)
+    assert words[0] == "replay"
+    again = parser.parse_args(words[1:])
+    assert (again.controller, again.ms, again.setpoint_weight) == ("pid", 1.62, 0.3)
+    assert again.present == [0.4, 20.0, 0.0]
+    assert again.bags == [bag]
+    assert not again.web
+
+
+def test_a_command_without_the_page_loads_nothing_of_it():
+    code = (
+        "import sys; from relay_autotune.cli import replay, tune; "
+        "tune.main(['--gain', '1.65', '--time-constants', '20', '--dead-time', '10']); "
+        "replay.main(['no_such_bag']); "
+        "sys.exit(any(n.split('.')[0] == 'tornado' or n.startswith('relay_autotune.web') "
+        "for n in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_a_missing_package_is_named_before_any_work(monkeypatch, capsys):
+    monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
+    assert replay.main(["--web", "no_such_bag"]) == 1
+    assert "pip install tornado" in capsys.readouterr().err
+
+
+def test_the_page_of_many_processes_is_refused(capsys):
+    assert replay.main(["--web", "--jobs", "2", "bags/biased_relay"]) == 2
+    assert "--web cannot be combined" in capsys.readouterr().err
+    assert isinstance(replay._parser(), argparse.ArgumentParser)
