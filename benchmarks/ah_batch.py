@@ -38,7 +38,7 @@ RATIO = 0.05
 PER_PERIOD = 100
 AMPLITUDE = 1.0
 MOST_SAMPLES = 100_000
-# Of K_u and w_u [%].
+# Errors of K_u and w_u [%].
 NARROW, WIDE = (2.0, 1.0), (4.0, 2.0)
 
 

@@ -263,7 +263,7 @@ def report(bench: Bench, seconds: float, load: int) -> tuple[str, bool]:
     sizes = (
         ("all", slope),
         ("the record: five numbers a sample", RECORD_BYTES),
-        ("the cycles that wait for who comes late: three numbers a sample", CYCLE_BYTES),
+        ("the cycles kept for late subscribers: three numbers a sample", CYCLE_BYTES),
         ("beyond these", beyond),
     )
     text = "\n\n".join(

@@ -22,7 +22,7 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.record.record import Record
 
-# Of structure and number of samples [ms].
+# By structure and number of samples [ms].
 TARGETS = {
     ("FOPDT", 1_000): 60,
     ("FOPDT", 1_000_000): 10_000,
@@ -42,7 +42,7 @@ QUICK = {"FOPDT": {1_000: 3, 10_000: 1}}
 
 
 def record(samples: int, ratio: float) -> Record:
-    """Return five cycles of 1.65 e^(-10 s)/(20 s + 1) in so many samples.
+    """Return five cycles of 1.65 e^(-10 s)/(20 s + 1) in a number of samples.
 
     :param samples: their number.
     :param ratio: noise-to-signal ratio.

@@ -30,7 +30,7 @@ class Process:
     :param title: the process as people write it.
     :param model: the process.
     :param bias: of the relay [u].
-    :param cycles: the record is as long as so many limit cycles.
+    :param cycles: length of the record in limit cycles.
     :param extra_delay: dead time that the relay adds [s].
     """
 

@@ -85,7 +85,7 @@ def judged(judge: Any, folder: Path, name: str, reference: dict[str, Any]) -> Ro
         [*command, "--json"], capture_output=True, text=True, timeout=_MOST_SECONDS, check=False
     )
     end = os.times()
-    # Of the processor, which other programs on the machine hardly change.
+    # Processor time, which other programs on the machine hardly change.
     seconds = end.children_user - begin.children_user + end.children_system - begin.children_system
     # The judge runs the same command: it gets the output that is there already.
     judge.subprocess = SimpleNamespace(

@@ -179,7 +179,7 @@ def analyse(
         they are not given.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
-    :raises RelayAutotuneError: if method or rule are unknown, or the record is none.
+    :raises RelayAutotuneError: if method or rule are unknown, or it is not a record.
     """
     record = one_record(record, "analyse")
     check_names(method, rule)
@@ -211,7 +211,7 @@ def analyse_alone(
     :param known: known values of the process.
     :param options: as for :func:`analyse`.
     :param rng: as for :func:`analyse`.
-    :raises RelayAutotuneError: if method or rule are unknown, or the record is none.
+    :raises RelayAutotuneError: if method or rule are unknown, or it is not a record.
     """
     record = one_record(record, "analyse_alone")
     check_names(method, rule)

@@ -297,7 +297,7 @@ class _Cursor:
         self._advance(length)
 
     def _skip_items(self, item: Type, count: Place) -> None:
-        """Pass so many elements of an array or sequence."""
+        """Pass a number of elements of an array or sequence."""
         if isinstance(item, Number):
             if isinstance(count, int):
                 if count:

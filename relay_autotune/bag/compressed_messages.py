@@ -19,7 +19,7 @@ from relay_autotune.bag.mcap_records import DamageError
 from relay_autotune.bag.packages import expanding_package
 from relay_autotune.bag.source import ZSTD_MAGIC, Source
 
-# Messages are handed on when they have expanded to so many bytes together.
+# Size of the expanded messages that are handed on together [bytes].
 _EXPANDED = 16 << 20
 
 
@@ -46,7 +46,7 @@ class Expander:
         self.first_refusal = ""
 
     def expand(self, messages: Messages) -> Iterator[Messages]:
-        """Yield messages as they were before they were compressed, so many at a time.
+        """Yield messages as they were before they were compressed, some at a time.
 
         Those that cannot be expanded are left out; `first_refusal` then says why.
 

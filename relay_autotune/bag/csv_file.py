@@ -49,9 +49,9 @@ _UNITS = {
 _UNIT = re.compile(r"\s*[\[(]\s*(?P<unit>[^\])]*?)\s*[\])]\s*$")
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
-# So much of a file tells its encoding and its separator.
+# The beginning of a file that tells its encoding and its separator [bytes].
 _FIRST = 64 << 10
-# Two stretches of so many rows that overlap in time are two recordings.
+# Number of rows from which two stretches that overlap in time are two recordings.
 _RESTART = 10
 
 

@@ -130,7 +130,7 @@ class _Budget:
         self._left = MOST_ELEMENTS
 
     def take(self, count: int) -> None:
-        """Take so many structures or elements.
+        """Take a number of structures or elements.
 
         :raises ValueError: if there are too many.
         """

@@ -33,7 +33,7 @@ _LIST = 36
 _START, _LENGTH, _LIST_LENGTH = 16, 24, 32
 # One entry of the list: a channel, and the place of its message index.
 _ENTRY = 10
-# A message index has its channel and the length of its list before places of so many bytes.
+# Sizes in a message index [bytes]: channel and length of the list; each place.
 _PLACES, _PLACE = 6, 16
 
 

@@ -21,7 +21,7 @@ _WORDS = {
     "pressure speed velocity position angle rpm height",
 }
 
-# A signal with at most so many levels steps between them.
+# A signal with no more levels than this steps between them.
 _MOST_LEVELS = 12
 
 # Fewer samples than these cannot show a response.

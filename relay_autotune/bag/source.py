@@ -29,7 +29,7 @@ MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
-# Of each range that is announced at most so much is fetched before it is read.
+# Largest part of an announced range that is fetched before it is read [bytes].
 _ANNOUNCED = 64 << 10
 
 # What the file might be instead, by its first bytes.
@@ -181,7 +181,7 @@ class Source:
         zstandard = expanding_package("zstandard")
         compressed = os.fstat(self._file.fileno()).st_size
         most = max(UNSUSPICIOUS, MOST_EXPANSION * compressed)
-        # Closed, and thereby deleted, by close().
+        # close() closes it, which deletes it.
         expanded = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
         try:
             room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK

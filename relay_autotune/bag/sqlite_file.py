@@ -22,7 +22,7 @@ from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.source import SQLITE_MAGIC, Source
 from relay_autotune.errors import BagError
 
-# Messages are handed on when they have so many bytes together.
+# Size of the messages that are handed on together [bytes].
 _BATCH = 4 << 20
 
 
@@ -143,7 +143,7 @@ class SqliteFile:
         try:
             for topic, time, data in self._database.execute(query, wanted):
                 if not (isinstance(time, int) and isinstance(data, bytes)):
-                    raise BagError(f"{self.path} holds a message that is none")
+                    raise BagError(f"{self.path} holds a message without binary data or time")
                 rows.append((topic, time, data))
                 size += len(data)
                 if size >= _BATCH:

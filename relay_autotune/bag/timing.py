@@ -37,7 +37,7 @@ class Column(Generic[T]):
         """Add values, shape (n,)."""
         size = self._size + values.size
         if size > self._data.size:
-            # What is added is filled with zeros, and thereby taken: large arrays grow less.
+            # Memory that is added is zeroed, so that it is taken at once: large arrays grow less.
             grown = self._data.size * (2 if size < _LARGE else 1.125)
             self._data.resize(max(size, int(grown), 1024), refcheck=False)
         self._data[self._size : size] = values

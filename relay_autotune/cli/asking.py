@@ -40,7 +40,7 @@ def asked(what: str, flag: str, known: str, read: Callable[[str], Any]) -> Any:
     :param what: what is asked for, with its unit.
     :param flag: the flag that would have given it.
     :param known: the value that Enter takes; empty: none.
-    :param read: returns the value of a text; None: it is none.
+    :param read: returns the value of a text; None: it has none.
     """
     _require_somebody(flag)
     shown = f"{what} [{known}]: " if known else f"{what}: "

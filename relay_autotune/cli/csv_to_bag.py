@@ -97,7 +97,7 @@ def _convert(options: argparse.Namespace) -> int:
             for topic, signal in zip(topics, (measurement, command), strict=True)
             for time_ns, value in zip(signal.time_ns, signal.values, strict=True)
         ]
-        # Of one row, the measurement comes first.
+        # The measurement of a row comes first.
         for time_ns, topic, value in sorted(rows, key=lambda row: row[0]):
             bag.write(topic, time_ns, time_ns, encode_float64(value))
     counts = f"{len(measurement)} messages on {topics[0]}, {len(command)} on {topics[1]}"

@@ -28,7 +28,7 @@ ENDINGS = (".jsonl", ".csv", ".parquet")
 _OF_EXPERIMENT = (
     *("start", "duration", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
 )
-# Of the model that counts and its fit, and of the gains.
+# Columns of the selected model and its fit, and of the gains.
 _METHOD, *_ACCURACY = columns(Identification)
 _OF_MODEL = (_METHOD, *OF_PROCESS, *_ACCURACY)
 _OF_FIT = columns(FitReport)

@@ -297,7 +297,7 @@ def of_message(
             found[each.name] = _read_columns(part, message, error, of, each.prefix)
         elif part is not None:
             told = of_message(part, message, error, of, each.prefix)
-            # Of what was not computed, every number is told as such.
+            # A part that was not computed has a default in each of its fields.
             absent = each.default is None and repr(told) == repr(part())
             found[each.name] = None if absent else told
         else:

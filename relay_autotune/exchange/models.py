@@ -51,7 +51,7 @@ def model_fields(model: TransferFunction) -> dict[str, Any]:
 def model_of_fields(m: dict[str, Any]) -> TransferFunction:
     """Return the transfer function that :func:`model_fields` tells.
 
-    :raises ModelError: if it is none.
+    :raises ModelError: if it is not a transfer function.
     """
     found = TransferFunction.from_polynomials(
         [number(c) for c in m["numerator"]],
@@ -131,7 +131,7 @@ def _real(values: Sequence[complex]) -> array.array[float]:
 def model_of_message(message: Any) -> TransferFunction:
     """Return the transfer function that a `TransferFunction` message tells by its polynomials.
 
-    :raises ModelError: if it is none, or too large.
+    :raises ModelError: if it is not a transfer function, or too large.
     """
     if max(len(message.numerator), len(message.denominator)) > _MOST_COEFFICIENTS:
         raise ModelError(

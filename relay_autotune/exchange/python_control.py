@@ -31,7 +31,7 @@ def to_control(system: TransferFunction | Controller, *, pade_order: int = PADE_
     for n = 2, 0.003 rad for n = 5). A controller's set-point weight has no place in it.
 
     :param system: a process, or a controller such as the gains of a rule.
-    :param pade_order: n >= 1; the dead time adds so many poles.
+    :param pade_order: n >= 1, the number of poles that the dead time adds.
     :raises ModelError: if the order is less than 1.
     :raises MissingPackageError: if python-control is not installed.
     """

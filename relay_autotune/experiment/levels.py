@@ -135,7 +135,7 @@ class Levels:
 
     @property
     def grew_enough(self) -> bool:
-        """True if the levels grew so much that the response must have grown, too."""
+        """True if the levels have grown enough for the response to have grown, too."""
         first = self._first_clear
         return first is not None and self.amplitude >= _GROWN * first[0]
 

@@ -38,7 +38,7 @@ _ROUNDING = 1e-6
 # compensated by shifts of a part of the amplitude, a limited number at a time.
 _SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
 _MOST_SHIFTS, _SHIFT = 2, 0.7
-# So many stays of an oscillation may need that: a load that comes and goes twice. A process that
+# Number of stays that may need a shift: a load that comes and goes twice. A process that
 # needs it at every turn does not oscillate.
 MOST_BORNE = 4
 _FOLLOWS = 2

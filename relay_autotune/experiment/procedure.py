@@ -63,7 +63,7 @@ _PROBE_SAMPLES = 2
 # make the amplitude much too large.
 _GROWTH_SETTLINGS = 0.25
 _GROWTH_SAMPLES = 20
-# A given amplitude that begins small has so many times as long, since it is to stay small until
+# Factor by which a given amplitude has longer to begin small, since it is to stay small until
 # the response to it is known.
 _PATIENT = 10.0
 

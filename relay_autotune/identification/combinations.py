@@ -14,7 +14,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import told
 
-# Half an interval at most so many times the value.
+# Largest half interval of a determined value, relative to the value.
 DETERMINED = 0.2
 
 

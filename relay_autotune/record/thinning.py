@@ -24,7 +24,7 @@ from relay_autotune.record.record import (
     roughness,
 )
 
-# A record of so many samples is left as it is; a longer one is brought to so many blocks.
+# Samples of a record that is left as it is; blocks that a longer one is brought to.
 LEFT_ALONE = 10_000
 BLOCKS = 5_000
 # A command that changes more often than this is averaged, too: each change costs what a sample
@@ -33,9 +33,9 @@ _MOST_CHANGES = BLOCKS // 4
 # From block to block the measurement may move this share of its range, beyond its noise: a
 # response of one lag is then seen by 20 blocks in its time constant.
 _MOST_MOVE = 0.05
-# Differences of two means beyond so many of their standard deviations are no noise.
+# A difference of two means beyond this number of its standard deviations is not noise.
 _NOISE = 6.0
-# Of the part that is used where blocks do not do, this share comes before the first change.
+# Share before the first change, in the part that is used where blocks do not do.
 _BEFORE = 0.1
 
 
@@ -117,7 +117,7 @@ def _slow_enough(y: FloatArray, wanted: int, *, white: bool) -> int:
 
 
 def _before_first(record: Record, changes: IntArray, length: int) -> int:
-    """Return where a part of so many samples begins that shows the first change of the command."""
+    """Return where a part of a given length begins that shows the first change of the command."""
     first = int(changes[0]) if changes.size else 0
     return max(0, min(first - int(_BEFORE * length), len(record) - length))
 

@@ -31,7 +31,7 @@ FloatArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _MODELS = 100
-# One in so many is each model on which gains have to hold, too.
+# One model in this number is one of another structure on which the gains have to hold.
 _PART = 10
 
 

@@ -66,7 +66,7 @@ def test_each_model_has_a_fit_to_all_samples(models):
     assert atv.fit.whiteness_p < 1e-6
     signal = simulate_relay(MODEL, RELAY, cycles=6, time=np.arange(0.0, 19.0, 0.02))
     away = signal.measurement - 3.0
-    # Of Gaussian noise the mean absolute value is sqrt(2/pi) of the standard deviation.
+    # The mean absolute value of Gaussian noise is sqrt(2/pi) of its standard deviation.
     ratio = NOISE * math.sqrt(2.0 / math.pi) / np.mean(np.abs(away))
     assert wang.fit.noise_to_signal == pytest.approx(ratio, rel=0.05)
     assert wang.fit.noise_to_signal_power == pytest.approx(NOISE**2 / np.mean(away**2), rel=0.1)

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks that tell a linear model from a process that is none."""
+"""Checks whether a process is linear."""
 
 from __future__ import annotations
 

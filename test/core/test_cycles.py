@@ -58,7 +58,7 @@ def tuned(gain=1.0, ratio=0.7, period=0.01, noise=0.0, baseline=0.0, **parameter
 
 
 def square(levels, stay, lead=(), tail=()):
-    """Return a record whose command stays at each of the levels for so many samples."""
+    """Return a record whose command stays at each of the levels for a number of samples."""
     command = np.concatenate((lead, np.repeat(levels, stay), tail)).astype(float)
     time = 0.5 * np.arange(command.size)
     return Record(time=time, measurement=np.sin(time), command=command)

@@ -101,7 +101,7 @@ def results(draw: Any, kind: Any) -> Any:
             held = tuple(draw(st.lists(results(inner[0]), max_size=3)))
         elif inner:
             held = draw(st.none() | results(inner[0]))
-            # A comparison without any number is none.
+            # A comparison without a number stands for no comparison.
             held = None if repr(held) == repr(inner[0]()) else held
         elif each.kind is float:
             held = draw(numbers(each))

@@ -32,7 +32,7 @@ def _record(
     samples: int = 400,
     rest: int = 0,
 ) -> Record:
-    """Return an ideal experiment, after so many samples at rest."""
+    """Return an ideal experiment, after a number of samples at rest."""
     period = exact_limit_cycle(model, relay, tolerance=1e-6).period / samples
     time = period * np.arange(samples * cycles)
     run = simulate_relay(model, relay, cycles=cycles + 2, time=time)
@@ -139,7 +139,7 @@ def test_the_deviations_are_those_over_seeds():
         )
         assert not any("another structure" in text for text in found.warnings)
     spread = np.sqrt(np.mean(np.array(scores) ** 2, axis=0))
-    # Of 30 draws of unit variance the root mean square is within 0.65 and 1.35 (99.5 %).
+    # The root mean square of 30 draws of unit variance is within 0.65 and 1.35 (99.5 %).
     assert np.all((spread > 0.65) & (spread < 1.35))
 
 

@@ -72,7 +72,7 @@ def test_two_short_noisy_records_halve_the_variance():
 
     stated = np.mean([m.std for m in single], axis=0) / np.mean([m.std for m in pairs], axis=0)
     assert stated == pytest.approx(math.sqrt(2.0), rel=0.05)
-    # Of 12 pairs against 24 records, three standard errors.
+    # Three standard errors of the ratio of 12 pairs to 24 records.
     assert 1.0 < rms(single) / rms(pairs) < 2.1
 
 

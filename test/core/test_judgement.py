@@ -306,7 +306,7 @@ def fed_back(process, gain, *, steps=2000):
 def test_a_controller_that_is_read_backward_gives_no_gains():
     record = fed_back(TransferFunction.fopdt(2.0, 4.0, 1.0), 1.5)
     assert followed_share(record, -1) == pytest.approx(1.0)
-    # Of the process's own sign the loop is one that could run.
+    # With the process's own sign the loop could run.
     assert followed_share(record, 1) is None
     inverse = analyse_alone(record)
     assert inverse.best_gains is None or inverse.model.model.process_sign == 1

@@ -58,7 +58,7 @@ def test_two_exact_limit_cycles_give_all_parameters(model, values, epsilon):
         found = (fit.solution.gain, *fit.solution.constants, fit.dead_time)
         assert fit.misfit < 1e-8
         if model == MODEL_5 and math.isnan(dead_time):
-            # Of two mirrored solutions either may be found; both have these limit cycles.
+            # Either of two mirrored solutions may be found; both have these limit cycles.
             continue
         assert found == pytest.approx(values, rel=1e-6)
 

@@ -69,7 +69,7 @@ def test_phase_is_continuous_and_agrees_with_the_angle(structure):
 @pytest.mark.parametrize("structure", EXAMPLES)
 def test_a_model_is_recognised_by_its_poles_and_zeros(structure):
     model = structure_named(structure).of_fields(**EXAMPLES[structure])
-    # Of three lags two may happen to be equal.
+    # Two of three lags may happen to be equal.
     wanted = "three_lags" if structure == "two_equal_one" else structure
     assert recognised(replace(model, structure="general")).structure == wanted
 

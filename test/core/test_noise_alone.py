@@ -20,7 +20,7 @@ PROCESS = structure_named("lag_n").of_fields(
 PERIOD = 0.09
 
 
-# Of these, noise made so few cycles that the tune went on for more than 15,000 samples.
+# With these seeds noise made few cycles, and the tune went on for more than 15,000 samples.
 @pytest.mark.parametrize("seed", [5, 7, 15, 26, 49])
 def test_an_actuator_that_sticks_while_the_amplitude_is_found_ends_the_tune(seed):
     plant = VirtualProcess(PROCESS, disturbances=Disturbances(noise_std=0.004), seed=seed)

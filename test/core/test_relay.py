@@ -178,7 +178,7 @@ def test_noise(ratio, level, seed):
 
 @pytest.mark.nightly
 def test_dense_noisy_samples_make_no_false_cycles():
-    # So many samples while the measurement passes the band that noise reaches across it.
+    # Dense samples: noise reaches across the band many times while the measurement passes it.
     tune = experiment(process_gain_sign=1)
     run(tune, FopdtPlant(1.0, 1.0, 0.5), 2e-5, noise=gaussian(0.05), samples=400_000)
     assert tune.outcome is Outcome.COMPLETED, tune.reason

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What nodes do with command lines that are none of ROS."""
+"""What nodes do with command lines that ROS does not know."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def test_with_simulated_time_a_silence_is_as_long_as_that_clock_says(
     loop.at(10.0)
     assert not repeated
     assert not repeater.why_dead()
-    # Said once, and kept for who comes late.
+    # Said once, and kept for late subscribers.
     loop.sensor.publish(Float64(data=5.0))
     loop.until(lambda: repeater.age(0.0) == 0.0)
     # While that clock stands still, no time passes for the process either.

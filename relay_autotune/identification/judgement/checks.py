@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks that tell a linear model from a process that is none, on the data it was fitted to."""
+"""Checks whether a process is linear, on the data that a linear model was fitted to."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _LEAST_DISAGREEMENT = 0.03
 _LEAST_CYCLES = 3
 # With fewer samples in a cycle, straight lines between them miss more than a percent.
 _LEAST_SAMPLES = 24
-# Of a command's range, where its effect may end; beside the level that it starts from.
+# Levels at which the effect of a command may end, in shares of its range; beside its first level.
 _SHARES = (0.25, 0.5, 0.75)
 # Curves that differ by less than this part count as the same.
 _ALIKE = 1e-6
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
-# Of the command's range, the least range of the levels on one side.
+# Least range of the levels on one side, as a share of the command's range.
 _OWN = 0.2
-# Of what does not follow one sample away, the share at the same instant that stands out.
+# Share of the direct effect at the same instant that stands out from that a sample away.
 _AT_ONCE = 0.5
 
 

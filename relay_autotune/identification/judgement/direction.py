@@ -46,7 +46,7 @@ _CORRELATED = 2.0
 _BESIDE = 1e-6
 # How many times the fast lag the slow one is at the start.
 _SLOWER = (2.0, 6.0, 20.0)
-# An answer that turns only so many times the test's length after a step is a drift.
+# A response that turns later than this after a step, in lengths of the test, is a drift.
 _HORIZON = 2.0
 _TRIAL = 1e-6
 

@@ -16,7 +16,7 @@ from relay_autotune.identification.judgement.quality import is_contradicted, mis
 from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Cycle, Record
 
-# The end of a record alone is better if what it leaves beyond the noise is so much less.
+# The end of a record alone is better if its residual beyond the noise is less by this factor.
 _BETTER = 0.5
 
 # A load is looked for in these structures, the second one being what was found without it.

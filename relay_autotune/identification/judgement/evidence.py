@@ -21,9 +21,9 @@ from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
 
-# In so many of its time constants a process that grows by itself runs away from any rest.
+# Number of its time constants in which a process that grows by itself leaves any rest.
 MOST_GROWTH = 7.0
-# A rival may leave so much more, and has to have so much of the support.
+# Residual of a rival relative to the model's, at most; its share of the support, at least.
 _AS_WELL = 1.1
 _WORTH_HEARING = 0.01
 

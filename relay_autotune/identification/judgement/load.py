@@ -25,7 +25,7 @@ _INSTANTS = 60
 # Share of the sum of squares that the best guess may leave; a load leaves next to nothing.
 _PROMISE = 0.7
 _FOLLOWED = 6
-# So many samples tell a load as well as more would.
+# Number of samples that tell a load as well as more would.
 _SAMPLES = 1500
 # Part of a parameter by which it is varied.
 _STEP = 1e-5
@@ -128,7 +128,7 @@ class _Fit:
                 left = self._measurement - offset - self._output(np.array(values), u)
         except RelayAutotuneError:
             left = np.full(self._time.size, math.inf)
-        # A model that runs away, or is none, must not stop the search.
+        # A model that runs away, or that cannot be built, must not stop the search.
         far = 10.0 * self._spread
         return np.clip(np.nan_to_num(left, nan=far, posinf=far, neginf=-far), -far, far)
 

@@ -16,7 +16,7 @@ from relay_autotune.record.record import Record
 # the noise is noise alone; 2 % of the measurement's spread is left by any simple structure.
 _OF_NOISE = 1.3
 _OF_SPREAD = 0.02
-# With so many times that, and more, a model is another process's.
+# A model whose misfit is this many times as large is of another process.
 _FAR_OFF = 2.0
 # Less probable than this as white noise.
 _NOT_WHITE = 1e-6
@@ -64,7 +64,7 @@ def unexplained_share(found: Identification, record: Record) -> float:
 
 
 def is_far_off(found: Identification, record: Record) -> bool:
-    """Return whether a model leaves so much that its intervals say nothing.
+    """Return whether a model's residual is too large for its intervals to mean anything.
 
     :param found: what was identified.
     :param record: the record.

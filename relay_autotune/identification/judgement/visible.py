@@ -29,7 +29,7 @@ ComplexArray = NDArray[np.complexfloating]
 _BINS = 24
 _MOST_SAMPLES = 2000
 _LEAST_SAMPLES = 60
-# Of the regression's own size: what is excited less than this is taken for not excited.
+# Excitation below this share of the regression's size counts as none.
 _RIDGE = 1e-3
 # Standard deviations that a difference has to stand clear of.
 _SURE = 3.0

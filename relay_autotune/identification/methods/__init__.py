@@ -69,7 +69,7 @@ def identify(
     :param method: one of ``METHODS``.
     :param known: what is known of the process beforehand.
     :raises IdentificationError: if the method is unknown or the record does not tell a model.
-    :raises RecordError: if the record is none.
+    :raises RecordError: if it is not a record.
     """
     return method_named(method)(one_record(record, "identify"), known)
 

@@ -82,7 +82,7 @@ def time_constant_from_phase(order: int, period: float, phase: float) -> float:
     :param order: n >= 1.
     :param period: P [s].
     :param phase: what the lags make up, from :func:`phase_of_lags` [rad].
-    :raises IdentificationError: if so many lags cannot have so much phase.
+    :raises IdentificationError: if this number of lags cannot have that phase.
     """
     each = phase / order
     if not each < 0.5 * math.pi:
@@ -273,7 +273,7 @@ def _with_estimate(found: Found) -> Identification:
     )
 
 
-# The describing function alone makes the two time constants differ by so much.
+# Difference of the two time constants that the describing function alone explains.
 _AGREEMENT = 0.1
 
 ATV = SymmetricMethod("atv", solve, _mismatch, _AGREEMENT, _remarks)

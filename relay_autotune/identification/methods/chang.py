@@ -372,7 +372,7 @@ def mismatch(order: int, cycle: SymmetricCycle, gain: float) -> float:
     :param order: n >= 1.
     :param cycle: the limit cycle.
     :param gain: K > 0 [y/u].
-    :return: infinite where the process has so much lag that the period has no tau.
+    :return: infinite where no tau gives the period: the process has too much lag.
     :raises IdentificationError: if the gain is too small for the amplitude or the hysteresis, or
         the dead time too large for the period.
     """

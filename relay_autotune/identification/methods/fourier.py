@@ -144,7 +144,7 @@ _LARGEST, _SMALLEST = 300.0, 1e-300
 _LONGEST = 1e4
 _BEYOND = 1.3
 _STEP = 0.1
-# Of a logarithm, or of a radian's time: for derivatives, and how near an end is at the end.
+# In logarithms, or in times of a radian: step of derivatives; distance that is at an end.
 _DIFFERENCE = 1e-4
 _AT_END = 1e-6
 

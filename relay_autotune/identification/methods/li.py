@@ -213,7 +213,7 @@ def fits_jointly(
     return agreeing or [min(fits, key=lambda f: f[1].misfit)]
 
 
-# A misfit of so many assumed errors is agreement.
+# Largest misfit that is agreement, in assumed errors.
 AGREEMENT = 2.0
 
 
@@ -259,7 +259,7 @@ def _exact_residuals(
         rise = (excess(test.period * (1 + step)) - excess(test.period * (1 - step))) / (2 * step)
         missed = excess(test.period) / max(rise, 1e-9)
         found.append(min(max(missed / period_error, -_PENALTY), _PENALTY))
-        # Of lags beyond all proportion nothing is left but rounding.
+        # The response of extremely long lags is lost in rounding.
         amplitude = max(gain * test.relay * peak(lags, test.period), _TINY * test.amplitude)
         found.append(math.log(amplitude / test.amplitude) / amplitude_error)
     return np.array(found)

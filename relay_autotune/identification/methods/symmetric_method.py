@@ -55,7 +55,7 @@ FloatArray = NDArray[np.float64]
 
 MOST_EQUAL = 20
 
-# A structure is as good as another whose half cycles are so much nearer to the record's; less
+# A structure is as good as another whose half cycles are nearer by up to this factor; less
 # than a share of the amplitude is what sampling makes of any.
 _ALIKE = 1.02
 _ALIKE_SHARE = 3e-3
@@ -71,7 +71,7 @@ class SymmetricMethod:
     :param solve: from model, limit cycle and gain (> 0; NaN: not known) to the numbers.
     :param mismatch: from order, limit cycle and gain to log(tau by the period/tau by the
         amplitude) of equal lags. Zero: the structure fits. Positive: the process has more lag;
-        infinite: so much that the period has no time constant. Negative: it has less.
+        infinite: no time constant gives the period. Negative: it has less lag.
     :param agreement: how large a mismatch counts as none where nothing else is known of it.
     :param remarks: from model, limit cycle and gain to sentences for the user.
     """

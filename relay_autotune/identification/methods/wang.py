@@ -191,7 +191,7 @@ def _log_ratio(numerator: float, denominator: float, where: str) -> float:
 
 _LEAST_CYCLES = 3
 _MOST_PARTS = 20
-# So many standard deviations above that of an integrator a ratio is not one of noise.
+# Standard deviations above an integrator's ratio from which a ratio is not one of noise.
 _CERTAIN = 3.0
 _LIKE_AN_INTEGRATOR = (
     "the peaks are those of an integrator's limit cycle, or noise lets them look so: gain and "

@@ -26,12 +26,12 @@ from relay_autotune.record.record import PiecewiseConstant, Record, RelaySetting
 FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
-# A command so far off both levels, in amplitudes, for more than this share of the time is none
-# of a relay.
+# Distance from both levels, in amplitudes, and share of the time: beyond both, the command is not
+# that of a relay.
 _OFF_LEVEL = 0.05
 _MOST_BETWEEN = 0.01
 _LEAST_SAMPLES = 4
-# So many cycles tell their scatter within 10 %.
+# Number of cycles that tells their scatter within 10 %.
 _MOST_SINGLES = 60
 
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"

@@ -57,7 +57,7 @@ def envelope(record: Record) -> Envelope:
     times, heights = [], []
     for cycle in cycles:
         low_at = cycle.start + cycle.period_high
-        # Of a direct process the high level turns the measurement up, so that it ends a minimum.
+        # With a positive gain the high level turns the measurement up, so that it ends a minimum.
         high_turns, low_turns = (
             (cycle.time_to_peak_max, cycle.time_to_peak_min)
             if settings.reverse_acting

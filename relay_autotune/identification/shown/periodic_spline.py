@@ -72,7 +72,7 @@ class Spline:
         columns = basis.spline(x, knots, 0)
         if basis.mirrored:
             columns = np.column_stack((columns, np.ones(x.size)))
-        # Of the many functions four or five are not zero at any point.
+        # Only four or five of the functions are not zero at a point.
         self._columns = csr_array(columns * self._root)
         self._transposed = csr_array(self._columns.T)
         gram = (self._transposed @ self._columns).toarray()
@@ -84,7 +84,7 @@ class Spline:
         self._left = target - self._columns @ self._smooth
 
     def _along(self, columns: FloatArray) -> FloatArray:
-        # Of the right side alone cho_solve would take longer to look at than to solve it.
+        # cho_solve would take longer to check the right side than to solve.
         found, _ = dpotrs(self._factor[0], self._transposed @ columns, self._factor[1])
         return np.asarray(found)
 

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 _MOST_BIAS = 0.01
 _MOST_SKEW = 0.05
 
-# Noise below this share of the amplitude is none.
+# Noise below this share of the amplitude is neglected.
 _QUIET = 2e-3
 _BINS = 100
 _SAMPLES_PER_BIN = 8

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _MOST_LAGS = 24
-# So many samples at least tell one more lag.
+# Least number of samples for each further lag.
 _SAMPLES_EACH = 12
 
 

@@ -49,7 +49,7 @@ _MOST_TIMES = 4
 # for the plain ones, on whose models gains have to hold, too.
 _HOPELESS = 30.0
 PLAIN = ("fopdt", "sopdt")
-# Of a slow disturbance that is tried as a beginning, times that the record lasts its correlation.
+# Length of the record in correlation times of the slow disturbance that is tried first.
 _SLOWEST = 10.0
 _ALIKE = 0.01
 _TRIAL = 1e-6
@@ -57,14 +57,14 @@ _STEPS = 15
 # What is looked at first: initial state, command before.
 _PASTS = ((False, False), (False, True), (True, True))
 _FIRST = ("fopdt", "sopdt", "sopdt_zero")
-# Of equal lags, every other number: beside a colour, they differ by no more than chance.
+# Equal lags in some numbers only: in coloured noise neighbours differ by chance alone.
 _OTHERS = (("lag_n", 3), ("lag_n", 5), ("lag_n", 8), ("three_lags", 0))
 _INTEGRATING = (("ipdt", 0), ("integrator_lag", 0), ("integrator_inverse", 0))
 _UNSTABLE = (("unstable_fopdt", 0), ("unstable_sopdt", 0))
 # Samples of a rest that shows the past, in which the measurement moves by no more than this share.
 _ENOUGH_REST = 15
 _STILL = 0.05
-# Of the record's length: a response that comes later leaves too little to tell it from a drift.
+# Latest response, as a share of the record: a later one cannot be told from a drift.
 _LONGEST = 0.25
 # An integrator or a growing mode bends to any drift: what it explains better has to be clear.
 _EARNED = 10.0

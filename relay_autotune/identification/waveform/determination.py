@@ -30,7 +30,7 @@ from relay_autotune.record.record import Record
 FloatArray = NDArray[np.float64]
 
 _MOST_FOR_PROFILES = 4096
-# Of a logarithm, or in standard deviations.
+# Widths in logarithms, or in standard deviations.
 _WIDE = 2.0
 _FARTHEST = 8.0
 
@@ -72,7 +72,7 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
     few = fit.problem.thinned(_MOST_FOR_PROFILES)
     whole = few.time.size == fit.problem.time.size
     state = fit.state if whole else refine(few, fit.state.theta)
-    # Fewer samples rise less: the curve of all is so many times as steep.
+    # With fewer samples the curve is less steep, by the ratio of their numbers.
     fewer = few.time.size / fit.problem.time.size
     low, high = found.ci95_low.copy(), found.ci95_high.copy()
     white = estimate_of(fit.problem, fit.state, fit, Noise(False))

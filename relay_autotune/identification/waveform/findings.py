@@ -51,7 +51,7 @@ _WORTH_COUNTING = 1e-2
 _MOST_COUNTED = 6
 _OPEN = 0.01
 _PREDICTED = 1e-6
-# Plain structures are beside a richer one where they leave so much more of the spread at most.
+# Residual that a plain structure may have beyond that of a richer one, as a share of the spread.
 _AS_WELL = 0.02
 
 
@@ -67,7 +67,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     residual = raw_residual(problem, state)
     rms = scale * math.sqrt(float(residual @ residual) / n)
     exact = rms <= scale * NEGLIGIBLE
-    # Of what is left once the colour that was estimated is taken out.
+    # Whiteness of the residual once the estimated colour is taken out.
     whiteness = math.nan if exact else ljung_box(state.residual)
     noise = noise_of(records, rms, not math.isnan(whiteness) and whiteness < _WHITE)
     if problem.colour is not None:

@@ -167,7 +167,7 @@ def _gradient(problem: Problem, state: Trial, scale: float) -> FloatArray:
 
 
 _MOST = 20_000
-# Values on a grid come again: of so many samples each, on average.
+# Values on a grid repeat: samples for each value, on average, from which it is one.
 _TIMES_EACH = 3.0
 _ROUNDED = 1e-3
 

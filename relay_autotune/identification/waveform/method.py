@@ -55,7 +55,7 @@ from relay_autotune.record.record import Input, Record
 
 FloatArray = NDArray[np.float64]
 
-# So many samples at two values alone are no measurement, however coarse.
+# From this number of samples on, two values alone are no measurement, however coarse.
 _ENOUGH_FOR_TWO = 20
 _LEAST_SAMPLES = 12
 _MOST_FOR_CHOICE = 16_384
@@ -65,7 +65,7 @@ _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
 # Noise of two records that differs by less is alike.
 _ALIKE = 1.2
-# Among all dead times and structures one fits noise alone by so much of the criterion.
+# What the best of all dead times and structures gains on noise alone, in the criterion.
 _SEARCHED = 10.0
 _MOST_ROUNDS = 20
 _SETTLED = 1e-6

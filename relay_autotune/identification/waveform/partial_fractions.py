@@ -29,9 +29,9 @@ Numbers = NDArray[Any]
 
 # What the differences of close poles may cost in accuracy: four digits.
 _MOST_CANCELLATION = math.log(1e4)
-# A time constant longer than so many horizons cancels with the held input.
+# A time constant of more horizons than this cancels with the held input.
 _LONGEST = 10.0
-# Up to so many changes a plain loop is as quick as array operations.
+# Number of changes up to which a plain loop is as quick as array operations.
 _FEW_CHANGES = 64
 # What differentiation makes of powers: binomial coefficients, and the power that is left.
 _MOST = 24
@@ -176,7 +176,7 @@ def follow(
         if pole.value != 0j:
             motion = pole.number * since
             if pole.value.real > 0.0:
-                # Of a state that has come down from there, which is zero for all that matters.
+                # A state that has decayed from beyond this bound is zero.
                 motion = np.minimum(motion, _OVERFLOW)
             output = output * np.exp(motion)[:, None]
         # A pair is twice the real part of one of its two.

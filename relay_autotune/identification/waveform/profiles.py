@@ -24,7 +24,7 @@ _MOST_STEPS = 20
 _MOST_TRIALS = 12
 # Fits that fail in a row before the profile counts as one that cannot be followed.
 _MOST_LOST = 5
-# Of the quantile: the least rise at the end of a search that did not settle.
+# Least rise at the end of a search that did not settle, as a share of the quantile.
 _FAR_ENOUGH = 0.5
 _CLOSE = 0.02
 _SETTLED = 1e-2
@@ -34,7 +34,7 @@ _LARGEST = 300.0
 _FURTHER = 4.0
 _WEAK = 1e-11
 _NARROW = 0.3
-# Of the way to a place far above, a straight line says nothing.
+# Share of the way to a far place within which a straight line holds.
 _SMALL = 0.2
 
 

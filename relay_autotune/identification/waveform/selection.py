@@ -66,9 +66,9 @@ _CORRELATED = 4.0
 _EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
-# With a mean square so many times the least one, a structure has no support worth telling.
+# A structure whose mean square is this many times the least one has no support.
 _BEYOND_HOPE = 4.0
-# A fit that has begun is given up where it promises no less than so many times the least one; of
+# A fit is given up where it promises no less than this many times the least mean square; of
 # a smaller mean square of the range, what it leaves is curvature that the promise does not know.
 _NO_PROMISE = 6.0
 _CLEAN = 1e-6

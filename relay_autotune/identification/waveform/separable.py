@@ -372,7 +372,7 @@ def information_criterion(
     :param samples: how many they are.
     :param parameters: p, all that was estimated.
     :param floor: what lies below it is rounding, and counts as equal.
-    :param worth: how many independent samples each is worth; n is so many times their number.
+    :param worth: how many independent samples each is worth, a factor of their number.
     """
     n = samples * worth
     return n * math.log(max(cost, floor) / samples) + parameters * math.log(max(n, 3.0))

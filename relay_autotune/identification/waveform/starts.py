@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 _GRID_SAMPLES = 240
 _BEST = 3
 _COARSE = 1e-4
-# Of several starts: steps that each may take, how many go on, and from which sum of squares not.
+# Several starts: steps that each may take, how many go on, and the sum of squares that ends one.
 _FIRST_STEPS = 5
 _SECOND_STEPS = 8
 _MORE = 3

@@ -81,7 +81,7 @@ def stepped(
     :param step: shape (m,).
     :param longest: time constant beyond which a lag is an integrator [s].
     """
-    # Of so few, plain numbers are quicker than arrays.
+    # Plain numbers are quicker than arrays of a few.
     *logs, dead_time = theta.tolist()
     *moves, by_dead_time = step.tolist()
     logs = [
@@ -146,7 +146,7 @@ def _at_changes(levels: FloatArray, gaps: FloatArray) -> tuple[FloatArray, Float
         state = doubled(decay, np.append(0.0, -np.expm1(-gaps) * levels[:-1]))
         away = state[:-1] - levels[:-1]
         return state, doubled(decay, np.append(0.0, decay * away * gaps))
-    # Of fewer, plain numbers are quicker than arrays.
+    # Plain numbers are quicker than arrays of a few.
     states, slopes = [0.0], [0.0]
     s = q = 0.0
     for level, gap, a in zip(levels.tolist(), gaps.tolist(), decay.tolist(), strict=False):
