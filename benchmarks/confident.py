@@ -40,7 +40,7 @@ from information import relative_bounds
 from processes import true_point
 
 from relay_autotune.analysis import analyse_alone
-from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, Finding
+from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.transfer_function import TransferFunction
@@ -152,7 +152,7 @@ class Bench:
 
     def _run(
         self, noise: float, seed: int, early: EarlyEnd | None, least: float = 0.0
-    ) -> tuple[RelayExperiment, Finding]:
+    ) -> tuple[RelayExperiment, FitProgress]:
         """Run a test; return it with what ended it."""
         tune = RelayExperiment(
             ExperimentParameters(
@@ -163,7 +163,7 @@ class Bench:
         )
         disturbed = Disturbances(noise_std=noise)
         plant = VirtualProcess(self.case.model, disturbances=disturbed, seed=seed)
-        ended_by, fit = Finding(), RunningFit()
+        ended_by, fit = FitProgress(), RunningFit()
         for k in range(_MOST_SAMPLES):
             plant.command(tune.step(k * self.period, plant.measure(k * self.period)))
             if tune.finished or 0.0 < least < tune.elapsed - tune.kicked_at:

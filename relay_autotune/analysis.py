@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError, defect
-from relay_autotune.experiment.early_end import Finding
+from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.judgement.assessment import assess
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
@@ -115,12 +115,12 @@ class Analysis:
         return self.judgement.verdict
 
     @property
-    def finding(self) -> Finding:
+    def finding(self) -> FitProgress:
         """Result of the fit and its prediction for a running experiment."""
         model, ms = self.model, self.predicted
         if model is None:
-            return Finding()
-        found = Finding(model.ultimate_gain, model.ultimate_gain_std)
+            return FitProgress()
+        found = FitProgress(model.ultimate_gain, model.ultimate_gain_std)
         return found if ms is None else replace(found, ms=ms.ms, ms_low=ms.low, ms_high=ms.high)
 
     def __repr__(self) -> str:

@@ -184,9 +184,9 @@ def _recordings(given: Sequence[str]) -> list[str]:
 
 def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
     """Write results to a file as they come."""
-    from relay_autotune.cli.results import Results
+    from relay_autotune.cli.results import ResultsFile
 
-    with Results(options.output) as results:
+    with ResultsFile(options.output) as results:
         left = [job for job in jobs if job.name not in results.done]
         status = results.status
         if len(left) < len(jobs):

@@ -44,7 +44,7 @@ _TEXTS = {
 }
 
 
-class Results:
+class ResultsFile:
     """A file of results, one document a line; a table is made of it at the end.
 
     :param output: the file: ``.jsonl`` holds the documents; ``.csv`` and ``.parquet`` a table

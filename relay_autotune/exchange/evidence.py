@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.errors import ModelError, ParameterError, TuningError
-from relay_autotune.experiment.early_end import Finding
+from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
@@ -38,7 +38,7 @@ _LEVELS = 8
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ExperimentFacts:
     """What is known of one experiment.
 
     :param experiment_id: its id.
@@ -59,7 +59,7 @@ class Evidence:
     sign: int = 0
 
     @classmethod
-    def of(cls, record: Record) -> Evidence:
+    def of(cls, record: Record) -> ExperimentFacts:
         """Return what a record tells.
 
         :param record: of the experiment.
@@ -201,7 +201,7 @@ def _fundamental(record: Record) -> tuple[float, complex]:
 
 
 def check_finding(
-    found: Finding, *, sign: int, amplitude: float = math.nan, relay: float = math.nan
+    found: FitProgress, *, sign: int, amplitude: float = math.nan, relay: float = math.nan
 ) -> None:
     """Refuse what cannot be true of a running experiment.
 

@@ -25,7 +25,7 @@ from relay_autotune.errors import (
 )
 from relay_autotune.escape import visible
 from relay_autotune.exchange.fields import float64_array, of_message, to_message
-from relay_autotune.experiment.early_end import Finding
+from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
@@ -248,7 +248,7 @@ def fill_transfer_function(
     experiment_id: str = "",
     final: bool = True,
     stamp_ns: int = 0,
-    finding: Finding | None = None,
+    finding: FitProgress | None = None,
     judgement: Judgement | None = None,
 ) -> None:
     """Write an identified model into a `TransferFunction` message.
@@ -266,7 +266,7 @@ def fill_transfer_function(
 
     _fill_envelope(message, experiment_id, final, stamp_ns, judgement)
     # K_u stands in both; that of the model counts.
-    to_message(message, finding or Finding())
+    to_message(message, finding or FitProgress())
     to_message(message, identification)
 
 
@@ -281,13 +281,13 @@ def _fill_envelope(
     message.verdict_reason = judgement.reason
 
 
-def finding_from_message(message: Any) -> Finding:
+def finding_from_message(message: Any) -> FitProgress:
     """Read what a `TransferFunction` message says of a running experiment.
 
     :param message: the message.
     :raises ParameterError: if its numbers cannot be.
     """
-    found: Finding = of_message(Finding, message, ParameterError, "of the experiment")
+    found: FitProgress = of_message(FitProgress, message, ParameterError, "of the experiment")
     return found
 
 

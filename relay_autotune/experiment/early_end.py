@@ -51,7 +51,7 @@ class Running(Protocol):
 
 
 @dataclass(frozen=True)
-class Finding:
+class FitProgress:
     """Result of the newest fit of a running experiment; NaN: not estimated.
 
     :raises ParameterError: if a number is outside its possible range.
@@ -134,7 +134,7 @@ class EarlyEnd:
         self._last = running.elapsed - running.kicked_at
         self._waits = True
 
-    def judge(self, running: Running, found: Finding) -> str:
+    def judge(self, running: Running, found: FitProgress) -> str:
         """Take the answer to a look; return why the experiment may end, "" if it may not.
 
         :param running: the experiment.

@@ -41,7 +41,7 @@ class Mark(Enum):
 
 
 @dataclass(frozen=True)
-class Check:
+class ChecklistLine:
     """One line of the checklist.
 
     :param mark: how it ended.
@@ -65,7 +65,7 @@ class Checklist:
     """
 
     def __init__(self, node: str, *, stops: bool) -> None:
-        self.checks: list[Check] = []
+        self.checks: list[ChecklistLine] = []
         self.refusal: RelayAutotuneError | None = None
         """The first check that failed; None: all passed."""
         self._node = node
@@ -110,7 +110,7 @@ class Checklist:
     def _add(self, mark: Mark, name: str, found: str, typed: str = "") -> None:
         if typed:
             found += f"; type: ros2 param set {self._node} {typed}"
-        self.checks.append(Check(mark, name, found))
+        self.checks.append(ChecklistLine(mark, name, found))
 
 
 def look_at_rest(checks: Checklist, samples: LastSamples) -> None:

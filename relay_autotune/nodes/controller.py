@@ -38,7 +38,7 @@ from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop
-from relay_autotune.nodes.results import Results
+from relay_autotune.nodes.results import ResultCheck
 from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
 from relay_autotune.process.transfer_function import TransferFunction
@@ -69,7 +69,7 @@ class ControllerNode(ServedNode):
         gains = gains_from(values)
         if gains is not None:
             bounds_from(values).require(gains)
-        self._results = Results(self, is_stable)
+        self._results = ResultCheck(self, is_stable)
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
         # Why the waiting gains are doubtful; empty: they are trusted.

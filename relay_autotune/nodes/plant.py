@@ -181,7 +181,7 @@ def model_from(values: dict[str, Any]) -> TransferFunction:
     return structure_named(values["structure"]).of_fields(**{f: values[f] for f in FIELDS})
 
 
-class Sensor:
+class ImperfectSensor:
     """Imperfections of a real sensor: late samples, lost samples, samples only on change.
 
     :param values: the node's parameters.
@@ -233,7 +233,7 @@ class PlantNode(ServedNode):
         self._period: float = values["sample_period"]
         self._samples = 0
         self._message = Float64()
-        self._sensor = Sensor(values)
+        self._sensor = ImperfectSensor(values)
         self._position: Any = None
         # No event callbacks: each one costs time in every turn of the executor.
         overridable = QoSOverridingOptions.with_default_policies()

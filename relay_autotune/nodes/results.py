@@ -21,7 +21,7 @@ from relay_autotune.errors import ModelError, RelayAutotuneError, TuningError
 # Loaded now, though it is needed only for the first model: that comes in a tune, and loading takes
 # most of a second, in which no measurement would be answered.
 from relay_autotune.exchange import models  # noqa: F401
-from relay_autotune.exchange.evidence import Evidence, check_finding
+from relay_autotune.exchange.evidence import ExperimentFacts, check_finding
 from relay_autotune.exchange.messages import (
     finding_from_message,
     gains_from_message,
@@ -70,7 +70,7 @@ class Refusals:
         )
 
 
-class Results:
+class ResultCheck:
     """Judge models and gains by the records of their experiments.
 
     :param node: the node that logs refusals.
@@ -83,7 +83,7 @@ class Results:
     ) -> None:
         self.refusals = Refusals(node)
         self._is_stable = is_stable
-        self._evidence: dict[str, Evidence] = {}
+        self._evidence: dict[str, ExperimentFacts] = {}
         self._models: dict[str, TransferFunction] = {}
 
     def know(self, experiment: Record) -> None:
@@ -92,7 +92,7 @@ class Results:
         :param experiment: its record.
         """
         if experiment.experiment_id not in self._evidence:
-            _keep(self._evidence, experiment.experiment_id, Evidence.of(experiment))
+            _keep(self._evidence, experiment.experiment_id, ExperimentFacts.of(experiment))
 
     def experiment(self, message: Any) -> None:
         """Remember the facts of an experiment's record, if the message holds a valid one.
@@ -178,7 +178,7 @@ class Results:
             raise TuningError(f"{gains} makes an unstable loop with the model of the experiment")
 
 
-class OwnResults(Results):
+class OwnResults(ResultCheck):
     """Accept results of this node's own experiments only.
 
     :param node: relay_node.

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EstimatedQuantity:
     """A quantity with its 95 % interval.
 
     :param name: of the quantity, as in the code.
@@ -75,8 +75,8 @@ class ModelCase:
 
     method: str
     model: TransferFunction
-    estimates: tuple[Estimate, ...]
-    ultimate: tuple[Estimate, ...]
+    estimates: tuple[EstimatedQuantity, ...]
+    ultimate: tuple[EstimatedQuantity, ...]
     fit: FitReport
     warnings: tuple[str, ...] = ()
     rivals: tuple[Rival, ...] = ()
@@ -228,7 +228,7 @@ def model_case(found: Identification, truth: TransferFunction | None) -> ModelCa
     low, high = found.ci95_low, found.ci95_high
     structure = found.estimate.structure
     estimates = tuple(
-        Estimate(
+        EstimatedQuantity(
             p.name, float(value), float(low[i]), float(high[i]), structure.unit(p),
             p.name not in found.undetermined, true_value(p.name, found.model, truth),
         )
@@ -285,7 +285,7 @@ def ultimate_estimates(
     frequency: float,
     frequency_std: float,
     truth: TransferFunction | None = None,
-) -> tuple[Estimate, ...]:
+) -> tuple[EstimatedQuantity, ...]:
     """Return K_u and w_u with their intervals; nothing where the model has none.
 
     :param gain: K_u [u/y].
@@ -310,6 +310,6 @@ def ultimate_estimates(
         ),
     )
     return tuple(
-        Estimate(n, v, v - NORMAL_95 * std, v + NORMAL_95 * std, unit, truth=t)
+        EstimatedQuantity(n, v, v - NORMAL_95 * std, v + NORMAL_95 * std, unit, truth=t)
         for n, v, std, t, unit in rows
     )

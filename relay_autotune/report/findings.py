@@ -49,7 +49,7 @@ class Chip:
 
 
 @dataclass(frozen=True)
-class Check:
+class Reason:
     """One reason to trust a result or not to.
 
     :param name: what was looked at.
@@ -70,7 +70,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Number:
+class NamedNumber:
     """A number of the experiment with its name.
 
     :param name: what it is.
@@ -188,12 +188,12 @@ def beside_present(case: Case) -> tuple[Row, ...]:
     )
 
 
-def repeats_of(case: Case) -> tuple[Number, ...]:
+def repeats_of(case: Case) -> tuple[NamedNumber, ...]:
     """Return how to make the same report, and the same test, again: names and commands.
 
     :param case: the experiment.
     """
-    found = [Number("The same report:", case.command)] if case.command else []
+    found = [NamedNumber("The same report:", case.command)] if case.command else []
     relay = case.settings
     if relay is not None and relay.amplitude > 0.0:
         values = {
@@ -209,7 +209,7 @@ def repeats_of(case: Case) -> tuple[Number, ...]:
             if value and math.isfinite(value)
         )
         command = f"ros2 run relay_autotune relay_node --ros-args {given}"
-        found.append(Number("The same relay in a live loop:", command))
+        found.append(NamedNumber("The same relay in a live loop:", command))
     return tuple(found)
 
 
@@ -230,7 +230,7 @@ def warnings_of(case: Case) -> tuple[str, ...]:
     return tuple(found)
 
 
-def checks_of(case: Case) -> tuple[Check, ...]:
+def checks_of(case: Case) -> tuple[Reason, ...]:
     """Return the checks of the result.
 
     :param case: the experiment.
@@ -238,10 +238,10 @@ def checks_of(case: Case) -> tuple[Check, ...]:
     return tuple(_check(found) for found in case.judgement.findings)
 
 
-def _check(found: Finding) -> Check:
+def _check(found: Finding) -> Reason:
     unit = f" {found.unit}" if found.unit else ""
     meaning = found.said if found.sentence else f"{found.what[0].upper()}{found.what[1:]}"
-    return Check(
+    return Reason(
         found.title,
         f"{_number(found.value)}{unit}, at most {_number(found.limit)}{unit}",
         f"{meaning}.",
@@ -253,7 +253,7 @@ def _number(value: float) -> str:
     return f"{value:g}" if math.isinf(value) else digits(value, 3)
 
 
-def numbers_of(case: Case) -> tuple[Number, ...]:
+def numbers_of(case: Case) -> tuple[NamedNumber, ...]:
     """Return the numbers of the limit cycle.
 
     :param case: the experiment.
@@ -262,17 +262,17 @@ def numbers_of(case: Case) -> tuple[Number, ...]:
     if cycle is None:
         return ()
     found = [
-        Number("period", f"{digits(cycle.period)} s"),
-        Number("high / low", f"{digits(cycle.period_high)} s / {digits(cycle.period_low)} s"),
-        Number("measurement", f"{digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
-        Number("cycles averaged", f"{len(cycle.cycles)}"),
-        Number("limit cycle", "settled" if cycle.converged else "still changing"),
+        NamedNumber("period", f"{digits(cycle.period)} s"),
+        NamedNumber("high / low", f"{digits(cycle.period_high)} s / {digits(cycle.period_low)} s"),
+        NamedNumber("measurement", f"{digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
+        NamedNumber("cycles averaged", f"{len(cycle.cycles)}"),
+        NamedNumber("limit cycle", "settled" if cycle.converged else "still changing"),
     ]
     if case.settings is not None:
         found += [
-            Number("relay", f"±{digits(case.settings.amplitude)} u"),
-            Number("bias", f"{digits(case.settings.bias)} u"),
-            Number("hysteresis", f"±{digits(case.settings.hysteresis)} y"),
+            NamedNumber("relay", f"±{digits(case.settings.amplitude)} u"),
+            NamedNumber("bias", f"{digits(case.settings.bias)} u"),
+            NamedNumber("hysteresis", f"±{digits(case.settings.hysteresis)} y"),
         ]
     return tuple(found)
 

@@ -18,9 +18,9 @@ from relay_autotune.escape import visible
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
-    Check,
     Chip,
-    Number,
+    NamedNumber,
+    Reason,
     Row,
     beside_present,
     checks_of,
@@ -78,10 +78,10 @@ class _Section:
     steps: tuple[str, ...]
     beside: tuple[Row, ...]
     warnings: tuple[str, ...]
-    checks: tuple[Check, ...]
-    numbers: tuple[Number, ...]
+    checks: tuple[Reason, ...]
+    numbers: tuple[NamedNumber, ...]
     doubts: tuple[str, ...]
-    repeats: tuple[Number, ...]
+    repeats: tuple[NamedNumber, ...]
     plates: tuple[_Drawn, ...]
     left_out: tuple[str, ...]
 

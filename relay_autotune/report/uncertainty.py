@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relay_autotune.report.case import Case, Estimate, ModelCase
+from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase
 from relay_autotune.report.style import BLUE, GREEN, GRID, INK, MUTED, VERMILLION, finish
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class _Row:
     """
 
     name: str
-    estimate: Estimate
+    estimate: EstimatedQuantity
     centre: float
 
     def ends(self) -> tuple[float, float] | None:

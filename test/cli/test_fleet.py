@@ -25,7 +25,7 @@ from relay_autotune.bag.reader import Selection
 from relay_autotune.cli import fleet, replay
 from relay_autotune.cli.fleet import in_processes, on_cluster
 from relay_autotune.cli.replay_bag import Job
-from relay_autotune.cli.results import COLUMNS, Results, rows
+from relay_autotune.cli.results import COLUMNS, ResultsFile, rows
 from relay_autotune.errors import BagError
 from relay_autotune.identification.known import Known
 
@@ -202,7 +202,7 @@ def test_a_table_in_parquet(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     output = tmp_path / "out.parquet"
     document = {"bag": "b", "experiments": [], "error": "is empty"}
-    with Results(str(output)) as results:
+    with ResultsFile(str(output)) as results:
         results.add("b", json.dumps(document))
     table = parquet.read_table(output)
     assert tuple(table.column_names) == COLUMNS
@@ -221,8 +221,11 @@ def test_files_that_cannot_be_results(tmp_path, capsys):
     assert status == 1
     assert "holds something else than results of replay" in err
     assert other.read_text() == "precious\n"
-    with Results(str(tmp_path / "used.jsonl")), pytest.raises(BagError, match="being written by"):
-        Results(str(tmp_path / "used.jsonl"))
+    with (
+        ResultsFile(str(tmp_path / "used.jsonl")),
+        pytest.raises(BagError, match="being written by"),
+    ):
+        ResultsFile(str(tmp_path / "used.jsonl"))
 
 
 def test_a_defect_in_one_bag_does_not_stop_the_others(tmp_path, capsys, monkeypatch):

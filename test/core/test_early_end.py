@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.analysis import analyse_alone, model_so_far
-from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, Finding
+from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
@@ -36,8 +36,8 @@ class Progress:
     cycle_count: int = 0
 
 
-def _known_to(width: float) -> Finding:
-    return Finding(ultimate_gain=-4.0, ultimate_gain_std=4.0 * width / 1.96)
+def _known_to(width: float) -> FitProgress:
+    return FitProgress(ultimate_gain=-4.0, ultimate_gain_std=4.0 * width / 1.96)
 
 
 def test_it_is_looked_at_at_switches_from_the_first_half_cycle_on():
@@ -74,10 +74,10 @@ def test_between_switches_it_waits_for_an_answer_and_longer_the_wider_the_interv
 @pytest.mark.parametrize(
     "found",
     [
-        Finding(),
-        Finding(ultimate_gain=1.0),
-        Finding(ultimate_gain=0.0, ultimate_gain_std=0.0),
-        Finding(ultimate_gain=1.0, ultimate_gain_std=math.inf),
+        FitProgress(),
+        FitProgress(ultimate_gain=1.0),
+        FitProgress(ultimate_gain=0.0, ultimate_gain_std=0.0),
+        FitProgress(ultimate_gain=1.0, ultimate_gain_std=math.inf),
         _known_to(0.0201),
         replace(_known_to(0.0201), ms=1.4, ms_low=1.39, ms_high=1.41),
     ],
@@ -90,19 +90,21 @@ def test_the_reason_names_what_was_sought():
     assert "K_u is within 0.0199 of it" in EarlyEnd(ULTIMATE_GAIN, 0.02).judge(
         Progress(), _known_to(0.0199)
     )
-    found = Finding(ms=1.4, ms_low=1.386, ms_high=1.414)
+    found = FitProgress(ms=1.4, ms_low=1.386, ms_high=1.414)
     assert "predicted Ms is within 0.01 of it" in EarlyEnd(MS, 0.02).judge(Progress(), found)
     assert EarlyEnd(MS, 0.02).judge(Progress(), replace(found, ms_high=math.inf)) == ""
     assert EarlyEnd(ULTIMATE_GAIN, 0.02).judge(Progress(), found) == ""
 
 
-def _ended(model: TransferFunction, sought: str, wanted: float) -> tuple[RelayExperiment, Finding]:
+def _ended(
+    model: TransferFunction, sought: str, wanted: float
+) -> tuple[RelayExperiment, FitProgress]:
     """Run a noisy test until it knows enough, as relay_node and identifier_node do together."""
     parameters = ExperimentParameters(amplitude=1.0, process_gain_sign=1, max_cycles=40)
     tune = RelayExperiment(parameters, 0.0, until_converged=False)
     plant = VirtualProcess(model, disturbances=Disturbances(noise_std=0.02), seed=3)
     early, fit = EarlyEnd(sought, wanted), RunningFit()
-    found = Finding()
+    found = FitProgress()
     for k in range(20_000):
         plant.command(tune.step(k * PERIOD, plant.measure(k * PERIOD)))
         if tune.finished:

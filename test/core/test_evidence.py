@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import ModelError, ParameterError, TuningError
-from relay_autotune.exchange.evidence import Evidence, check_finding
-from relay_autotune.experiment.early_end import Finding
+from relay_autotune.exchange.evidence import ExperimentFacts, check_finding
+from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
@@ -57,7 +57,7 @@ def gains_of(process: TransferFunction) -> Controller:
 @pytest.mark.parametrize("samples", [60, 2000])
 def test_the_process_itself_and_its_gains_pass(name: str, samples: int) -> None:
     process = PROCESSES[name]
-    evidence = Evidence.of(record_of(process, samples=samples))
+    evidence = ExperimentFacts.of(record_of(process, samples=samples))
     # The truth is G at the frequency of the oscillation; few samples tell it less well.
     truth = complex(process(1j * evidence.frequency))
     assert abs(evidence.answer / truth - 1.0) < (0.9 if samples < 100 else 0.1)
@@ -68,7 +68,7 @@ def test_the_process_itself_and_its_gains_pass(name: str, samples: int) -> None:
 @pytest.mark.parametrize("name", PROCESSES)
 def test_a_model_of_another_process_is_refused(name: str) -> None:
     process = PROCESSES[name]
-    evidence = Evidence.of(record_of(process))
+    evidence = ExperimentFacts.of(record_of(process))
     for factor in (-1.0, 50.0, 0.02, 1e300, -1e-300):
         wrong = replace(process, gain=factor * process.gain)
         with pytest.raises(ModelError, match=r"sign|answers|turned"):
@@ -78,7 +78,7 @@ def test_a_model_of_another_process_is_refused(name: str) -> None:
 
 
 def test_gains_that_cannot_be_are_refused() -> None:
-    evidence, good = Evidence.of(record_of(FOPDT)), gains_of(FOPDT)
+    evidence, good = ExperimentFacts.of(record_of(FOPDT)), gains_of(FOPDT)
     for change, said in (
         ({"kc": -good.kc}, "the sign of the process"),
         ({"kc": 1e308}, "loop gain"),
@@ -95,7 +95,7 @@ def test_gains_that_cannot_be_are_refused() -> None:
 
 @pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED, Outcome.UNKNOWN])
 def test_gains_of_an_experiment_that_was_not_completed_are_refused(outcome: Outcome) -> None:
-    evidence = Evidence.of(record_of(FOPDT, outcome=outcome))
+    evidence = ExperimentFacts.of(record_of(FOPDT, outcome=outcome))
     with pytest.raises(TuningError, match="completed ones alone"):
         evidence.check_gains(gains_of(FOPDT), FOPDT)
 
@@ -105,7 +105,7 @@ def test_half_cycles_tell_the_size_and_the_sign() -> None:
     n = whole.cycle_start[1]
     columns = ("time", "measurement", "command", "receive_time", "command_time")
     parts = {name: getattr(whole, name)[:n] for name in columns}
-    evidence = Evidence.of(replace(whole, **parts, cycle_start=(), held_input=None))
+    evidence = ExperimentFacts.of(replace(whole, **parts, cycle_start=(), held_input=None))
     assert not evidence.whole
     evidence.check_model(FOPDT)
     evidence.check_gains(gains_of(FOPDT), FOPDT)
@@ -118,22 +118,22 @@ def test_half_cycles_tell_the_size_and_the_sign() -> None:
 def test_a_record_at_rest_tells_nothing_that_gains_could_be_compared_with() -> None:
     still = Record(np.arange(5.0), np.ones(5), np.ones(5), outcome=Outcome.COMPLETED)
     with pytest.raises(TuningError, match="no oscillation"):
-        Evidence.of(still).check_gains(gains_of(FOPDT), FOPDT)
+        ExperimentFacts.of(still).check_gains(gains_of(FOPDT), FOPDT)
 
 
 def test_a_finding_has_the_sign_and_the_size_of_the_oscillation() -> None:
     facts = {"sign": 1, "amplitude": 0.2, "relay": 0.5}
     # 4 mu/(pi a) is 3.18.
-    check_finding(Finding(3.0, 0.1), **facts)
-    check_finding(Finding(math.nan, math.nan, 1.4, 1.3, 1.5), **facts)
+    check_finding(FitProgress(3.0, 0.1), **facts)
+    check_finding(FitProgress(math.nan, math.nan, 1.4, 1.3, 1.5), **facts)
     with pytest.raises(ParameterError, match="other sign"):
-        check_finding(Finding(-3.0, 0.1), **facts)
+        check_finding(FitProgress(-3.0, 0.1), **facts)
     for gain in (1e308, 1e-308, 200.0):
         with pytest.raises(ParameterError, match=r"oscillation shows about 3\.18"):
-            check_finding(Finding(gain, 0.0), **facts)
+            check_finding(FitProgress(gain, 0.0), **facts)
     # Without a whole cycle the sign alone is known, on a set-point not even that.
-    check_finding(Finding(200.0, 0.0), sign=1)
-    check_finding(Finding(-200.0, 0.0), sign=0)
+    check_finding(FitProgress(200.0, 0.0), sign=1)
+    check_finding(FitProgress(-200.0, 0.0), sign=0)
     for wrong in ((math.inf, 1.0), (1.0, -1.0), (1.0, 0.1, 0.5), (1.0, 0.1, 1.4, 1.6, 1.2)):
         with pytest.raises(ParameterError, match="nothing is concluded"):
-            Finding(*wrong)
+            FitProgress(*wrong)

@@ -20,7 +20,7 @@ from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.exchange.document import judgement_fields, judgement_of_fields
 from relay_autotune.exchange.fields import of_document, of_message, to_document, to_message
 from relay_autotune.exchange.messages import gains_from_message, identification_from_message
-from relay_autotune.experiment.early_end import Finding as Progress
+from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import FitReport, Identification, Rival, Validation
@@ -36,7 +36,7 @@ from relay_autotune.verdict import Finding, Judgement, Result
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = (
     *(Identification, FitReport, Validation, FrequencyPoint, Combination, Rival),
-    *(Gains, Performance, Finding, RelaySettings, LimitCycle, Cycle, Progress),
+    *(Gains, Performance, Finding, RelaySettings, LimitCycle, Cycle, FitProgress),
 )
 # As long as the record, and what is told by other fields of the document.
 UNTOLD = {(Identification, "fitted"), (Identification, "parts"), (LimitCycle, "std")}
@@ -85,8 +85,10 @@ def results(draw: Any, kind: Any) -> Any:
         # Documents have the model of a rival alone.
         alone = Estimate.of_model(draw(estimates()).model)
         return Rival(alone, draw(st.floats(0.0, 1.0)))
-    if kind is Progress:
-        return Progress(draw(POSITIVE), draw(POSITIVE), 1.5, 1.2, draw(st.floats(1.5, math.inf)))
+    if kind is FitProgress:
+        return FitProgress(
+            draw(POSITIVE), draw(POSITIVE), 1.5, 1.2, draw(st.floats(1.5, math.inf))
+        )
     found: dict[str, Any] = {}
     for each in (f for f in told_fields(kind) if not f.derived):
         inner = [a for a in get_args(each.kind) if a not in (type(None), ...)]
@@ -158,7 +160,7 @@ def test_every_field_of_a_result_is_declared(kind):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", [k for k in RESULTS if k not in (LimitCycle, Cycle, Progress)])
+@pytest.mark.parametrize("kind", [k for k in RESULTS if k not in (LimitCycle, Cycle, FitProgress)])
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_a_result_comes_back_from_its_document(kind, data):
@@ -195,7 +197,7 @@ def test_gains_come_back_from_their_message(value):
     assert_same(gains_from_message(message), value)
 
 
-@pytest.mark.parametrize("kind", [RelaySettings, Progress])
+@pytest.mark.parametrize("kind", [RelaySettings, FitProgress])
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_what_the_relay_did_and_found_comes_back_from_its_message(kind, data):
@@ -236,7 +238,7 @@ SAMPLES = {"settings", "lead_in", "time", "measurement", "command"}
 @pytest.mark.parametrize(
     ("name", "parts", "beside"),
     [
-        ("TransferFunction", (Progress(), value_of(Identification)), ENVELOPE),
+        ("TransferFunction", (FitProgress(), value_of(Identification)), ENVELOPE),
         ("PidGains", (value_of(Gains),), ENVELOPE),
         ("RelaySettings", (value_of(RelaySettings),), set()),
         ("RelayCycle", (value_of(Cycle),), ENVELOPE | SAMPLES),

@@ -170,7 +170,7 @@ class StepTest:
 
 
 @dataclass(frozen=True)
-class Curve:
+class StepCurve:
     """The baseline, and a polynomial that leaves it when the dead time is over.
 
     :param dead_time: D [s].
@@ -314,7 +314,7 @@ def _return_time(test: StepTest, noise_known: float) -> float:
     return float(since[i])
 
 
-def _fitted(test: StepTest, until: float, known: float) -> tuple[Curve, FloatArray | None]:
+def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, FloatArray | None]:
     """Return the smooth curve; and the covariance of dead time, coefficients and baseline."""
     end = test.begin + _BEYOND * until
     part = test.time <= end
@@ -365,7 +365,7 @@ def _fitted(test: StepTest, until: float, known: float) -> tuple[Curve, FloatArr
     if math.isnan(known):
         dead_time = _refined(lambda p: solved(p, powers)[0], dead_time, places)
     cost, solution, columns = solved(dead_time, powers)
-    curve = Curve(dead_time, span - dead_time, solution)
+    curve = StepCurve(dead_time, span - dead_time, solution)
     jacobian = columns
     if math.isnan(known):
         slope = curve.polynomial().deriv()(np.maximum(since - dead_time, 0.0))
@@ -409,7 +409,7 @@ def _columns(since: FloatArray, dead_time: float, span: float, powers: int) -> F
     return np.column_stack((moved, np.ones(since.size)))
 
 
-def _values(curve: Curve, step: float) -> FloatArray:
+def _values(curve: StepCurve, step: float) -> FloatArray:
     """Read extremum and return off the curve, and solve."""
     deviation = curve.polynomial()
     slope = deviation.deriv()
@@ -438,7 +438,7 @@ def _real_roots(polynomial: np.polynomial.Chebyshev, span: float) -> FloatArray:
     return np.sort(real[(real > 1e-9 * span) & (real <= span)])
 
 
-def _jacobian(curve: Curve, step: float) -> FloatArray:
+def _jacobian(curve: StepCurve, step: float) -> FloatArray:
     """Return the derivatives of the values by dead time, coefficients and baseline."""
     end = curve.dead_time + curve.span
 
@@ -446,7 +446,7 @@ def _jacobian(curve: Curve, step: float) -> FloatArray:
         dead_time = float(x[0])
         # Moved by its coefficients alone, the curve reaches as far as it does.
         span = curve.span if dead_time == curve.dead_time else end - dead_time
-        return _values(Curve(dead_time, span, x[1:]), step)
+        return _values(StepCurve(dead_time, span, x[1:]), step)
 
     at = np.concatenate(([curve.dead_time], curve.coefficients))
     steps = np.full(at.size, _STEP * float(np.abs(curve.coefficients[:-1]).max()))
@@ -455,7 +455,7 @@ def _jacobian(curve: Curve, step: float) -> FloatArray:
 
 
 def _report(
-    record: Record, test: StepTest, curve: Curve, values: FloatArray
+    record: Record, test: StepTest, curve: StepCurve, values: FloatArray
 ) -> tuple[FitReport, FloatArray]:
     """Compare the model with the whole step response."""
     u = PiecewiseConstant(np.array([test.begin]), np.array([test.step]), 0.0)

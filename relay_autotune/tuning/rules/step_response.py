@@ -25,7 +25,7 @@ _MONOTONE = 0.02
 
 
 @dataclass(frozen=True)
-class StepResponse:
+class ReactionCurve:
     """Gain, lag and delay of a step response.
 
     :param gain: K; of an integrating process the rate per unit step [y/u, y/(u s)].
@@ -38,7 +38,7 @@ class StepResponse:
     delay: float
 
 
-def step_response(model: TransferFunction) -> StepResponse:
+def step_response(model: TransferFunction) -> ReactionCurve:
     """Return K, T and L of a process, from its own exact step response.
 
     :param model: a process with one integrator at most.
@@ -53,9 +53,9 @@ def step_response(model: TransferFunction) -> StepResponse:
     if model.integrators:
         # The tangent in the long run begins to rise after all delays and lags.
         shift = sum(t.real for t in model.time_constants) - sum(z.real for z in model.zeros)
-        return StepResponse(model.gain, math.inf, model.dead_time + shift)
+        return ReactionCurve(model.gain, math.inf, model.dead_time + shift)
     if is_first_order(model):
-        return StepResponse(model.gain, model.time_constants[0].real, model.dead_time)
+        return ReactionCurve(model.gain, model.time_constants[0].real, model.dead_time)
     return _measured(model)
 
 
@@ -105,9 +105,9 @@ class _Rise:
         return float(brentq(missing, self.time[first - 1], self.time[first], rtol=1e-12))
 
 
-def _measured(model: TransferFunction) -> StepResponse:
+def _measured(model: TransferFunction) -> ReactionCurve:
     rise = _Rise(model)
     slopes = np.gradient(rise.y, rise.time)
     top = int(np.argmax(slopes))
     delay = float(rise.time[top] - rise.y[top] / slopes[top])
-    return StepResponse(model.gain, rise.time_of(_WHOLE) - delay, max(delay, 0.0))
+    return ReactionCurve(model.gain, rise.time_of(_WHOLE) - delay, max(delay, 0.0))
