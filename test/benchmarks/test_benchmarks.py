@@ -23,6 +23,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
 ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted((ROOT / "benchmarks").glob("[!_]*.py"))
 PAGE = (ROOT / "docs" / "benchmarks.md").read_text()
 QUICK = {
     "fit_time": ("--quick",),
@@ -55,10 +56,23 @@ QUICK = {
 LONG = {"unmodelled": ("--quick",)}
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "benchmarks").glob("[!_]*.py")), ids=lambda p: p.stem
+)
 def test_it_finds_what_it_imports(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(path.parent)
     importlib.import_module(path.stem)
+
+
+def test_each_benchmark_is_in_one_group_of_the_list() -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks")], capture_output=True, text=True, timeout=60
+    )
+    listed = re.findall(r"^  (\w+) +\S", done.stdout, re.MULTILINE)
+    runnable = [
+        p.stem for p in (ROOT / "benchmarks").glob("[!_]*.py") if "def main" in p.read_text()
+    ]
+    assert sorted(listed) == sorted(runnable)
 
 
 @pytest.mark.nightly
