@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.escape import visible
-from relay_autotune.report.case import Case, Estimate
+from relay_autotune.report.case import Case, EstimatedQuantity
 from relay_autotune.report.findings import (
     beside_present,
     checks_of,
@@ -176,7 +176,7 @@ def _checks(case: Case) -> list[list[str]]:
     ]
 
 
-def _estimate(estimate: Estimate) -> list[str]:
+def _estimate(estimate: EstimatedQuantity) -> list[str]:
     interval = "not estimated"
     if math.isfinite(estimate.low):
         interval = f"{digits(estimate.low)} to {digits(estimate.high)}"
