@@ -31,7 +31,7 @@ from relay_autotune.escape import visible
 
 # Lists of texts that name the elements of the arrays beside them, and of those in structures
 # beside them; and the field by which an element of an array of messages is named.
-_NAME_LISTS = ("name", "joint_names", "dof_names", "interface_names", "interface_groups", "names")
+NAME_LISTS = ("name", "joint_names", "dof_names", "interface_names", "interface_groups", "names")
 _OWN_NAME = "name"
 
 _STEP = re.compile(r"\.?([A-Za-z]\w*)|\[(\d{1,9})\]|\[(?:([A-Za-z]\w*)=)?([^\[\]]+)\]")
@@ -135,12 +135,34 @@ def _spelt(root: Struct, path: str) -> str:
     """Return a path with NAME in place of each 0 where the elements have names."""
     if "[" not in path:
         return path
+    return written(
+        [
+            Element("NAME", step.names)
+            if isinstance(step, Element) and step.names and isinstance(step.chosen, int)
+            else step
+            for step in steps_of(root, path, "")
+        ]
+    )
+
+
+def written(steps: Sequence[Step]) -> str:
+    """Return the path of some steps."""
     return "".join(
-        f".{step}"
-        if isinstance(step, str)
-        else step.shown(step.chosen if isinstance(step.chosen, str) else "NAME")
-        for step in steps_of(root, path, "")
+        f".{step}" if isinstance(step, str) else _as_written(step) for step in steps
     ).removeprefix(".")
+
+
+def names_in(steps: Sequence[Step], message: Any) -> list[str]:
+    """Return the names of the elements in a message that the first named step chooses from.
+
+    :param steps: of a path, as :func:`steps_of` returns them.
+    :param message: as a Python object.
+    """
+    for at, step in enumerate(steps):
+        if isinstance(step, Element) and step.names is not None:
+            trail = _walk(message, _way(steps[:at]))
+            return [_text(name) for name in _names(step.names, trail[-1], trail)]
+    return []
 
 
 def _parsed(path: str, of: str) -> Iterator[str | tuple[str, str]]:
@@ -187,7 +209,7 @@ def _element(
             f"[{names[0]}={name}] or [{names[1]}={name}]"
         )
     raise FieldError(
-        f"{of} has no list of names for {path!r}, such as {', '.join(_NAME_LISTS[:4])}; expected "
+        f"{of} has no list of names for {path!r}, such as {', '.join(NAME_LISTS[:4])}; expected "
         f"the place of the element, as in [0], or the list, as in [LIST={name}]"
     )
 
@@ -211,7 +233,7 @@ def _own_names(array: Repeated, around: Sequence[tuple[int, Struct]]) -> Names |
             return Names(_OWN_NAME, None)
     for depth, struct in reversed(around):
         fields = dict(struct.fields)
-        found = [name for name in _NAME_LISTS if _is_list(fields.get(name))]
+        found = [name for name in NAME_LISTS if _is_list(fields.get(name))]
         if len(found) == 1:
             return Names(found[0], depth)
         if found:
@@ -299,12 +321,7 @@ class _Finder:
         :raises FieldError: if it is not there, or not clear.
         """
         by = self._element.names
-        if by is None:
-            names: list[Any] = []
-        elif by.depth is None:
-            names = [getattr(item, by.field) for item in array]
-        else:
-            names = getattr(trail[by.depth], by.field)
+        names = [] if by is None else _names(by, array, trail)
         count = len(array)
         if names != self._seen or count != self._count:
             self._place = self._found(names, count)
@@ -345,15 +362,19 @@ class _Finder:
 
     def _shown(self, last: str = "") -> str:
         """Return the path up to the element, with something else in its place if given."""
-        text = ""
-        for step in self._steps[: self._at]:
-            text += f".{step}" if isinstance(step, str) else _as_written(step)
-        return visible((text + (last or _as_written(self._element))).removeprefix("."))
+        return visible(written(self._steps[: self._at]) + (last or _as_written(self._element)))
 
 
 def _as_written(element: Element) -> str:
     chosen = element.chosen
     return element.shown(chosen) if isinstance(chosen, str) else f"[{chosen}]"
+
+
+def _names(by: Names, array: Any, trail: Sequence[Any]) -> Sequence[Any]:
+    if by.depth is None:
+        return [getattr(item, by.field) for item in array]
+    found: Sequence[Any] = getattr(trail[by.depth], by.field)
+    return found
 
 
 def _text(name: Any) -> str:

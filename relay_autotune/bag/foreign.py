@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from relay_autotune.bag.fields import split_name
+from relay_autotune.bag.joints import Choice, named_pair
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
 from relay_autotune.bag.signals import Signal, join
 from relay_autotune.bag.topics import Topics
@@ -26,18 +27,33 @@ _CLOCK_DIFFERENCE_NS = 100_000_000
 
 
 def experiments_of_pair(
-    topics: Topics, measurement: str | None, command: str | None, *, whole: bool = False
+    topics: Topics,
+    measurement: str | None,
+    command: str | None,
+    *,
+    joint: str = "",
+    joint_order: tuple[str, ...] = (),
+    whole: bool = False,
 ) -> tuple[list[Record], list[str]]:
     """Return the experiments in two topics, and notes about them.
 
     :param topics: the bag.
     :param measurement: ``TOPIC[:FIELD]`` of the measurement; None: found.
     :param command: that of the command; None: found.
+    :param joint: name of the joint that both are of; empty: none is named.
+    :param joint_order: the joints in the order of commands that do not name them.
     :param whole: whether they are one experiment, whatever they look like.
     :raises SelectionError: if the names do not fit, or more than one pair does.
     :raises BagError: if nothing stands out of the noise.
     """
+    first: list[str] = []
+    if joint:
+        measurement, command, why = named_pair(
+            topics, Choice(joint, measurement, command, joint_order)
+        )
+        first = [f"using --measurement {measurement} --command {command}: {why}"]
     pair, notes = _pair(topics, measurement, command)
+    notes = [*first, *notes]
     names = (pair.measurement.name, pair.command.name)
     measured, commanded = topics.signals(names).values()
     notes = [*notes, *measured.notes, *commanded.notes]

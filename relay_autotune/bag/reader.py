@@ -55,6 +55,8 @@ class Selection:
     :param start: beginning of the part to use [s from the first sample]; None: all.
     :param end: end of the part to use [s from the first sample]; None: all.
     :param clock: which time of a message counts, one of ``CLOCKS``.
+    :param joint: name of the joint that measurement and command are of; empty: none is named.
+    :param joint_order: the joints in the order of commands that do not name them.
     :param largest_chunk: size of a chunk, or a message outside of chunks, beyond which it is left
         out [bytes].
     """
@@ -66,6 +68,8 @@ class Selection:
     end: float | None = None
     clock: str = CLOCKS[0]
     largest_chunk: int = LARGEST_CHUNK
+    joint: str = ""
+    joint_order: tuple[str, ...] = ()
 
     @property
     def is_part(self) -> bool:
@@ -96,6 +100,11 @@ def read_experiments(
     if len(paths) > 1 and any(part.suffix.lower() == ".csv" for part in paths):
         raise SelectionError("CSV files cannot be joined to one timeline; expected bags")
     if path.suffix.lower() == ".csv":
+        if wanted.joint:
+            raise SelectionError(
+                f"--joint {wanted.joint} is for bags, whose messages name joints; of {path} name "
+                "two columns with --measurement and --command"
+            )
         records, notes = _of_csv(path, wanted)
     elif wanted.time is not None:
         raise SelectionError(f"--time names a column of a CSV file, but {path} is not one")
@@ -180,7 +189,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
     if not topics.types():
         raise BagError("; ".join((f"{topics.path} holds no topic", *topics.notes)))
-    if wanted.measurement is not None or wanted.command is not None:
+    if wanted.joint or wanted.measurement is not None or wanted.command is not None:
         records, notes = _of_pair(topics, wanted)
     else:
         records, notes = recorded_experiments(topics)
@@ -197,7 +206,14 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
     # Our own recordings need neither the search for a pair nor that for experiments.
     from relay_autotune.bag.foreign import experiments_of_pair
 
-    return experiments_of_pair(topics, wanted.measurement, wanted.command, whole=wanted.is_part)
+    return experiments_of_pair(
+        topics,
+        wanted.measurement,
+        wanted.command,
+        joint=wanted.joint,
+        joint_order=wanted.joint_order,
+        whole=wanted.is_part,
+    )
 
 
 def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:

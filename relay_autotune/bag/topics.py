@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.cdr import Path
-from relay_autotune.bag.decode import decode_messages
+from relay_autotune.bag.decode import decode_messages, decoded_message
 from relay_autotune.bag.fields import may_be_single, named_field, only_field, split_name, stamp_of
 from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
 from relay_autotune.bag.locate import Messages
@@ -110,6 +111,33 @@ class Topics:
             only = only_field(root)
             alone &= only is not None and named_field(root, only, topic) == path
         return topic if alone else f"{topic}:{wanted}"
+
+    def definition_of(self, topic: str) -> bytes:
+        """Return the definition of a topic's messages; of several, all."""
+        return b"\n".join(channel.definition for _, channel in self._channels(topic))
+
+    def root_of(self, topic: str) -> Struct:
+        """Return the type of a topic's messages, the first one's.
+
+        :raises BagError: if its definition makes no sense.
+        """
+        return self._type(self._channels(topic)[0][1])
+
+    def first_messages(self, topic: str, count: int) -> list[Any]:
+        """Return the first messages of a topic, decoded, those that fit its first type.
+
+        :param topic: its name.
+        :param count: how many at most.
+        """
+        root, found = self.root_of(topic), []
+        key, channel = self._channels(topic)[0]
+        for _, _, messages in self._messages({(key, channel.id): None}):
+            for begin, end in zip(messages.begin.tolist(), messages.end.tolist(), strict=True):
+                with suppress(BagError):
+                    found.append(decoded_message(root, bytes(messages.content[begin:end])))
+                if len(found) == count:
+                    return found
+        return found
 
     def single_numbers(self) -> list[str]:
         """Return the topics whose messages are there for one number."""

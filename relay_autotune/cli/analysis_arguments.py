@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.reader import Selection
@@ -49,7 +50,16 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         "--join", action="store_true", help="take all BAGs as one recording on one timeline"
     )
     taken.add_argument(
-        "--joint", action="store_true",
+        "--joint", action="append", default=[], metavar="NAME",
+        help="find measurement and command of this joint by its name; of several, one after the "
+        "other",
+    )  # fmt: skip
+    taken.add_argument(
+        "--joint-order", metavar="NAME,NAME,...",
+        help="joints of commands that do not name them, as in the controller's parameter joints",
+    )  # fmt: skip
+    taken.add_argument(
+        "--jointly", action="store_true",
         help="take all experiments as tests of one process, with one model",
     )  # fmt: skip
     taken.add_argument(
@@ -93,12 +103,19 @@ def jobs_of(
     start, end = options.start, options.end
     if start is not None and end is not None and start >= end:
         raise SelectionError(f"--start {start:g} is not before --end {end:g}")
-    jointly = options.joint or options.method in ONLY_JOINT
+    joints = list(dict.fromkeys(options.joint)) or [""]
+    order = (
+        tuple(name.strip() for name in options.joint_order.split(","))
+        if options.joint_order
+        else ()
+    )
+    _check_joints(joints, order)
+    jointly = options.jointly or options.method in ONLY_JOINT
     names = list(dict.fromkeys(recordings))
     groups = [tuple(names)] if jointly or options.join else [(name,) for name in names]
     return [
         Job(
-            name=visible(", ".join(group)),
+            name=visible(", ".join(group) + (f" {joint}" if joint else "")),
             paths=group,
             selection=Selection(
                 options.measurement,
@@ -108,6 +125,8 @@ def jobs_of(
                 end,
                 options.clock,
                 options.max_chunk,
+                joint,
+                order,
             ),
             method=options.method,
             rule=options.rule,
@@ -117,5 +136,27 @@ def jobs_of(
             options=asked,
         )
         for group in groups
+        for joint in joints
         if group
     ]
+
+
+def _check_joints(joints: Sequence[str], order: Sequence[str]) -> None:
+    """Refuse joints that cannot be.
+
+    :raises SelectionError: with what to write instead.
+    """
+    for joint in joints:
+        if joint and Path(joint).exists():
+            raise SelectionError(
+                f"--joint names a joint, but {joint} is a recording; to take all experiments as "
+                f"tests of one process, write --jointly"
+            )
+        if joint and order and joint not in order:
+            raise SelectionError(
+                f"--joint-order {','.join(order)} does not have the joint {joint}"
+            )
+    if order and not joints[0]:
+        raise SelectionError("--joint-order is for a joint: name it with --joint")
+    if len(set(order)) < len(order):
+        raise SelectionError(f"--joint-order {','.join(order)} names a joint twice")

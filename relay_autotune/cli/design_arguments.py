@@ -62,7 +62,7 @@ def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
         "--node", default="/pid_controller", metavar="NAME", help="whose file it is (%(default)s)"
     )
     group.add_argument(
-        "--dof", default="joint", metavar="NAME", help="its degree of freedom (%(default)s)"
+        "--dof", metavar="NAME", help="its degree of freedom (that of --joint, else joint)"
     )
     group.add_argument("--command-min", type=finite, metavar="U", help="lower clamp in it [u]")
     group.add_argument("--command-max", type=finite, metavar="U", help="upper clamp in it [u]")
@@ -79,4 +79,5 @@ def export_target(options: argparse.Namespace) -> Target:
 
     limits = {n: getattr(options, n) for n in ("command_min", "command_max")}
     given = {n: v for n, v in limits.items() if v is not None}
-    return Target(node=options.node, dof=options.dof, **given)
+    dof = options.dof or next(iter(getattr(options, "joint", ())), "joint")
+    return Target(node=options.node, dof=dof, **given)

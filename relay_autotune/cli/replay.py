@@ -53,9 +53,10 @@ Examples, with the recordings that come with the package:
   replay --ms 1.6 --export pid_controller --dof heater bags/step_test > g.yaml
   replay --web bags/step_test
   replay --method chang --gain 1.65 bags/unbiased_relay_with_noise
-  replay --joint bags/biased_relay bags/unbiased_relay_with_noise
+  replay --jointly bags/biased_relay bags/unbiased_relay_with_noise
 And with some of your own:
   replay --measurement /imu:angular_velocity.z --command /wheel/volt robot_bag
+  replay --joint left_wheel --joint right_wheel --output wheels.csv robot_bag
   replay --method li without_extra_delay with_extra_delay
 """
 

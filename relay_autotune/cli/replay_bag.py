@@ -161,7 +161,7 @@ def _exported(
     if len(found) > 1:
         raise SelectionError(
             f"{len(found)} experiments have gains and a file holds those of one: choose it by "
-            "--start and --end, or take all for tests of one process by --joint"
+            "--start and --end, or take all for tests of one process by --jointly"
         )
     only = found[0]
     if only.verdict is not Verdict.TRUSTED and not accept_doubtful:
