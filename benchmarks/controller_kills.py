@@ -18,12 +18,13 @@ are in force.
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +51,10 @@ from relay_autotune_msgs.msg import PidGains, TransferFunction
 RUNS = 200
 # Kills come at a random moment between the call of ~/apply and this time after it [s].
 WITHIN = 2.5
-PHASES = ("apply", "between", "verify", "after it")
+SILENT = "any; that node is silent"
+PHASES = ("apply", "between", "verify", "after it", SILENT)
+# A target that has seen many peers die may answer nobody any more: kills until a new one comes.
+EACH = 25
 
 
 @dataclass(frozen=True)
@@ -144,6 +148,14 @@ def own(runs: int, deadline: float) -> list[Kill]:
 def another(runs: int, deadline: float) -> list[Kill]:
     """Kill a node that sets another node's gains: that node must get back its previous gains."""
     found: list[Kill] = []
+    while len(found) < runs and time.monotonic() < deadline:
+        found += _of_one_target(range(len(found), min(len(found) + EACH, runs)), deadline)
+    return found
+
+
+def _of_one_target(counts: Iterable[int], deadline: float) -> list[Kill]:
+    """Return kills with one other node, until it does not answer any more."""
+    found: list[Kill] = []
     with rig_of_its_own() as rig:
         loop = Loop(rig)
         before = loop.values()
@@ -152,7 +164,7 @@ def another(runs: int, deadline: float) -> list[Kill]:
         model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
         model.numerator, model.denominator = [0.6], [0.3, 1.0]
         loop.models.publish(model)
-        for count in range(runs):
+        for count in counts:
             if time.monotonic() > deadline:
                 break
             random = Random(f"another {count}")
@@ -172,13 +184,21 @@ def another(runs: int, deadline: float) -> list[Kill]:
             loop.start()
             # Gains stay if ~/apply was finished and no verification was running.
             allowed = [before, [kc, kc / 0.3, 0.0]] if phase == "between" else [before]
-            problem = ""
+            values: list[float] = []
+
+            def are_right(values: list[float] = values, right: Any = allowed) -> bool:
+                values[:] = loop.values()
+                return values in right
+
             try:
-                rig.until(lambda right=allowed: loop.values() in right, "the gains of before")
+                rig.until(are_right, "the gains of before")
             except AssertionError:
-                problem = str(loop.values())
+                if not values:
+                    found.append(Kill("another node's", SILENT, math.nan, ""))
+                    break
+            problem = "" if values in allowed else str(values)
             found.append(Kill("another node's", phase, time.monotonic() - begun, problem))
-            if loop.values() != before:
+            if values != before:
                 loop.trigger("revert")
     return found
 
@@ -199,6 +219,7 @@ def rows(kills: list[Kill]) -> list[tuple[object, ...]]:
                 times = [kill.seconds for kill in some]
                 wrong = sum(1 for kill in some if kill.problem)
                 shown = (f"{np.median(times):.1f}", f"{max(times):.1f}")
+                shown = ("-", "-") if phase == SILENT else shown
                 found.append((kind, phase, len(some), wrong, *shown))
     return found
 
