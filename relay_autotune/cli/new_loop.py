@@ -17,7 +17,7 @@ from relay_autotune.cli.asking import asked, number_of, pair_of
 from relay_autotune.cli.export import number
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
-from relay_autotune.errors import SelectionError
+from relay_autotune.errors import ParameterError, SelectionError
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
@@ -27,6 +27,9 @@ START_WITHIN = 30.0
 # What a checklist says to type, and the flags that give these parameters here.
 _TYPED = re.compile(r"; type: ros2 param set \S+ (\w+) \w+$")
 _FLAGS = {
+    "measurement_field": "--field",
+    "command_field": "--command-field",
+    "command_message": "--command-message",
     "baseline": "--at",
     "measurement_min": "--within",
     "measurement_max": "--within",
@@ -117,7 +120,11 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         command_kind = client.kind_of(options.command, options.wait, published=False)
         others = options.command_message or ""
         command_field = options.command_field or "data"
-        present = client.commanded(options.command, command_kind, command_field, others)
+        try:
+            client.require_field(kind, options.field)
+            present = client.commanded(options.command, command_kind, command_field, others)
+        except ParameterError as error:
+            raise SelectionError(_as_flags(str(error))) from None
         # Its mean command is the baseline where a controller commands through relay_node.
         controlled = client.is_controlled()
     told = "" if math.isnan(present) else f"{present:.6g}"
@@ -167,3 +174,10 @@ def with_flags(check: str) -> str:
     :param check: the line; its node ends with the command, so that nothing can be set on it.
     """
     return _TYPED.sub(lambda found: f"; give {_FLAGS.get(found[1], found[1])}", check)
+
+
+def _as_flags(text: str) -> str:
+    """Return an error's text with the flags in place of the parameters of the same meaning."""
+    for parameter, flag in _FLAGS.items():
+        text = re.sub(rf"\b{parameter}\b", flag, text)
+    return text

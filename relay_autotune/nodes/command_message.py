@@ -62,6 +62,7 @@ class CommandMessage:
         self._value, self._put = reading(steps), setting(steps)
         if steps == ("data",):
             self._put = _set_data
+        self._beside = "what other_commands says" if taken else given or "zeros"
         self._stamped = hasattr(message, "header")
         self._now_ns = now_ns
         self._message: Any = None
@@ -117,8 +118,10 @@ class CommandMessage:
 
     @property
     def described(self) -> str:
-        """What is commanded, for people."""
-        return self.type_name if self.field == "data" else f"{self.field} of {self.type_name}"
+        """What is commanded, and what stands beside it, for people."""
+        if self.field == "data":
+            return self.type_name
+        return f"{self.field} of {self.type_name}, beside {self._beside},"
 
     def _only_element(self, root: Struct, field: str, message: Any, *, taken: bool) -> str:
         kind = dict(root.fields).get("data")

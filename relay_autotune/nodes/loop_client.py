@@ -28,6 +28,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.command_message import CommandMessage
+from relay_autotune.nodes.live_types import reader_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
@@ -176,6 +177,15 @@ class LoopClient:
     def is_controlled(self) -> bool:
         """Tell whether a controller of this namespace publishes controller_command."""
         return self._node.count_publishers(self._resolved("controller_command")) > 0
+
+    def require_field(self, type_name: str, field: str) -> None:
+        """Refuse a field that the measurement's type does not have.
+
+        :param type_name: of the measurement's messages.
+        :param field: path of the measurement in them.
+        :raises ParameterError: with the fields that it has.
+        """
+        reader_of(type_name, field)
 
     def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         """Return the mean of the commands that are published now; NaN: none are.

@@ -11,10 +11,11 @@ import sys
 from typing import Any
 
 import pytest
+import yaml
 
 from relay_autotune.cli.asking import agrees
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
-from relay_autotune.errors import LoopError, SelectionError
+from relay_autotune.errors import LoopError, ParameterError, SelectionError
 
 
 class Looker:
@@ -28,6 +29,10 @@ class Looker:
 
     def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         return self.present
+
+    def require_field(self, type_name: str, field: str) -> None:
+        if field == "nothing":
+            raise ParameterError(f"measurement_field: {type_name} has no field {field!r}")
 
     def is_controlled(self) -> bool:
         return self.controlled
@@ -124,3 +129,22 @@ def test_flags_of_a_new_loop_need_both_topics() -> None:
         is_new_loop(given)
     given.within = None
     assert not is_new_loop(given)
+
+
+def test_commands_within_messages_become_parameters() -> None:
+    given = options(
+        "--within", "0", "1", "--at", "0", "--command-within", "0", "1", "--field", "velocity[l]",
+        "--command-field", "data[1]", "--command-message", "{data: [0, 0]}",
+        "--command-period", "0.1",
+    )  # fmt: skip
+    found = arguments(Looker(), given)
+    assert found["measurement_field"] == "velocity[l]"
+    assert found["command_field"] == "data[1]"
+    # The value of a parameter is read as YAML once more.
+    assert yaml.safe_load(yaml.safe_load(found["command_message"])) == {"data": [0, 0]}
+    assert found["command_period"] == "0.1"
+
+
+def test_a_field_that_is_not_there_is_named_by_its_flag() -> None:
+    with pytest.raises(SelectionError, match="--field: std_msgs/msg/Float32 has no field"):
+        arguments(Looker(), options("--within", "0", "1", "--at", "0", "--field", "nothing"))

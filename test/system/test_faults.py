@@ -20,7 +20,7 @@ from faulty_loop import BASELINE, DEFAULTS, SAFE, Loop
 from loop_rig import RELIABLE, Rig
 from rclpy.node import Node
 from ros_domain import free_domain
-from std_msgs.msg import Float64
+from std_msgs.msg import Float32, Float64
 
 from relay_autotune_msgs.msg import RelayExperiment
 
@@ -148,13 +148,17 @@ def test_a_process_that_does_not_settle_by_itself_is_refused_without_a_hold(loop
     loop.set(process_type="self_regulating", start_without_hold=False)
 
 
-def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
-    from_relay = rig.listen("command", Float64, RELIABLE)
+@pytest.mark.parametrize("kind", [Float64, Float32])
+def test_in_takeover_the_node_is_silent_but_for_its_tune(
+    rig: Rig, kind: type[Float64 | Float32]
+) -> None:
+    from_relay = rig.listen("command", kind, RELIABLE)
     experiments = rig.listen("relay_experiment", RelayExperiment)
-    controller = rig.node.create_publisher(Float64, "command", 10)
+    controller = rig.node.create_publisher(kind, "command", 10)
     sensor = rig.node.create_publisher(Float64, "measurement", 100)
     rig.relay(
         path="takeover",
+        command_type=f"std_msgs/msg/{kind.__name__}",
         amplitude=0.5,
         settle_time=0.3,
         controller_timeout=0.3,
@@ -163,13 +167,13 @@ def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
     rig.node.create_timer(0.01, lambda: sensor.publish(Float64(data=math.sin(len(from_relay)))))
     rig.until(lambda: controller.get_subscription_count() == 2, "the relay")
     rig.until(sensor.get_subscription_count, "the relay's ear")
-    controller.publish(Float64(data=BASELINE))
+    controller.publish(kind(data=BASELINE))
     # Before the tune only the controller publishes the command.
     rig.run_for(0.4)
     assert {m.data for m in from_relay} <= {BASELINE}
 
     def refused() -> bool:
-        controller.publish(Float64(data=BASELINE))
+        controller.publish(kind(data=BASELINE))
         rig.run_for(0.05)
         return "is being commanded by another node" in rig.ask_for_tune(dry_run=True).reason
 
@@ -178,8 +182,10 @@ def test_in_takeover_the_node_is_silent_but_for_its_tune(rig: Rig) -> None:
     # Its last command is the baseline.
     started = rig.tune()
     assert f"about the baseline {BASELINE:g}" in started.reason
-    rig.until(lambda: any(m.data == BASELINE + 0.65 for m in from_relay), "the kick")
-    controller.publish(Float64(data=0.123))
+    # Its own commands come back to it, those of 32 bits rounded.
+    kicked = pytest.approx(BASELINE + 0.65, rel=1e-6)
+    rig.until(lambda: any(m.data == kicked for m in from_relay), "the kick")
+    controller.publish(kind(data=0.123))
     ended = rig.until(lambda: experiments, "the record")[-1]
     assert "another node commanded 0.123 on /command" in ended.reason
     # The controller commands the loop again, so the node is silent.
