@@ -181,6 +181,7 @@ class Told:
         order of documents; 0: it is no column.
     :param word: True: a name of letters, digits and underscores.
     :param derived: True: a property, which is checked when it is read instead of set.
+    :param optional: True: documents leave it out where it is the default.
     """
 
     name: str
@@ -199,6 +200,7 @@ class Told:
     column: int = 0
     word: bool = False
     derived: bool = False
+    optional: bool = False
 
     def problem(self, values: Any) -> str | None:
         """Return a sentence on what is wrong with a number or an array, None if nothing is.

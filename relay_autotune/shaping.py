@@ -11,7 +11,6 @@ from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import LOOP_CHECKS
 from relay_autotune.tuning import DesignTask, Gains
 from relay_autotune.tuning.ensemble import ensemble_peaks
-from relay_autotune.tuning.model_set import ModelSet
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, judge
 
 
@@ -37,9 +36,7 @@ class Shaping:
             return NOT_JUDGED
         loop = Loop(
             controller=gains,
-            ms_of=lambda models: (
-                ensemble_peaks(gains, ModelSet([self.task.in_loop(m) for m in models])).ms
-            ),
+            ms_of=lambda models: ensemble_peaks(gains, self.task.set_of(models)).ms,
             ms=gains.ms,
             ms_95=gains.ms_95,
             added_delay=self.task.options.added_delay,

@@ -9,13 +9,12 @@ import argparse
 from typing import TYPE_CHECKING
 
 from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
 
 if TYPE_CHECKING:
     from relay_autotune.cli.export import Target
-
-EXPORTS = ("pid_controller", "yaml")
 
 
 def add_design(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +44,13 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     :param options: with those of :func:`add_design`.
     :raises SelectionError: if a value is out of its range.
     """
-    return DesignOptions(**given_quantities(options, declared(DesignOptions)))
+    from relay_autotune.cli.export import WITHOUT_LAW
+
+    given = given_quantities(options, declared(DesignOptions))
+    export = getattr(options, "export", None)
+    if "law" not in given and export in LAWS and export != WITHOUT_LAW:
+        given["law"] = export
+    return DesignOptions(**given)
 
 
 def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
@@ -54,9 +59,15 @@ def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     :param parser: of the command.
     :return: the group that they are in.
     """
+    from relay_autotune.cli.export import EXPORTS
+
     group = parser.add_argument_group("gains as a file")
     group.add_argument(
-        "--export", choices=EXPORTS, help="print a file that other programs load instead"
+        "--export",
+        choices=EXPORTS,
+        metavar="LAW",
+        help="print a file that other programs load instead: yaml, or of a law of --law, which "
+        "needs not be named again",
     )
     group.add_argument(
         "--node", default="/pid_controller", metavar="NAME", help="whose file it is (%(default)s)"

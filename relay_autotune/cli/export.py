@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Gains as files that other programs load: ros2_controllers' pid_controller, and plain YAML.
+"""Gains as files that other programs load, by the table of laws, and as plain YAML.
 
 `ros2 param load` parses a file as YAML, turns each value into text and parses that again. A number
 must look like a floating-point number both times: `2` would be read as an integer, `0.00001` as
@@ -19,9 +19,13 @@ from pathlib import Path
 
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import Gains
+from relay_autotune.loop.laws import LAWS, Law
 from relay_autotune.quantities import told_fields
 
 _DIGITS = 10
+# Gains that are for no law in particular can be exported for this one.
+WITHOUT_LAW = "pid_controller"
+EXPORTS = (*LAWS, "yaml")
 _NAME = re.compile(r"[A-Za-z_]\w*\Z")
 _NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
 
@@ -61,12 +65,23 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
     """Return gains as the text of a file.
 
     :param gains: what is to be loaded.
-    :param how: "pid_controller" or "yaml".
+    :param how: a law of :data:`~relay_autotune.loop.laws.LAWS`, or "yaml".
     :param target: for pid_controller: where they go.
     :param doubt: what to look at before they are used; empty: they are trusted.
+    :raises SelectionError: if they are for another law.
     """
-    text = pid_controller(gains, target) if how == "pid_controller" else plain(gains)
-    return f"# DOUBTFUL: {' '.join(doubt.split())}\n{text}" if doubt else text
+    if how == "yaml":
+        return _doubted(plain(gains), doubt, "#")
+    if gains.law not in ("", how) or (gains.law == "" and how != WITHOUT_LAW):
+        runs = gains.law or "controller_node, as a continuous controller"
+        raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
+    law = LAWS[how]
+    text = pid_controller(gains, target) if how == WITHOUT_LAW else settings(gains, law, target)
+    return _doubted(text, doubt, law.remark)
+
+
+def _doubted(text: str, doubt: str, remark: str) -> str:
+    return f"{remark} DOUBTFUL: {' '.join(doubt.split())}\n{text}" if doubt else text
 
 
 def pid_controller(gains: Gains, target: Target) -> str:
@@ -78,38 +93,59 @@ def pid_controller(gains: Gains, target: Target) -> str:
     :param gains: what is to be loaded.
     :param target: where they go.
     """
-    values: dict[str, float | str] = {"p": gains.p, "i": gains.i, "d": gains.d}
-    for name, value in (
+    clamps = (
         ("u_clamp_max", target.command_max),
         ("u_clamp_min", target.command_min),
-    ):
-        if math.isfinite(value):
-            values[name] = value
-    if gains.ti > 0.0:
-        values["antiwindup_strategy"] = "back_calculation"
-        # The value that the controller would use for 0; its documentation has had two versions.
-        values["tracking_time_constant"] = (
-            math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
-        )
-    else:
-        values["antiwindup_strategy"] = "none"
+    )
+    values = _values(gains, LAWS[WITHOUT_LAW])
     lines = [
-        *_comments(gains, (*_lacking(gains), *_signed(gains))),
+        *_comments(gains, (*_lacking(gains), *_signed(gains)), "#"),
         f"# ros2 param load {target.node} FILE",
         f"{_key(target.node)}:",
         "  ros__parameters:",
         "    gains:",
         f"      {_key(target.dof)}:",
+        *(f"        {name}: {value}" for name, value in values[:3]),
+        *(f"        {name}: {number(value)}" for name, value in clamps if math.isfinite(value)),
+        *(f"        {name}: {value}" for name, value in values[3:]),
     ]
-    for name, setting in values.items():
-        lines.append(f"        {name}: {setting if isinstance(setting, str) else number(setting)}")
     return "\n".join(lines) + "\n"
+
+
+def settings(gains: Gains, law: Law, target: Target) -> str:
+    """Return gains as the settings of a law, a line each, in the words of its program.
+
+    :param gains: what they are for.
+    :param law: the law.
+    :param target: with clamps of the command, which such a file has no place for.
+    :raises SelectionError: if there are clamps.
+    """
+    if math.isfinite(target.command_min) or math.isfinite(target.command_max):
+        raise SelectionError(
+            f"a file for {law.name} has no place for clamps of the command: set its own limits "
+            "there, and leave out --command-min and --command-max"
+        )
+    told = (f"For {law.program}.", f"Command: {law.command}. At its limit: {law.limits}.")
+    lines = _comments(gains, told, law.remark)
+    lines += [law.line.format(name=name, value=value) for name, value in _values(gains, law)]
+    return "\n".join(lines) + "\n"
+
+
+def _values(gains: Gains, law: Law) -> list[tuple[str, str]]:
+    """Return the settings of a law as texts, those without a value left out."""
+    found = ((each.name, each.of(law.at(gains, gains.law_period))) for each in law.settings)
+    return [
+        (name, value if isinstance(value, str) else number(value))
+        for name, value in found
+        if value is not None
+    ]
 
 
 def plain(gains: Gains) -> str:
     """Return gains as lines of `key: value`, which is YAML."""
-    lines = [*_comments(gains, ()), f"rule: {gains.rule}", f"form: {gains.form}"]
-    for each in (f for f in told_fields(Gains) if f.kind is float):
+    lines = [*_comments(gains, (), "#"), f"rule: {gains.rule}", f"form: {gains.form}"]
+    numbers = (f for f in told_fields(Gains) if f.kind is float)
+    for each in (f for f in numbers if not f.optional):
         value = getattr(gains, each.name)
         unit = f"  # {each.unit}" if each.unit else ""
         lines.append(f"{each.name}: {number(value) if math.isfinite(value) else 'null'}{unit}")
@@ -156,14 +192,15 @@ def _key(name: str) -> str:
     return f"'{name}'" if special else name
 
 
-def _comments(gains: Gains, more: Sequence[str]) -> list[str]:
-    told = (
+def _comments(gains: Gains, more: Sequence[str], remark: str) -> list[str]:
+    told = [
         f"Gains by the rule {gains.rule} of relay_autotune: Ms {gains.ms:.3g}, Mt {gains.mt:.3g}.",
         f"ISA form: kc {gains.kc:.6g} u/y, ti {gains.ti:.6g} s, td {gains.td:.6g} s, "
         f"tf {gains.tf:.6g} s, b {gains.b:g}.",
-        *more,
-    )
-    return [f"# {line}" for line in told]
+    ]
+    if gains.law:
+        told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
+    return [f"{remark} {line}" for line in (*told, *more)]
 
 
 def _lacking(gains: Gains) -> list[str]:

@@ -93,7 +93,7 @@ def to_document(value: object) -> dict[str, Any]:
     for each in told_fields(kind):
         held = getattr(value, each.name)
         name = each.document or each.name
-        if each.document is None:
+        if each.document is None or (each.optional and held == each.default):
             continue
         part, many = _part_of(each.kind)
         if part is not None and many:

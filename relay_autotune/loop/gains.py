@@ -229,6 +229,22 @@ class Gains(Performance, Controller):
         after="ms",
         column=1,
     )
+    law: str = told(
+        "",
+        "Law that they are for; left out: controller_node's, as a continuous controller.",
+        "",
+        message=None,
+        word=True,
+        optional=True,
+    )
+    law_period: float = told(
+        "s",
+        "Sampling period at which that law runs; left out: no law was named.",
+        0.0,
+        lower=0.0,
+        message=None,
+        optional=True,
+    )
     reason: str = told("", "Why this rule and these gains, a sentence for people.")
     warnings: tuple[str, ...] = told("", "What the user must know before using them.", ())
 
@@ -246,6 +262,7 @@ class Gains(Performance, Controller):
         ms_95: float,
         reason: str,
         warnings: tuple[str, ...] = (),
+        law: tuple[str, float] | None = None,
     ) -> Gains:
         """Join a controller and its performance.
 
@@ -255,12 +272,16 @@ class Gains(Performance, Controller):
         :param ms_95: value of Ms not exceeded by 95 % of the models within the uncertainty.
         :param reason: why this rule and these gains.
         :param warnings: what the user must know.
+        :param law: name and sampling period of the law that they are for; None: not named.
         """
+        name, period = law or ("", 0.0)
         return cls(
             **vars(controller),
             **vars(performance),
             rule=rule,
             ms_95=ms_95,
+            law=name,
+            law_period=period,
             reason=reason,
             warnings=warnings,
         )

@@ -122,6 +122,7 @@ class Smoothing:
     :param slope: the derivative of a signal, for its own time constant and the period.
     :param value: the filter on the measurement in the other parts; likewise.
     :param adjustable: True if the time constant can be chosen.
+    :param on_measurement: True if all parts see the measurement through the filter.
     """
 
     words: str
@@ -129,6 +130,7 @@ class Smoothing:
     slope: Callable[[float, float], Rational]
     value: Callable[[float, float], Rational] = lambda _tf, _period: _ONE
     adjustable: bool = True
+    on_measurement: bool = False
 
 
 def _measurement_filter(tf: float, period: float) -> tuple[Rational, Rational]:
@@ -174,6 +176,7 @@ _ON_MEASUREMENT = Smoothing(
     lambda tf, _period: tf,
     lambda tf, period: _measurement_filter(tf, period)[1],
     lambda tf, period: _measurement_filter(tf, period)[0],
+    on_measurement=True,
 )
 _FIRST_ORDER = Smoothing(
     "first order, on the derivative",
@@ -202,10 +205,10 @@ class Setting:
     """
 
     name: str
-    value: float | str | Callable[[SampledLaw], float | str]
+    value: float | str | Callable[[SampledLaw], float | str | None]
 
-    def of(self, law: SampledLaw) -> float | str:
-        """Return the value for a law with its gains."""
+    def of(self, law: SampledLaw) -> float | str | None:
+        """Return the value for a law with its gains; None: it is left out."""
         return self.value(law) if callable(self.value) else self.value
 
 
@@ -265,7 +268,7 @@ class Law:
                 "with integral action"
             )
         td = 0.0 if self.slope is Slope.NONE else wanted.td
-        filtered = td > 0.0 or self.smoothing is _ON_MEASUREMENT
+        filtered = td > 0.0 or self.smoothing.on_measurement
         tf = self.smoothing.setting(wanted.tf, period) if filtered else 0.0
         return replace(wanted, td=td, tf=tf, b=self.weight(wanted.b))
 
@@ -373,9 +376,14 @@ class RunningLaw:
         return self._waiting.pop(0)
 
 
-def _tracking(law: SampledLaw) -> float:
-    """Return the time constant that control_toolbox itself would use for 0."""
+def _tracking(law: SampledLaw) -> float | None:
+    """Return the time constant that control_toolbox would use for 0.
+
+    It is given, since its documentation has had two versions of it.
+    """
     gains = law.gains
+    if gains.ti == 0.0:
+        return None
     return math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
 
 
@@ -639,6 +647,7 @@ _ROWS = (
     ),
 )
 
+OWN_LAW = _ROWS[0].name
 LAWS: dict[str, Law] = {law.name: law for law in _ROWS}
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,8 @@ def sampled_grid(model: TransferFunction, gains: Controller, period: float) -> F
     times = [abs(c) for c in constants] + [gains.ti, gains.td, gains.tf, model.dead_time]
     top = math.pi / period
     low = 1e-3 * min(top, *(1.0 / t for t in times if t > 0.0))
+    # Loops of one process have the same grid for most gains.
+    low = 10.0 ** math.floor(math.log10(low))
     count = int(_PER_DECADE * math.log10(top / low))
     parts = [np.geomspace(low, top, count), top * (1.0 - np.geomspace(1e-6, 0.5, 80))]
     if model.dead_time > 0.0:
@@ -79,13 +82,20 @@ class SampledLoop:
 
     :param law: with its gains.
     :param model: the process, with the dead time of the loop, but none for the hold.
+    :param process: the same between hold and sampler, where it is known already.
     """
 
-    def __init__(self, law: SampledLaw, model: TransferFunction) -> None:
+    def __init__(
+        self, law: SampledLaw, model: TransferFunction, process: HeldProcess | None = None
+    ) -> None:
         self.law = law
-        self.process = HeldProcess(model, law.period)
-        self.grid = sampled_grid(model, law.gains, law.period)
+        self.process = process or HeldProcess(model, law.period)
         self._integrators = model.integrators + (1 if law.gains.ti > 0.0 else 0)
+
+    @cached_property
+    def grid(self) -> FloatArray:
+        """Frequencies that show the loop [rad/s], shape (n,)."""
+        return sampled_grid(self.process.model, self.law.gains, self.law.period)
 
     def __call__(self, s: ComplexArray) -> ComplexArray:
         """Return L at ``z = exp(s h)``.
@@ -95,15 +105,23 @@ class SampledLoop:
         z = np.exp(np.asarray(s) * self.law.period)
         return np.asarray(self.law.from_measurement(z) * self.process(z))
 
-    @property
+    @cached_property
     def unstable(self) -> float:
         """Number of closed-loop poles outside the unit circle; infinite: one on it."""
+        return self.unstable_from(self.grid, self(1j * self.grid))
 
-        def bounded(w: FloatArray) -> ComplexArray:
-            risen = 1.0 - np.exp(-1j * w * self.law.period)
-            return np.asarray((1.0 + self(1j * w)) * risen ** float(self._integrators))
+    def unstable_from(self, grid: FloatArray, loop: ComplexArray) -> float:
+        """Return the same from values of the loop that are known.
 
-        turned = _turning(bounded, np.append(0.1 * self.grid[0], self.grid))
+        :param grid: such as :attr:`grid`, shape (n,).
+        :param loop: L there, shape (n,).
+        """
+
+        def risen(w: FloatArray, value: ComplexArray) -> ComplexArray:
+            rise = 1.0 - np.exp(-1j * w * self.law.period)
+            return np.asarray((1.0 + value) * rise ** float(self._integrators))
+
+        turned = _turning(lambda w: risen(w, self(1j * w)), grid, risen(grid, loop))
         if turned is None:
             return math.inf
         return self.process.unstable_poles - round(turned / math.pi)
@@ -204,12 +222,17 @@ class SampledLoop:
         return process * forward / rest, process / rest, forward / rest, -law * process / rest
 
 
-def _turning(function: Callable[[FloatArray], ComplexArray], grid: FloatArray) -> float | None:
+def _turning(
+    function: Callable[[FloatArray], ComplexArray], grid: FloatArray, values: ComplexArray
+) -> float | None:
     """Return the growth of a function's phase over a grid; None: it passes through zero.
 
     Cells in which it turns too far to be followed are divided.
+
+    :param function: of the frequency.
+    :param grid: frequencies [rad/s], shape (n,).
+    :param values: of the function there, shape (n,).
     """
-    values = function(grid)
     low, high, begins, ends = grid[:-1], grid[1:], values[:-1], values[1:]
     total = 0.0
     for _ in range(_MOST_DIVISIONS):

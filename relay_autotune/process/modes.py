@@ -264,7 +264,9 @@ class Modes:
         row = np.concatenate([cluster.output[0, 0] for cluster in self._clusters])
         matrices = np.eye(self.size) - move / z[:, None, None]
         start = np.broadcast_to(begin @ self.input_direction, (z.size, self.size))
-        return np.asarray(np.linalg.solve(matrices, start[..., None])[..., 0] @ row)
+        # A product of matrices would wake the threads of BLAS.
+        moved = np.linalg.solve(matrices, start[..., None])[..., 0]
+        return np.asarray(np.einsum("ns,s->n", moved, row))
 
     def weights(self, z: Coordinates) -> list[Coordinates]:
         """Return, for each cluster, the coefficients of the outputs' polynomials.

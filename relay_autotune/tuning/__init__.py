@@ -13,9 +13,12 @@ from relay_autotune.errors import TuningError, look_up
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, Gains, Performance
+from relay_autotune.loop.laws import OWN_LAW
+from relay_autotune.loop.sampled_loop import analyse_sampled
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
+from relay_autotune.tuning.law_cost import cost_of
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
 from relay_autotune.tuning.rules.applicability import is_first_order
@@ -134,6 +137,8 @@ def design(task: DesignTask, rule: str) -> Gains:
 def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> Gains:
     """Return what a rule's controller does, with the set-point weight that the options ask for.
 
+    Where a law was named, it is what that law can do of the controller, with its exact loop.
+
     :param task: the process and what is asked of the controller.
     :param rule: the rule's name.
     :param controller: what it gives.
@@ -142,12 +147,44 @@ def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> 
     """
     if not math.isnan(task.options.setpoint_weight):
         controller = replace(controller, b=task.options.setpoint_weight)
-    performance = analyse_loop(controller, task.in_loop(task.model), task.options.sample_period)
-    warnings = cautions(performance, task)
+    law = task.runs(controller)
+    if law is None:
+        period = task.options.sample_period
+        performance = analyse_loop(controller, task.in_loop(task.model), period)
+        warnings = cautions(performance, task)
+    else:
+        performance = analyse_sampled(law, task.held(task.model))
+        reason += f"; for {law.law.name} every {law.period:g} s"
+        cost = cost_of(law, performance, _with_own_law(task, rule, controller))
+        warnings = (*cautions(performance, task), *cost)
+        controller = law.gains
     if not task.models:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
-        return Gains.of(
-            rule, controller, performance, ms_95=performance.ms, reason=reason, warnings=warnings
-        )
-    ms_95 = max(ensemble_ms(controller, task.around), performance.ms)
-    return Gains.of(rule, controller, performance, ms_95=ms_95, reason=reason, warnings=warnings)
+        ms_95 = performance.ms
+    else:
+        ms_95 = max(ensemble_ms(controller, task.set_of(task.models)), performance.ms)
+    return Gains.of(
+        rule,
+        controller,
+        performance,
+        ms_95=ms_95,
+        reason=reason,
+        warnings=warnings,
+        law=None if law is None else (law.law.name, law.period),
+    )
+
+
+def _with_own_law(task: DesignTask, rule: str, controller: Controller) -> Performance | None:
+    """Return what the rule attains with our own law at the same period; None: nothing.
+
+    :param controller: what it gives for the law that was named; no other rule looks at the law.
+    """
+    own = replace(task, options=replace(task.options, law=OWN_LAW))
+    try:
+        if rule == DEFAULT_RULE:
+            controller, _ = robust(own)
+        law = own.runs(controller)
+        assert law is not None
+        return analyse_sampled(law, own.held(own.model))
+    except TuningError:
+        return None

@@ -22,7 +22,7 @@ from relay_autotune.loop.stability import (
     winding,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.tuning.model_set import HeldSet, ModelSet
 from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.surroundings import allowed_outside
 from relay_autotune.tuning.task import DesignTask
@@ -83,7 +83,7 @@ class Peaks:
         return int(np.isinf(self.ms).sum())
 
 
-def ensemble_peaks(controller: Controller, models: ModelSet) -> Peaks:
+def ensemble_peaks(controller: Controller, models: ModelSet | HeldSet) -> Peaks:
     """Return the robustness of a controller on each of many models.
 
     Stability follows from the number of turns of each loop on the grid; where two points are too
@@ -97,7 +97,7 @@ def ensemble_peaks(controller: Controller, models: ModelSet) -> Peaks:
     return Peaks(np.where(unstable, math.inf, ms), np.where(unstable, math.inf, mt))
 
 
-def ensemble_ms(controller: Controller, models: ModelSet) -> float:
+def ensemble_ms(controller: Controller, models: ModelSet | HeldSet) -> float:
     """Return the Ms that 95 % of the models do not exceed with one controller.
 
     :param controller: the gains.
@@ -117,9 +117,12 @@ def ensemble_ms(controller: Controller, models: ModelSet) -> float:
 
 
 def _loops(
-    controller: Controller, models: ModelSet
+    controller: Controller, models: ModelSet | HeldSet
 ) -> tuple[ComplexArray, FloatArray, NDArray[np.bool_]]:
     """Return loops L and |1 + L| on a grid, shape (n, m), and which are unstable, shape (m,)."""
+    if isinstance(models, HeldSet):
+        values, unstable = models.loops(controller)
+        return values, np.abs(1.0 + values), unstable
     grid = frequencies(*controller.characteristic(models.models[0]))
     # At the first frequency all dynamics except integrators are at rest.
     w = np.concatenate(([1e-6 * grid[0]], grid))
@@ -167,7 +170,9 @@ def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
         controller, _ = rule(replace(task, models=()))
     except TuningError:
         return None
-    models = ModelSet([task.in_loop(model) for model in (task.model, *task.models)])
+    law = task.runs(controller)
+    controller = controller if law is None else law.gains
+    models = task.set_of((task.model, *task.models))
     own, *others = ensemble_peaks(controller, models).ms
     # No interpolation: some values may be infinite.
     low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")

@@ -147,8 +147,9 @@ class Responses:
         count = self._poles[of] + _gained(x, reach, height)
         begun = np.where(reach[..., 0] > 0.0, np.where(height[..., 0] > 0.0, -1, 1), 0)
         count = count + np.where(self._at_rest[of], begun, 0)
-        stable = np.where(count == 0, _first_crossing(reach, w * height, kp), 0.0)
-        return _largest_ki(bounds, kp, td, w, (x, y), stable)
+        stable = np.where(count == 0, first_crossing(reach, w * height, kp), 0.0)
+        rest = kp[:, None, None], (kp * td)[:, None, None] * w
+        return envelope(bounds, rest, w, (x, y), stable)
 
     def _felt(
         self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
@@ -181,23 +182,25 @@ def _gained(x: FloatArray, reach: FloatArray, height: FloatArray) -> NDArray[np.
     return np.asarray(2 * (falls - rises))
 
 
-def _largest_ki(
+def envelope(
     bounds: Bounds,
-    kp: FloatArray,
-    td: FloatArray,
+    rest: tuple[FloatArray, FloatArray],
     w: FloatArray,
     parts: tuple[FloatArray, FloatArray],
     stable: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the envelope of the ellipses: upper and lower ends of the range, shape (k, m).
 
+    :param bounds: on the sensitivities.
+    :param rest: real and imaginary part of the controller without integral and filter, such as
+        kp and kp td w, shape (k, 1, n or 1).
+    :param w: frequencies at which the integral action is ki/(j w), shape (n,).
     :param parts: real and imaginary part of 1/(F G), shape (k or 1, m, n).
     :param stable: integral gains up to which the loop is stable, shape (k, m).
     """
     x, y = parts
     square = x * x + y * y
-    p = kp[:, None, None]
-    lead = (kp * td)[:, None, None] * w
+    p, lead = rest
     edges = []
     for c, r in bounds.circles:
         room = r * r * square - (p + c * x) ** 2
@@ -228,7 +231,7 @@ def _largest_ki(
     return np.where(limit > 0.0, refined, limit), below
 
 
-def _first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> FloatArray:
+def first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> FloatArray:
     """Return the least positive integral gain at which a closed-loop pole is on the axis.
 
     :param distance: kp + x, zero where some ki brings the loop to -1, shape (k, m, n).

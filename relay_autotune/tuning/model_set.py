@@ -7,11 +7,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import Law
+from relay_autotune.loop.sampled_loop import SampledLoop, sampled_grid
+from relay_autotune.process.held import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.floating[Any]]
@@ -82,3 +88,41 @@ class ModelSet:
 def _columns(constants: _Constants) -> ComplexArray:
     """Return the first constant of each model, then the second, and so on, shape (p, m)."""
     return np.array(constants, dtype=np.complex128).T
+
+
+@dataclass(frozen=True)
+class HeldSet:
+    """Models between hold and sampler, for the exact loops of a law.
+
+    :param models: with the dead time of the loop, but none for the hold.
+    :param law: the law.
+    :param period: of the samples [s].
+    """
+
+    models: tuple[TransferFunction, ...]
+    law: Law
+    period: float
+
+    @cached_property
+    def _held(self) -> list[HeldProcess]:
+        return [HeldProcess(model, self.period) for model in self.models]
+
+    @cached_property
+    def _known(self) -> dict[tuple[float, int], ComplexArray]:
+        """Responses of the models, by the begin and the size of the grid."""
+        return {}
+
+    def loops(self, controller: Controller) -> tuple[ComplexArray, NDArray[np.bool_]]:
+        """Return the loops on a grid, shape (n, m), and which of them are unstable, shape (m,).
+
+        :param controller: the gains, as far as the law can have them.
+        """
+        law = self.law.at(controller, self.period)
+        grid = sampled_grid(self.models[0], controller, self.period)
+        z, key = np.exp(1j * grid * self.period), (float(grid[0]), grid.size)
+        if key not in self._known:
+            self._known[key] = np.column_stack([held(z) for held in self._held])
+        values = law.from_measurement(z)[:, None] * self._known[key]
+        each = zip(self.models, self._held, values.T, strict=True)
+        unstable = [SampledLoop(law, m, h).unstable_from(grid, v) != 0.0 for m, h, v in each]
+        return values, np.array(unstable)

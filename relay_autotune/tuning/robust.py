@@ -12,6 +12,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.tuning.candidates import NoiseLimit, Optimum
 from relay_autotune.tuning.frontier import Bounds
+from relay_autotune.tuning.sampled_search import SampledSearch
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.setpoint import with_setpoint_weight
 from relay_autotune.tuning.task import MS_RANGE, DesignOptions, DesignTask
@@ -49,14 +50,12 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
         limits the gain.
     """
     options = task.options
-    model = task.in_loop(task.model)
-    around = tuple(task.in_loop(m) for m in task.models if m.process_sign == model.process_sign)
     bounds = Bounds(options.ms, options.largest_mt(task.model))
-    search = Search(model, around, options.filter_ratio, _noise_limit(options))
-    if options.controller == "auto":
+    search = _search(task)
+    if options.controller == "auto" and search.differentiates:
         controller, reason = _chosen(search, bounds)
     else:
-        derivative = options.controller == "pid"
+        derivative = options.controller == "pid" and search.differentiates
         found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
         controller, reason = found.optimum.controller, _promise(found, search)
     if controller.i == 0.0 or not math.isfinite(controller.i):
@@ -64,7 +63,27 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
             "no controller with a gain above zero keeps the bounds on the model and those around "
             "it: it is not known well enough; record a longer or larger test"
         )
-    return with_setpoint_weight(controller, model, search.frequency), reason
+    return with_setpoint_weight(controller, search.model, search.frequency), reason
+
+
+def _search(task: DesignTask) -> Search:
+    """Return the search on the process in its loop, exact for a law that was named."""
+    options, model = task.options, task.in_loop(task.model)
+    others = [m for m in task.models if m.process_sign == model.process_sign]
+    around = tuple(task.in_loop(m) for m in others)
+    law, noise = options.runs, _noise_limit(options)
+    if law is None:
+        return Search(model, around, options.filter_ratio, noise)
+    return SampledSearch(
+        model,
+        around,
+        options.filter_ratio,
+        noise,
+        law=law,
+        period=options.sample_period,
+        held=task.held(task.model),
+        held_models=tuple(task.held(m) for m in others),
+    )
 
 
 def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:

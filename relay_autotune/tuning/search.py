@@ -80,6 +80,11 @@ class Search:
     filter_ratio: float = 10.0
     noise: NoiseLimit | None = None
 
+    @property
+    def differentiates(self) -> bool:
+        """True if the controller may have a derivative."""
+        return True
+
     @cached_property
     def frequency(self) -> float:
         """Frequency about which the loop is closed [rad/s]."""
@@ -105,9 +110,24 @@ class Search:
         if not self.models:
             return None
         grid = self.responses.grid
+        return Surroundings(self._responses_of_models(grid[grid > 0.03 * self.frequency][::2]))
+
+    def _responses_of_models(self, grid: FloatArray) -> Responses:
         # Single precision is twice as fast and more than an ensemble needs.
-        some = grid[grid > 0.03 * self.frequency][::2].astype(np.float32)
-        return Surroundings(Responses(self.models, some, self.frequency))
+        return Responses(self.models, grid.astype(np.float32), self.frequency)
+
+    def _controller(self, best: Candidates) -> Controller:
+        """Return the first of some candidates, with the sign of the process."""
+        return best.controller(0, self.model.process_sign)
+
+    def _peaks(self, controller: Controller) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return Ms and Mt of a controller on the process, each with its frequency."""
+        exact = controller.loop(self.model)
+        return peaks(exact, frequencies(exact))
+
+    def _span(self, td: float) -> tuple[float, float] | None:
+        """Return the range of proportional gains to look at for a derivative time [s]."""
+        return stable_gains(self.model, self.responses.grid, td, td / self.filter_ratio)
 
     def _among(self, around: Surroundings | None) -> Search:
         """Return this search with other models around the process; its responses are kept."""
@@ -142,7 +162,7 @@ class Search:
             best, iae = found
         if best.kp[0] > _UNLIMITED * self._largest_kp:
             raise TuningError(_NO_LIMIT)
-        return Optimum(best.controller(0, self.model.process_sign), iae)
+        return Optimum(self._controller(best), iae)
 
     def _among_models(
         self, bounds: Bounds, point: FloatArray, asked: Surroundings
@@ -191,9 +211,11 @@ class Search:
         :param iae: there [y s/u].
         """
         for _ in range(_MOST_ADDED):
-            loop = self._at(bounds, point[None]).controller(0, self.model.process_sign)
-            exact = loop.loop(self.model)
-            found = zip(peaks(exact, frequencies(exact)), (bounds.ms, bounds.mt), strict=True)
+            found = zip(
+                self._peaks(self._controller(self._at(bounds, point[None]))),
+                (bounds.ms, bounds.mt),
+                strict=True,
+            )
             missed = [w for (peak, w), bound in found if peak > _HELD * bound]
             if not missed:
                 break
@@ -235,7 +257,7 @@ class Search:
         count = _GAINS[derivative]
         parts = []
         for time in times.tolist():
-            span = stable_gains(self.model, self.responses.grid, time, time / self.filter_ratio)
+            span = self._span(time)
             if span is None:
                 continue
             low, high = span
@@ -362,12 +384,12 @@ class Search:
         )
         chosen = upper * share
         # Beyond, the integral action alone would close the loop where no frequency was looked at.
-        chosen[np.isfinite(chosen) & (chosen > self._largest_ki)] = -math.inf
+        chosen[np.isfinite(chosen) & (chosen > self._beyond)] = -math.inf
         ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)
         return Candidates(kp, ki, td, tf)
 
     @cached_property
-    def _largest_ki(self) -> float:
+    def _beyond(self) -> float:
         """Integral gain that closes the loop at the highest frequency of the grid [u/(y s)]."""
         highest = float(self.responses.grid[-1])
         return highest / float(np.abs(self.model(1j * highest)))

@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.gains import Performance
+from relay_autotune.loop.gains import Controller, Performance
+from relay_autotune.loop.laws import LAWS, Law, SampledLaw
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity
-from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.tuning.model_set import HeldSet, ModelSet
 
 CONTROLLERS = ("auto", "pi", "pid")
 MS_RANGE = (1.2, 4.0)
@@ -106,6 +108,13 @@ class DesignOptions:
     resonance: float = quantity(
         2.0, "dB", "Closed-loop resonance, for luyben2003.", lower=0.0, open_ended=True
     )
+    law: str = quantity(
+        "",
+        "",
+        "Law that the gains are for, exact at the sampling period, such as pid_controller; not "
+        "given: controller_node's, with half a period as dead time.",
+        choices=("", *LAWS),
+    )
 
     def __post_init__(self) -> None:
         check(self, TuningError)
@@ -121,7 +130,22 @@ class DesignOptions:
 
         A sample that is held for a period lags by half of it on average.
         """
-        return 0.5 * self.sample_period + self.loop_delay
+        held = 0.5 if self.law == "" else 0.5 + LAWS[self.law].delay
+        return held * self.sample_period + self.loop_delay
+
+    @property
+    def runs(self) -> Law | None:
+        """The law that the gains are for; None: none was named.
+
+        :raises TuningError: if it was named without a sampling period.
+        """
+        if self.law == "":
+            return None
+        if self.sample_period == 0.0:
+            raise TuningError(
+                f"{self.law} runs at a sampling period, and none is known: give sample_period"
+            )
+        return LAWS[self.law]
 
     def largest_mt(self, model: TransferFunction) -> float:
         """Return the bound on Mt for a process.
@@ -157,6 +181,33 @@ class DesignTask:
         :param model: the process, or a model within its uncertainty.
         """
         return replace(model, dead_time=model.dead_time + self.options.added_delay)
+
+    def held(self, model: TransferFunction) -> TransferFunction:
+        """Return a process with the loop's own delay, but no dead time for the hold.
+
+        :param model: the process, or a model within its uncertainty.
+        """
+        return replace(model, dead_time=model.dead_time + self.options.loop_delay)
+
+    def runs(self, controller: Controller) -> SampledLaw | None:
+        """Return the law that will run, with what it can do of a controller; None: not named.
+
+        :param controller: the gains that a rule gives.
+        """
+        law, period = self.options.runs, self.options.sample_period
+        return None if law is None else law.at(law.best(controller, period), period)
+
+    def set_of(self, models: Sequence[TransferFunction]) -> ModelSet | HeldSet:
+        """Return models as the loop has them.
+
+        :param models: such as those within the uncertainty.
+        """
+        law = self.options.runs
+        if law is None:
+            known = models is self.models
+            return self.around if known else ModelSet([self.in_loop(m) for m in models])
+        held = tuple(self.held(model) for model in models)
+        return HeldSet(held, law, self.options.sample_period)
 
     @cached_property
     def around(self) -> ModelSet:
