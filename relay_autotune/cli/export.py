@@ -80,6 +80,14 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
     return _doubted(text, doubt, law.remark)
 
 
+def exports_of(law: str) -> tuple[str, ...]:
+    """Return how gains for a law can be written.
+
+    :param law: its name; empty: none was named.
+    """
+    return (law or WITHOUT_LAW, "yaml")
+
+
 def _doubted(text: str, doubt: str, remark: str) -> str:
     return f"{remark} DOUBTFUL: {' '.join(doubt.split())}\n{text}" if doubt else text
 

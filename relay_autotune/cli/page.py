@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from relay_autotune.cli.arguments import as_typed, say
-from relay_autotune.cli.design_arguments import EXPORTS, export_target
+from relay_autotune.cli.design_arguments import export_target
 from relay_autotune.errors import MissingPackageError
 from relay_autotune.tuning.task import DesignOptions
 
@@ -71,7 +71,7 @@ def show(
     :param models: the experiments, each with what the design of its gains takes.
     :raises SelectionError: if the address cannot be used.
     """
-    from relay_autotune.cli.export import exported
+    from relay_autotune.cli.export import exported, exports_of
     from relay_autotune.web.address import address_of
     from relay_autotune.web.server import Page, run
     from relay_autotune.web.shape import Asked, Subject
@@ -95,5 +95,5 @@ def show(
     def written(gains: Gains, how: str, doubt: str) -> str:
         return exported(gains, how, target, doubt=doubt)
 
-    page = Page(subjects, EXPORTS, written, address_of(options.web_address))
+    page = Page(subjects, exports_of(options.law or ""), written, address_of(options.web_address))
     run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))

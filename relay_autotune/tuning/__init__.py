@@ -162,7 +162,7 @@ def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> 
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
         ms_95 = performance.ms
     else:
-        ms_95 = max(ensemble_ms(controller, task.set_of(task.models)), performance.ms)
+        ms_95 = max(ensemble_ms(controller, task.exact), performance.ms)
     return Gains.of(
         rule,
         controller,

@@ -204,8 +204,7 @@ class DesignTask:
         """
         law = self.options.runs
         if law is None:
-            known = models is self.models
-            return self.around if known else ModelSet([self.in_loop(m) for m in models])
+            return ModelSet([self.in_loop(model) for model in models])
         held = tuple(self.held(model) for model in models)
         return HeldSet(held, law, self.options.sample_period)
 
@@ -213,6 +212,11 @@ class DesignTask:
     def around(self) -> ModelSet:
         """The models within the uncertainty, with the dead time that the loop adds to them."""
         return ModelSet([self.in_loop(model) for model in self.models])
+
+    @cached_property
+    def exact(self) -> ModelSet | HeldSet:
+        """The models within the uncertainty, as the law that was named has them."""
+        return self.around if self.options.runs is None else self.set_of(self.models)
 
 
 def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:

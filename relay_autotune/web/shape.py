@@ -222,7 +222,7 @@ def _shaped(
     around: list[TransferFunction] = []
     unstable = 0
     if task.models:
-        peaks = ensemble_peaks(gains, task.set_of(task.models))
+        peaks = ensemble_peaks(gains, task.exact)
         unstable = peaks.unstable
         around = [m for m, ms in zip(task.around.models, peaks.ms, strict=True) if ms < math.inf]
     return Shaped(
