@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Uncertainty that knows that the structure was chosen."""
+"""Uncertainty of K_u and w_u that includes the choice of the structure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from relay_autotune.identification.result import Identification, Rival
 
 FloatArray = NDArray[np.float64]
 
-# How far a value of a rival may stray for the first order to stand for it: of a logarithm, and
+# Largest deviation of a rival's value for which the first order holds: relative to the value, and
 # of a dead time or a zero, in radians at the ultimate frequency.
 _FARTHEST_RATIO = 2.0
 _FARTHEST_PHASE = 1.0
@@ -32,8 +32,8 @@ def averaged_point(
 
         var = sum_m w_m (var_m + (x_m - x)^2)
 
-    (Buckland, Burnham and Augustin 1997): what one structure leaves open, and how far they
-    differ.
+    (Buckland, Burnham and Augustin 1997): the variance within each structure, and the distance
+    between them.
 
     :param found: the chosen model.
     :param support: its weight.
@@ -64,14 +64,14 @@ def averaged_point(
 
 
 def _within_reach(rival: Estimate, root: FloatArray, frequency: float) -> Estimate:
-    """Return an estimate with the covariance of its values as far as the first order goes.
+    """Return an estimate with its covariance limited to where the first order holds.
 
     A lag or a zero far below the sampling period can hardly be told from dead time. To first
-    order the two may then differ by more than the whole record, with a standard deviation S
-    where the value is next to nothing; K_u, a curved function of both, would inherit that. A
-    value is therefore taken to be known beforehand to within a limit L, many times what the data
-    leave of one that they show:  ``(S^-1 + L^-1)^-1 = L^1/2 U s^2/(1 + s^2) U' L^1/2`` with the
-    singular values s of the root of S over that of L.
+    order its standard deviation may then exceed the whole record, and so would that of K_u, a
+    curved function of both. Each value therefore has a prior of covariance L, far wider than that
+    of a value that the data show. With it the covariance S becomes
+    ``(S^-1 + L^-1)^-1 = L^1/2 U s^2/(1 + s^2) U' L^1/2``, with the singular values s of the root
+    of S over that of L.
 
     :param rival: the estimate.
     :param root: of its covariance.

@@ -1,12 +1,11 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The fit where what is left is no white noise: generalised least squares in the noise's colour.
+"""The fit where the residual is not white: generalised least squares in the noise's colour.
 
-A criterion that takes correlated samples for independent ones prefers what bends to the noise.
-Here all structures are fitted to all samples by generalised least squares (Aitken 1935), in the
-colour of what the best of them leaves (Cochrane and Orcutt 1949, iterated), and compared by what
-their samples are worth.
+A criterion that takes correlated samples for independent ones prefers models that follow the
+noise. Here all structures are fitted by generalised least squares (Aitken 1935) in the colour of
+the best one's residual (Cochrane and Orcutt 1949, iterated), and compared in that colour.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ from relay_autotune.identification.waveform.theta import unit_steps
 
 FloatArray = NDArray[np.float64]
 
-# Less probable than this as white noise, a residual has a colour.
+# Probability as white noise below which a residual has a colour.
 _WHITE = 1e-3
-# Samples that are compared: of correlated ones more tell little, unless the process is fast; but
-# samples much denser than its response would weigh what is faster than the process most.
+# Numbers of samples, and samples for each response of the process. More correlated samples tell
+# little, unless the process is fast; much denser ones would favour what is faster than it.
 _FEW, _MOST = 1200, 4000
 _A_RESPONSE, _AT_LEAST = 5.0, 2.0
 _MOST_TIMES = 4
-# A structure whose criterion is larger by this in one colour is not tried in the next one, but
-# for the plain ones, on whose models gains have to hold, too.
+# Excess of the criterion beyond which a structure is not tried in the next colour. The plain ones
+# always are: gains have to hold on their models, too.
 _HOPELESS = 30.0
 PLAIN = ("fopdt", "sopdt")
 # Length of the record in correlation times of the slow disturbance that is tried first.
@@ -54,34 +53,37 @@ _SLOWEST = 10.0
 _ALIKE = 0.01
 _TRIAL = 1e-6
 _STEPS = 15
-# What is looked at first: initial state, command before.
+# Pasts that are tried: free initial state, unknown command before.
 _PASTS = ((False, False), (False, True), (True, True))
 _FIRST = ("fopdt", "sopdt", "sopdt_zero")
-# Equal lags in some numbers only: in coloured noise neighbours differ by chance alone.
+# Structure and order. Few numbers of equal lags: in coloured noise neighbours differ by chance.
 _OTHERS = (("lag_n", 3), ("lag_n", 5), ("lag_n", 8), ("three_lags", 0))
 _INTEGRATING = (("ipdt", 0), ("integrator_lag", 0), ("integrator_inverse", 0))
 _UNSTABLE = (("unstable_fopdt", 0), ("unstable_sopdt", 0))
-# Samples of a rest that shows the past, in which the measurement moves by no more than this share.
+# Least number of samples of a rest that shows the past, and the largest share of its range by
+# which the measurement moves during it.
 _ENOUGH_REST = 15
 _STILL = 0.05
-# Latest response, as a share of the record: a later one cannot be told from a drift.
+# Longest dead time, as a share of the record: a later response cannot be told from a drift.
 _LONGEST = 0.25
-# An integrator or a growing mode bends to any drift: what it explains better has to be clear.
+# Gain in the criterion asked of an integrator, a growing mode or a free past: they fit any drift.
 _EARNED = 10.0
-# Lengths of the record up to which a lag is one.
+# Longest lag in lengths of the record: a longer one counts as an integrator.
 _LASTING = 2.0
-# Standard deviations of parameters in their own sizes beyond which samples do not tell them.
+# Largest standard deviation of a parameter that the samples determine, relative to its size.
 _TOLD = 1.0
-# Before all structures are tried: a flexible one that leaves this much colour is enough to know.
+# Probability as white noise, and worth of a sample, below which one flexible structure's residual
+# is clearly coloured.
 _CLEAR = 1e-12
 _LITTLE_WORTH = 0.5
-# Parts of a record, and how many times more than usual one of them leaves where something came.
+# Number of blocks of a record, and the ratio of one block's residual power to the median beyond
+# which an event caused it.
 _BLOCKS = 10
 _UNEVEN = 5.0
 
 
 def is_coloured(fit: Fit) -> bool:
-    """Return whether what a fit leaves is no white noise."""
+    """Return whether the residual of a fit is not white noise."""
     state = fit.state
     if fit.loss != LOSSES[0] or state.cost <= state.residual.size * NEGLIGIBLE**2:
         return False
@@ -90,9 +92,9 @@ def is_coloured(fit: Fit) -> bool:
 
 
 def is_an_event(fit: Fit) -> bool:
-    """Return whether most of what a fit leaves came at one time, as a step of the load does.
+    """Return whether most of a fit's residual came at one time, as from a step of the load.
 
-    That is no noise, of whatever colour: the load is estimated, or the cycles are left out.
+    That is not noise of any colour: the load is estimated, or the cycles are left out.
     """
     blocks = np.array_split(fit.state.residual, _BLOCKS)
     powers = np.array([float(np.mean(block**2)) for block in blocks])
@@ -100,9 +102,9 @@ def is_an_event(fit: Fit) -> bool:
 
 
 def is_clearly_coloured(problem: Problem, sign: int) -> bool:
-    """Return whether even a flexible structure with an unknown past leaves no white noise.
+    """Return whether even a flexible structure with an unknown past leaves coloured noise.
 
-    It saves the choice among structures as if noise were white, which takes longest on such data.
+    Then the choice of a structure for white noise is skipped, which takes longest on such data.
 
     :param problem: samples and input, with a FOPDT structure.
     :param sign: direction of the relay; 0: not known.
@@ -110,7 +112,7 @@ def is_clearly_coloured(problem: Problem, sign: int) -> bool:
     few = replace(problem.thinned(_FEW), past=problem.past_is_open)
     found = Ground.of(few, few.time.size * NEGLIGIBLE**2, sign)
     if found.problem.time.size < few.time.size:
-        # What no past explains comes first.
+        # The first samples, which no past explains, were left out.
         return False
     flexible = next(iter(found.fit(("sopdt_zero",))), None)
     if flexible is None or flexible.state.cost <= few.time.size * NEGLIGIBLE**2:
@@ -130,7 +132,7 @@ def in_colour(
     :param known: the structure, if it is known.
     :param sign: direction of the relay; 0: not known.
     :param held: True: a relay held the process, so that it may be unstable.
-    :return: None: no structure can be read, or the noise is white.
+    :return: None: no structure fits, or the noise is white.
     """
     whole = replace(problem, drift=False, relaxation=False, past=False)
     names = (known.structure,) if known.structure else ()
@@ -143,10 +145,11 @@ def in_colour(
 
 
 def _is_told(candidate: Candidate) -> bool:
-    """Return whether the samples tell each parameter.
+    """Return whether the samples determine each parameter.
 
-    A gain and a lag to their own size, a zero and a dead time to that of all times together: what
-    is less sure is a lag between the samples or beyond the record, or two that are one.
+    The standard deviation of a gain or a lag is compared with its value, that of a zero or a dead
+    time with all times together. It is larger where a lag is shorter than the sampling interval
+    or longer than the record, or where two lags cannot be told apart.
     """
     problem, state = candidate.problem, candidate.state
     estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise(False))
@@ -175,7 +178,7 @@ def _dense_enough(problem: Problem, sign: int) -> tuple[Problem, Problem]:
 
 
 def _colour(problem: Problem, state: Trial) -> Colour | None:
-    """Return the colour of what a fit leaves, each sample as it counts."""
+    """Return the colour of a fit's weighted residual."""
     columns, _ = problem.columns(state.theta)
     left = problem.y - state.coefficients @ columns
     if problem.weight is not None:
@@ -186,17 +189,17 @@ def _colour(problem: Problem, state: Trial) -> Colour | None:
 def _compared(
     problem: Problem, few: Problem, sign: int, names: tuple[str, ...], order: int, *, held: bool
 ) -> list[Candidate]:
-    """Return all structures in one colour, the one that counts first.
+    """Return all structures in one colour, the chosen one first.
 
-    The noise is estimated in turn with the models, from two beginnings: what the best simulation
-    leaves, and a slow disturbance, which a simulation would bend to. The likelier end counts.
+    Noise and models are estimated in turn, from two starts: the residual of the best simulation,
+    and a slow disturbance, which a simulation would follow. The more likely result counts.
     """
     grounds = [
         _ground(replace(few, relaxation=relaxation, past=past), sign)
         for relaxation, past in (_PASTS[:1] if _rests(problem) else _PASTS)
         if problem.past_is_open or not past
     ]
-    # Each past in the colour of what it leaves itself, and a richer one has to earn its place.
+    # Each past is judged in the colour of its own residual; a richer one has to be clearly better.
     found = []
     for ground in grounds:
         begun = [c for name in names or _FIRST for c in ground.fit((name,), order)]
@@ -217,7 +220,7 @@ def _compared(
 
 
 def _of_all(ground: Ground, problem: Problem) -> Ground:
-    """Return a ground of all samples, with the past of one of some of them."""
+    """Return a ground of all samples, with the past of a ground of fewer samples."""
     past = ground.problem
     problem = replace(problem, relaxation=past.relaxation, past=past.past)
     return replace(ground, problem=problem, floor=problem.time.size * NEGLIGIBLE**2)
@@ -229,18 +232,18 @@ def _fitted_to(problem: Problem, found: list[Candidate]) -> list[Candidate]:
 
 
 def _in_its_own(found: list[Candidate], ground: Ground) -> list[Candidate]:
-    """Return candidates in the colour of what the best of them leaves, the best first."""
+    """Return candidates in the colour of the best one's residual, the best first."""
     best = min(found, key=lambda c: c.criterion)
     return _in(_colour(best.problem, best.state), found, ground)
 
 
 def _unasked(problem: Problem) -> float:
-    """Return what an unknown past has to earn: like a drift, it bends to what is slow."""
+    """Return the penalty of an unknown past: like a drift, it fits any slow disturbance."""
     return _EARNED * sum(nuisances_of(problem))
 
 
 def _ground(problem: Problem, sign: int) -> Ground:
-    """Return where fits to all samples begin, whatever past they have."""
+    """Return the ground of all samples: none are left out for their unknown past."""
     fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
     floor = problem.time.size * NEGLIGIBLE**2
     return Ground(problem, fopdt, Starts(problem, fopdt), floor, sign)
@@ -261,7 +264,7 @@ def _rests(problem: Problem) -> bool:
 
 
 def _converged(found: list[Candidate], ground: Ground) -> list[Candidate]:
-    """Return candidates in the colour of what the best of them leaves."""
+    """Fit in the colour of the best one's residual, again until that changes no more."""
     for _ in range(_MOST_TIMES):
         if not found:
             return []
@@ -297,14 +300,14 @@ def _in(colour: Colour | None, found: list[Candidate], ground: Ground) -> list[C
         problem = replace(c.problem, colour=colour)
         state = refine(problem, c.state.theta, tolerance=_TRIAL, most=_STEPS)
         candidate = ground.candidate(problem, state)
-        # A past that is not known explains all that a dead time as long as the record leaves over.
+        # With a dead time as long as the record, an unknown past would explain everything.
         if candidate is not None and candidate.model.dead_time <= _LONGEST * length:
             again.append(_earned(candidate, length))
     return sorted(again, key=lambda c: c.criterion)
 
 
 def _earned(candidate: Candidate, length: float) -> Candidate:
-    """Return a candidate with what an integrator, or a lag that looks like one, has to earn.
+    """Return a candidate with the penalty of an integrator, or of a lag that looks like one.
 
     :param length: of the record [s].
     """
@@ -315,7 +318,7 @@ def _earned(candidate: Candidate, length: float) -> Candidate:
 
 
 def _ordered(found: list[Candidate]) -> list[Candidate]:
-    """Return the candidates, the simplest that the criterion cannot tell from the best first."""
+    """Return the candidates; first the simplest that the criterion cannot tell from the best."""
     found = sorted(found, key=lambda c: c.criterion)
     best = found[0].criterion
     rivals = [c for c in found if c.criterion <= best + 2.0]

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Intervals of what a fit does not determine, and what it does determine all the same."""
+"""Intervals of parameters that a fit does not determine, and combinations that it does."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from relay_autotune.record.record import Record
 FloatArray = NDArray[np.float64]
 
 _MOST_FOR_PROFILES = 4096
-# Widths in logarithms, or in standard deviations.
+# Largest standard deviation of a logarithm with which a search begins, and farthest end of an
+# interval, in logarithms or in standard deviations.
 _WIDE = 2.0
 _FARTHEST = 8.0
 
@@ -38,7 +39,7 @@ _FARTHEST = 8.0
 def with_what_is_determined(
     found: Identification, records: Sequence[Record], fit: Fit, quantile: float
 ) -> Identification:
-    """Replace intervals that linear ones do not stand for, and say what is known beside them.
+    """Replace linear intervals where they do not hold, and add the determined combinations.
 
     :param found: the identification with its linear intervals.
     :param records: what it was identified from.
@@ -97,8 +98,8 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
             near, far = (_limit(e) if math.isinf(e) else math.exp(min(e, 700.0)) for e in ends)
             ends = (near, far) if value > 0.0 else (-far, -near)
         if fit.problem.colour is not None and math.isinf(ends[1]) and parameter.least == 0.0:
-            # A dead time beyond part of the record is no candidate in a colour: the profile broke
-            # off where it could not be held, as between two samples.
+            # In a colour a long dead time is no candidate: the profile broke off where the fit
+            # failed, as between two samples.
             ends = (ends[0], math.nan)
         # An end that could not be found stays the linear one.
         low[i] = low[i] if math.isnan(ends[0]) else min(ends[0], value)
@@ -118,7 +119,7 @@ def _limit(logarithm: float) -> float:
 
 
 class _Parameter:
-    """One parameter of the field as a function of theta and the linear coefficients."""
+    """One of the structure's parameters as a function of theta and the linear coefficients."""
 
     def __init__(
         self, problem: Problem, state: Trial, scale: float, number: int, logarithmic: bool

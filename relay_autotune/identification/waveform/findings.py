@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a waveform fit tells: model, covariance, rivals, quality of the fit, warnings."""
+"""The results of a waveform fit: model, covariance, rivals, quality of the fit, warnings."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _WORTH_COUNTING = 1e-2
 _MOST_COUNTED = 6
 _OPEN = 0.01
 _PREDICTED = 1e-6
-# Residual that a plain structure may have beyond that of a richer one, as a share of the spread.
+# Largest excess of a plain structure's residual over a richer one's, as a share of the spread.
 _AS_WELL = 0.02
 
 
@@ -71,7 +71,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     whiteness = math.nan if exact else ljung_box(state.residual)
     noise = noise_of(records, rms, not math.isnan(whiteness) and whiteness < _WHITE)
     if problem.colour is not None:
-        # It knows that rounding errors stay alike from sample to sample.
+        # The colour includes that rounding errors stay alike from sample to sample.
         noise = replace(noise, inflation=1.0)
     estimate = estimate_of(problem, state, fit, noise)
     halves = None if problem.colour is None or estimate is None else _halves(fit, estimate.model)
@@ -126,10 +126,10 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
 
 
 def _plain(fit: Fit, rms: float, spread: float) -> list[TransferFunction]:
-    """Return the plain models that simulate the record best, where that is nearly as good.
+    """Return the best plain models, if they simulate the record nearly as well as the fit.
 
     :param fit: in colour.
-    :param rms: of what the fit leaves [y].
+    :param rms: of the fit's residual [y].
     :param spread: of the measurement [y].
     """
     found = []
@@ -146,7 +146,7 @@ def _plain(fit: Fit, rms: float, spread: float) -> list[TransferFunction]:
 
 
 def _halves(fit: Fit, model: TransferFunction) -> Halves | None:
-    """Return what the halves of a record say of each other about the frequency of the loop."""
+    """Compare the halves of a record at about the frequency of the loop."""
     point = ultimate_point(model)
     slow = model.dead_time + sum(abs(t) for t in model.time_constants)
     if point is None and not slow > 0.0:
@@ -155,11 +155,11 @@ def _halves(fit: Fit, model: TransferFunction) -> Halves | None:
 
 
 def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatArray:
-    """Return what the fit makes of the samples of the first record, and NaN where it cannot."""
+    """Return the fitted measurement of the first record; NaN where samples were left out."""
     record, problem, scale = records[0], fit.problem, fit.scale
     fitted = np.full(len(record), math.nan)
     if problem.colour is not None and len(records) == 1:
-        # It was fitted to some of the samples, which tell as much as all of them.
+        # It was fitted to some of the samples only.
         every = replace(
             problem,
             time=record.time,
@@ -187,7 +187,7 @@ def _checks(
 
 
 def _beside_rivals(found: Identification, fit: Fit, noise: Noise) -> Identification:
-    """Tell the rivals, and let them widen what is said of K_u and w_u."""
+    """Add the rivals, and widen the uncertainty of K_u and w_u by theirs."""
     shares = support(list(fit.candidates))
     chosen = fit.problem.structure
     own = 0.0
@@ -230,13 +230,13 @@ def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) ->
     found = estimate_of(problem, state, replace(fit, loss="squares"), noise)
     if found is None or found.root is None:
         return None
-    # It was fitted to some of the samples, where they are many.
+    # Where samples are many, it was fitted to some of them only.
     root = found.root * math.sqrt(problem.time.size / fit.problem.time.size)
     return Rival(Estimate.of_root(found.structure, found.values, root), share)
 
 
 def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> float:
-    """Return the error over the last cycle of the model that the samples before it give."""
+    """Return the rms error over the last cycle of a model fitted to the samples before it."""
     record = records[0]
     if len(records) > 1 or len(record.cycle_start) < 3:
         return math.nan
@@ -247,7 +247,7 @@ def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> fl
     if before.y.size < 4 * state.parameters or last.y.size == 0:
         return math.nan
     if before.relaxation or before.drift or before.structure.unstable:
-        # These are counted from the ends of the samples given.
+        # These terms depend on where the samples begin and end.
         return math.nan
     earlier = refine(before, state.theta, tolerance=_PREDICTED)
     error = last.y - earlier.coefficients @ evaluate(last, earlier.theta).columns
@@ -255,7 +255,7 @@ def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> fl
 
 
 def _measured_noise(records: Sequence[Record]) -> float:
-    """Return the noise measured before the tests, of all of them together."""
+    """Return the standard deviation of the noise measured before all tests."""
     if len(records) == 1:
         return records[0].noise_std
     squares = [r.noise_std**2 for r in records if math.isfinite(r.noise_std)]
@@ -263,7 +263,7 @@ def _measured_noise(records: Sequence[Record]) -> float:
 
 
 def _from_baseline(record: Record) -> bool:
-    """Return whether a record is of a relay that began at its baseline, as for a rest."""
+    """Return whether a record is of a relay test that began at its baseline."""
     return record.settings is not None and record.input().initial == record.settings.baseline
 
 

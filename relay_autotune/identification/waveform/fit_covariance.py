@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a waveform fit is, and the covariance of its parameters."""
+"""A waveform fit, and the covariance of its parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
 
-# Parts of the measurement's range that are rounding.
+# Residual that is rounding, as a share of the measurement's range.
 NEGLIGIBLE = 1e-10
 _EPSILON = float(np.finfo(float).eps)
 
@@ -39,9 +39,9 @@ class Fit:
     :param state: the fit.
     :param candidates: all structures tried, the best first.
     :param scale: range of the measurement, in which the problem counts [y].
-    :param base: what the samples' weights would be without the loss, shape (n,); None: the
-        weights themselves.
-    :param loss: what was minimised.
+    :param base: the samples' weights without those of the loss, shape (n,); None: the weights
+        themselves.
+    :param loss: the loss that was minimised.
     :param warnings: sentences on what was left out.
     """
 
@@ -56,10 +56,10 @@ class Fit:
 
 @dataclass(frozen=True)
 class Noise:
-    """What the residual is like.
+    """Properties of the residual.
 
     :param coloured: True: its samples are correlated.
-    :param inflation: how many times larger the covariance is than for white noise of its size.
+    :param inflation: ratio of the covariance to that of white noise of the same size.
     :param step: of the sensor's grid [y]; 0: none, or far below the noise.
     """
 
@@ -69,7 +69,7 @@ class Noise:
 
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:
-    """Return what a fit leaves of each sample, whatever it counts, shape (n,)."""
+    """Return the residual of a fit, neither weighted nor whitened, shape (n,)."""
     if problem.weight is None and problem.colour is None:
         return state.residual
     columns, _ = problem.columns(state.theta)
@@ -81,8 +81,8 @@ def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
     step = max(quantisation_step(r.measurement) for r in records)
     if step == 0.0 or rms >= step:
         return Noise(coloured)
-    # Rounding errors stay alike until the next level is crossed: each level that is held is
-    # one piece of news, however many samples it lasts, with the variance of a rounding.
+    # Rounding errors stay alike until the next level is crossed: each held level counts as one
+    # sample with the variance of a rounding, however many samples it lasts.
     held = sum(1 + int(np.count_nonzero(np.diff(r.measurement))) for r in records)
     samples = sum(len(r) for r in records)
     larger = max(step**2 / 12.0 / rms**2, 1.0) if rms > 0.0 else 1.0
@@ -90,13 +90,13 @@ def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
 
 
 def estimate_of(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> Estimate | None:
-    """Return the parameters of the field with their covariance to first order.
+    """Return the structure's parameters with their covariance to first order.
 
     :param problem: what was fitted.
     :param state: its fit.
-    :param fit: where scale and loss are told.
-    :param noise: what the residual is like.
-    :return: None if the fit is not of its structure.
+    :param fit: for its scale and loss.
+    :param noise: properties of the residual.
+    :return: None if the fit left its structure.
     """
     read = problem.structure.read(state.theta, fit.scale * state.coefficients)
     if read is None:
@@ -110,11 +110,10 @@ def estimate_of(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> Estim
 def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
     """Return B of the covariance B B' of all linear coefficients and theta, in this order.
 
-    Of least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
-    ``J r`` between two inverses. Of a robust loss r is its derivative, over the mean of its
-    second one (Huber 1981). With J = Q R the inverses are those of R: where two parameters can
-    hardly be told apart, J'J keeps half of the digits that it takes to tell what both together
-    leave open.
+    For least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
+    ``J r`` between two inverses. For a robust loss r is the loss's derivative, over the mean of
+    its second one (Huber 1981). With J = Q R, R is inverted: J'J would lose half of the digits
+    where two parameters can hardly be told apart.
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)
@@ -122,7 +121,7 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((jacobian / size[:, None]).T)
     left, singular, right = np.linalg.svd(r, full_matrices=False)
-    # What has no effect beyond rounding is as uncertain as that tells, not certain.
+    # A direction whose effect is below rounding counts as uncertain, not as exact.
     singular = np.maximum(singular, _EPSILON * n * singular[0])
     inverse = (right.T / singular) @ left.T / size[:, None]
     degrees = max(n - state.parameters, 1)
@@ -133,7 +132,7 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
     variances, axes = np.linalg.eigh(meat)
     root = inverse @ (axes * np.sqrt(np.maximum(variances, 0.0)))
     white = np.sum(inverse**2, axis=1) * (float(scores @ scores) / degrees)
-    # Each of the two reasons for fewer independent samples may hold; the larger one counts.
+    # Correlation and rounding both leave fewer independent samples: the larger effect counts.
     larger = np.sqrt(white * noise.inflation / np.maximum(np.sum(root**2, axis=1), 1e-300))
     return np.asarray(root * np.maximum(larger, 1.0)[:, None] / slope)
 
@@ -152,7 +151,7 @@ def _scores(problem: Problem, state: Trial, fit: Fit) -> tuple[FloatArray, Float
 
 
 def _gradient(problem: Problem, state: Trial, scale: float) -> FloatArray:
-    """Return d(parameters of the field)/d(linear coefficients, theta), shape (p, k + m)."""
+    """Return d(structure's parameters)/d(linear coefficients, theta), shape (p, k + m)."""
     structure, k = problem.structure, state.coefficients.size
 
     def values(point: FloatArray) -> FloatArray:
@@ -167,7 +166,7 @@ def _gradient(problem: Problem, state: Trial, scale: float) -> FloatArray:
 
 
 _MOST = 20_000
-# Values on a grid repeat: samples for each value, on average, from which it is one.
+# Least number of samples for each value, on average: values on a grid repeat.
 _TIMES_EACH = 3.0
 _ROUNDED = 1e-3
 

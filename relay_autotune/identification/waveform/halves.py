@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether both halves of a record tell one model, and what they tell where they do not."""
+"""Comparison of the models that the two halves of a record give."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ FloatArray = NDArray[np.float64]
 
 _TRIAL = 1e-6
 _STEPS = 15
-# Beyond this mean square of two deviations, 99 % of equal halves lie nearer.
+# Mean square of two standardised deviations that 99 % of equal halves do not exceed.
 _BY_CHANCE = 4.6
-# A half tells a model where it leaves no more of the logarithm of its response.
+# Largest standard deviation of its response's logarithm with which a half gives a model.
 _TOLD = 0.5
 _STEP = 1e-5
 _FEWEST = 24
@@ -30,10 +30,10 @@ _FEWEST = 24
 
 @dataclass(frozen=True)
 class Halves:
-    """What the halves of a record say of each other.
+    """Comparison of the two halves of a record.
 
     :param apart: mean square of the difference of their responses, relative to its covariance.
-    :param models: of those halves that tell one.
+    :param models: of those halves that determine one.
     """
 
     apart: float
@@ -46,11 +46,11 @@ class Halves:
 
 
 def parted(problem: Problem, state: Trial) -> tuple[Problem, Problem] | None:
-    """Part a record where half of the information on the model's parameters has come.
+    """Split a record into halves of equal information on the model's parameters.
 
     :param problem: of one or several experiments.
     :param state: its fit.
-    :return: None: of several experiments, or of too few samples.
+    :return: None for several experiments, or for too few samples.
     """
     if len(problem.bounds) > 1:
         return None
@@ -67,14 +67,13 @@ def parted(problem: Problem, state: Trial) -> tuple[Problem, Problem] | None:
 def halves_of(fit: Fit, frequency: float) -> Halves | None:
     """Fit the chosen structure to either half of a record, and compare the responses.
 
-    The halves tell equally much: the record is parted where half of the information on the
-    model has come. With z the logarithm of the response at one frequency, its real and imaginary
-    part, the difference d and its covariance C, the mean square is ``d' C^-1 d/2``, which is 1 on
-    average for one process under noise of the colour that was found.
+    Both halves hold equal information on the model. With d the difference of the logarithms of
+    their responses at one frequency, as real and imaginary part, and C its covariance, the mean
+    square is ``d' C^-1 d/2``. It is 1 on average for one process under noise of this colour.
 
     :param fit: in colour, of one experiment.
     :param frequency: at which the responses are compared [rad/s].
-    :return: None: it cannot be parted.
+    :return: None: it cannot be split, or a half gives no covariance.
     """
     parts = parted(fit.problem, fit.state)
     if parts is None:

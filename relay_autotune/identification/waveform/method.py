@@ -9,8 +9,8 @@ The model is
 
 with r_k the exact responses to the recorded command, the dead time any real number. Which
 structure, and whether drift and initial state belong to it, is decided by the Bayesian
-information criterion. Several records of one process share c and theta; offset, drift and
-initial state are each one's own.
+information criterion. Several records of one process share c and theta; each has its own offset,
+drift and initial state.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ from relay_autotune.record.record import Input, Record
 
 FloatArray = NDArray[np.float64]
 
-# From this number of samples on, two values alone are no measurement, however coarse.
+# Number of samples from which even a coarse measurement takes more than two values.
 _ENOUGH_FOR_TWO = 20
 _LEAST_SAMPLES = 12
 _MOST_FOR_CHOICE = 16_384
-# Beyond, what is not known of a process is not hidden in noise.
+# Largest number of samples that are fitted: beyond, noise does not limit what is known.
 _MOST_SAMPLES = 2_000_000
 _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
-# Noise of two records that differs by less is alike.
+# Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2
-# What the best of all dead times and structures gains on noise alone, in the criterion.
+# Gain in the criterion that the best of all dead times and structures reaches on noise alone.
 _SEARCHED = 10.0
 _MOST_ROUNDS = 20
 _SETTLED = 1e-6
@@ -87,12 +87,12 @@ def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
 def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING) -> Identification:
     """Identify one model from all samples of several records of one process.
 
-    Each record counts by the noise in it.
+    Each record is weighted by its noise.
 
-    :param records: at least one; what is told of single samples is told of the first.
+    :param records: at least one; the results for single samples are those of the first.
     :param known: as for :func:`identify_waveform`.
-    :raises IdentificationError: if a record holds too little, they are of processes of different
-        direction, or there is no response to the command.
+    :raises IdentificationError: if a record holds too little, the relays' directions differ, or
+        there is no response to the command.
     """
     if known.structure and known.structure not in TABLE:
         raise IdentificationError(
@@ -165,7 +165,7 @@ def _sign(records: Sequence[Record]) -> int:
 
 
 def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
-    # What is decided on some thousand samples would not be decided otherwise on a million.
+    # The choice on some thousand samples is the same as on a million.
     part = problem.thinned(_MOST_FOR_CHOICE)
     ground = Ground.of(part, part.time.size * NEGLIGIBLE**2, sign)
     candidates = _candidates(ground, known)
@@ -183,8 +183,8 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
         )
         whole = after_the_unknown(whole, chosen.state)
         state = refine(whole, chosen.state.theta)
-        # With a drift beside it, a fit may still run off to where it is no process any more; and
-        # where no structure holds what came, the simplest may leave all of it.
+        # With a drift, a fit may still run off to a model that is no process; and where no
+        # structure explains a disturbance, the simplest may explain nothing at all.
         if ground.candidate(whole, state) is not None and (
             known.structure or len(rest) == 1 or _responds(whole, state)
         ):
@@ -206,7 +206,7 @@ def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
         return fit
     part, state = fit.problem, fit.state
     for _ in range(_MOST_ROUNDS):
-        # The loud ones have pulled the fit, and with it the noise of the quiet ones.
+        # The noisy experiments pulled the fit, which changed the noise found in the others.
         earlier, part = noise, _weighted(part, noise)
         state = refine(part, state.theta, tolerance=_SETTLED)
         noise = _noise_of_each(part, state)
@@ -218,7 +218,7 @@ def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
 def _noise_of_each(problem: Problem, state: Trial) -> FloatArray:
     residual = raw_residual(problem, state)
     noise = np.sqrt([np.mean(residual[part] ** 2) for part in problem.experiments])
-    # One without noise counts for all, but not for more than numbers hold.
+    # An experiment without noise outweighs all others, but its weight stays finite.
     return np.asarray(np.maximum(noise, _LEAST_NOISE * noise.max()))
 
 
@@ -284,7 +284,7 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     error = np.abs(state.residual - np.median(state.residual))
     width = scale_of(state.residual)
     far = error > max(_OUTLIER * width, NEGLIGIBLE)
-    # Many of them, or several in a row, are no spikes but something that the model lacks.
+    # Many of them, or several in a row, are not spikes but something that the model lacks.
     alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
     if width > NEGLIGIBLE and np.sum(far) == np.sum(alone) <= _MOST_OUTLIERS * found.size:
         found[_places(whole, problem)] = far

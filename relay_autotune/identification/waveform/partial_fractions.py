@@ -9,8 +9,8 @@ With the step of a held input as a pole at s = 0, an output is
     S_(p,j)(t) = sum_k step_k (t - t_k)^j/j! exp(p (t - t_k)),
 
 which needs no matrix and is several times as fast as
-:class:`relay_autotune.process.modes.Modes`. Poles that are close to one another cancel in it;
-those are for the modes.
+:class:`relay_autotune.process.modes.Modes`. The terms of close poles cancel: such poles are left
+to the modes.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ FloatArray = NDArray[np.float64]
 # Real for a real pole, complex for the upper one of a pair.
 Numbers = NDArray[Any]
 
-# What the differences of close poles may cost in accuracy: four digits.
+# Largest loss of accuracy by the differences of close poles: four digits.
 _MOST_CANCELLATION = math.log(1e4)
-# A time constant of more horizons than this cancels with the held input.
+# Longest time constant in horizons: a longer one cancels with the held input.
 _LONGEST = 10.0
 # Number of changes up to which a plain loop is as quick as array operations.
 _FEW_CHANGES = 64
-# What differentiation makes of powers: binomial coefficients, and the power that is left.
+# Taylor coefficients of powers of s: binomial coefficients, and the power that is left.
 _MOST = 24
 _POWERS = np.maximum(np.subtract.outer(np.arange(_MOST), np.arange(_MOST)), 0)
 _BINOMIALS = np.array([[float(math.comb(i, j)) for j in range(_MOST)] for i in range(_MOST)])
@@ -41,7 +41,7 @@ _BINOMIALS = np.array([[float(math.comb(i, j)) for j in range(_MOST)] for i in r
 MANY_CHANGES = 100
 # A state that has decayed to this share of itself is zero.
 _FORGOTTEN = 1e-20
-# exp() of it, and of its negative, is a normal number.
+# Exponents x of a block, and of one factor: exp(x) and exp(-x) are normal numbers.
 _BLOCK = 200.0
 _OVERFLOW = 300.0
 
@@ -74,7 +74,7 @@ class Pole:
         p, terms = self.number, self.multiplicity
         if not (backward and self.value.real > 0.0):
             return _recursions(p, changes, steps, terms, 1.0)
-        # Each step is taken back before the one before it is reached.
+        # Backward in time, each step is undone before the earlier one is reached.
         before = _recursions(-p, -changes[::-1], -steps[::-1], terms, -1.0)[:, ::-1]
         before[0] += steps
         return before
@@ -83,7 +83,7 @@ class Pole:
 def partial_fractions(
     constants: Sequence[complex], integrators: int, numerators: FloatArray, horizon: float
 ) -> list[Pole] | None:
-    """Return the poles of outputs to a unit step; None where some are too close for that.
+    """Return the poles of outputs to a unit step; None where some are too close to each other.
 
     :param constants: time constants T of ``prod(1 + T s)``, equal ones repeated, pairs complete
         [s].
@@ -176,10 +176,10 @@ def follow(
         if pole.value != 0j:
             motion = pole.number * since
             if pole.value.real > 0.0:
-                # A state that has decayed from beyond this bound is zero.
+                # A state that decayed from beyond this bound is zero: exp() must not overflow.
                 motion = np.minimum(motion, _OVERFLOW)
             output = output * np.exp(motion)[:, None]
-        # A pair is twice the real part of one of its two.
+        # A conjugate pair gives twice the real part of one pole's output.
         total += 2.0 * output.real if pole.value.imag else output
     return total.T
 
@@ -205,7 +205,7 @@ def _recursions(
 def doubled(decay: Numbers, drive: Numbers) -> Numbers:
     """Return ``x_k = decay_(k-1) x_(k-1) + drive_k`` by joining ever longer stretches.
 
-    Hillis and Steele 1986: of m numbers, log m sums of arrays.
+    Hillis and Steele 1986: m numbers take log2(m) sums of arrays.
 
     :param decay: of magnitude at most 1, shape (m - 1,).
     :param drive: shape (m,).
@@ -224,7 +224,7 @@ def _recursion(p: Any, changes: FloatArray, decay: Numbers, drive: Numbers) -> N
     """Return ``x_k = exp(p (t_k - t_(k-1))) x_(k-1) + drive_k``, shape (m,)."""
     span = abs(p.real) * abs(float(changes[-1] - changes[0])) if changes.size else 0.0
     if changes.size <= _FEW_CHANGES * (1.0 + span / _BLOCK):
-        # Fewer to a block than what a block costs, as with a fast pole and a busy input.
+        # A block would hold too few changes to pay, as with a fast pole and a busy input.
         if changes.size > MANY_CHANGES and (p.real * (changes[-1] - changes[0])) < 0.0:
             return doubled(decay, drive)
         x = drive.tolist()
@@ -234,7 +234,7 @@ def _recursion(p: Any, changes: FloatArray, decay: Numbers, drive: Numbers) -> N
     found = np.empty(changes.size, dtype=decay.dtype)
     first, carried = 0, 0.0
     while first < changes.size:
-        # Within a block, a sum of what each change would have been at its beginning.
+        # Within a block: a cumulative sum of the changes, referred to the block's beginning.
         reach = _BLOCK / abs(p.real) if p.real else math.inf
         last = int(np.searchsorted(changes, changes[first] + reach, side="right"))
         motion = np.exp(p * (changes[first:last] - changes[first]))

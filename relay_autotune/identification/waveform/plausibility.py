@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which fits explain the samples by what no sample can show."""
+"""Fits that explain the samples by something that no sample can show."""
 
 from __future__ import annotations
 
@@ -9,22 +9,20 @@ import math
 
 from relay_autotune.process.transfer_function import TransferFunction
 
-# Samples that an oscillation of the process must have in each of its periods.
+# Least number of samples in each period of an oscillation of the process.
 _SAMPLES_A_SWING = 4.0
-# Intervals between samples that a whole response takes at least, to be one.
+# Shortest response of a process, in intervals between samples.
 _SHORTEST_RESPONSE = 0.5
-# Lengths of the record up to which a zero counts; beyond, a slow pole cancels it, or nothing does,
-# and what is left is a drift.
+# Longest zero in lengths of the record: beyond, a slow pole cancels it, or it is a drift.
 _LONGEST_ZERO = 2.0
 
 
 def is_unseen(model: TransferFunction, interval: float, length: float) -> bool:
     """Return whether a fit owes its small residual to what happens between the samples.
 
-    It rings faster than the samples show: noise alone asks for such a resonance, of any height,
-    and it would bound every gain. Or its whole answer falls between two samples, or comes from a
-    zero beyond reason: so answers a controller that is read backward, whose command follows the
-    measurement in the same instant.
+    It rings faster than the samples show: noise alone leads to such a resonance, of any height,
+    and it would limit every gain. Or its whole response falls between two samples, or comes from
+    an unreasonable zero: so a controller responds, where command and measurement were swapped.
 
     :param model: the fit.
     :param interval: between samples [s].

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Profile-likelihood intervals, for parameters whose sum of squares is no parabola."""
+"""Profile-likelihood intervals, for parameters whose sum of squares is not a parabola."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ FloatArray = NDArray[np.float64]
 # A parameter as a function of theta and the linear coefficients.
 Parameter = Callable[[FloatArray, FloatArray], float]
 
-# Steps outward, and trials of one fit on the way.
+# Largest numbers of steps outward, and of trials of each fit.
 _MOST_STEPS = 20
 _MOST_TRIALS = 12
-# Fits that fail in a row before the profile counts as one that cannot be followed.
+# Number of failed fits in a row after which the profile cannot be followed.
 _MOST_LOST = 5
 # Least rise at the end of a search that did not settle, as a share of the quantile.
 _FAR_ENOUGH = 0.5
 _CLOSE = 0.02
 _SETTLED = 1e-2
 _FAR = 8.0
-# Logarithm of a gain beyond which products of it are no numbers.
+# Largest logarithm of a gain: products with a larger one overflow.
 _LARGEST = 300.0
 _FURTHER = 4.0
 _WEAK = 1e-11
 _NARROW = 0.3
-# Share of the way to a far place within which a straight line holds.
+# Least share of the way to the outer point for which interpolation is trusted.
 _SMALL = 0.2
 
 
@@ -65,8 +65,8 @@ def profile_ends(
     :param std: its standard deviation to first order.
     :param quantile: q.
     :param least: a lower bound of the parameter.
-    :param farthest: beyond this distance from the estimate no end is looked for.
-    :param inflation: how many times larger the variance is than that of white noise.
+    :param farthest: largest distance of an end from the estimate that is tried.
+    :param inflation: ratio of the variance to that of white noise.
     :return: lower and upper end; infinite where the sum of squares never rises so far, NaN where
         it could not be followed.
     """
@@ -125,7 +125,7 @@ def _end(problem: Problem, state: Trial, parameter: Parameter, search: _Search) 
             inside, place = (root, reach), held[:2]
         if math.isinf(outside[0]):
             if outside[1] - inside[1] <= _NARROW * inside[1]:
-                # It has not risen as far as numbers reach.
+                # It has not risen enough up to where fits fail.
                 return search.side * math.inf
             further = reach * min(search.quantile / max(root, 1e-3), _FURTHER)
             reach = further if math.isinf(outside[1]) else 0.5 * (inside[1] + outside[1])
@@ -146,10 +146,10 @@ def _hold(
     parameter: Parameter,
     target: float,
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Minimise over all else with the parameter at its target, by Gauss's and Newton's steps.
+    """Minimise over all else with the parameter at its target, by Gauss-Newton steps.
 
-    The gain moves as a logarithm, and a zero beside it, so that a gain and a time constant that
-    only have a ratio move together.
+    The gain moves as a logarithm, and a zero relative to it, so that a gain and a time constant
+    move together where only their ratio is known.
     """
     k, own = coefficients.size, len(problem.structure.powers)
     point = np.concatenate((coefficients, theta))
@@ -213,5 +213,5 @@ def _constrained(
     solved = np.linalg.lstsq((along.T @ scaled).T, rest, rcond=_WEAK)[0]
     with np.errstate(over="ignore"):
         step = np.asarray((onto + along @ solved) / size)
-    # A direction that the samples hardly show may ask for more than numbers hold.
+    # Along a direction that the samples hardly show, the step may overflow.
     return step if np.all(np.isfinite(step)) else None

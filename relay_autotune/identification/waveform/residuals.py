@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tests on residuals, and covariances that stay honest where they are correlated."""
+"""Tests of residuals, and covariances that allow for their correlation."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
 
 
 def worth(residual: FloatArray, errors: float = 0.0) -> float:
-    """Return how many independent samples each of correlated ones is worth, up to 1.
+    """Return the number of independent samples that one correlated sample is worth, up to 1.
 
     With a correlation rho of neighbours, n samples tell no more than ``n (1 - rho)/(1 + rho)``
     independent ones.
 
     :param residual: shape (n,), in the order of time.
-    :param errors: standard errors up to which a correlation counts as none.
+    :param errors: largest correlation that counts as zero, in standard errors.
     """
     n = residual.size
     rho = float(autocorrelation(residual, 1)[0])
@@ -57,7 +57,7 @@ def noise_to_signal(noise: FloatArray, signal: FloatArray) -> tuple[float, float
 
     N1 is the ratio of the mean powers, N2 that of the mean absolute values.
 
-    :param noise: what is not the signal [y], shape (n,).
+    :param noise: the noise [y], shape (n,).
     :param signal: deviation from the operating point [y], shape (n,).
     :return: N1 and N2; NaN where there is no signal.
     """
@@ -119,7 +119,7 @@ def scale_of(residual: FloatArray) -> float:
 
 
 def weights(residual: FloatArray, scale: float, loss: str) -> FloatArray:
-    """Return what each sample counts: w, with which w r is the derivative of the loss at r.
+    """Return the weight w of each sample, with which w r is the derivative of the loss at r.
 
     Huber 1964: ``w = min(1, c/|x|)``; Tukey's biweight (Beaton and Tukey 1974):
     ``w = (1 - (x/c)^2)^2`` within c and 0 beyond, with x = r/scale.
@@ -137,7 +137,7 @@ def weights(residual: FloatArray, scale: float, loss: str) -> FloatArray:
 
 
 def mean_slope(residual: FloatArray, scale: float, loss: str) -> float:
-    """Return the mean second derivative of the loss, by which its estimates are less certain.
+    """Return the mean second derivative of the loss, which divides standard deviations.
 
     :param residual: r, shape (n,).
     :param scale: standard deviation of the noise's bulk.

@@ -58,21 +58,21 @@ FloatArray = NDArray[np.float64]
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _SAMPLES_EACH = 8
-# How many times smaller the mean square must be for the beginning to be left out.
+# Ratio of the mean squares with and without the beginning, from which it is left out.
 _MUCH_BETTER = 4.0
-# Standard errors from which a correlation of neighbours counts as one.
+# Least correlation of neighbours that counts, in standard errors.
 _CORRELATED = 4.0
-# Drift and initial state belong to a fit only on strong evidence, since they blur the gain.
+# Least gain in the criterion for which drift or initial state is fitted: they blur the gain K.
 _EVIDENCE = 6.0
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
 # A structure whose mean square is this many times the least one has no support.
 _BEYOND_HOPE = 4.0
-# A fit is given up where it promises no less than this many times the least mean square; of
-# a smaller mean square of the range, what it leaves is curvature that the promise does not know.
+# Ratio of the promised mean square to the least one, from which a fit is given up. Below the
+# second, in squares of the range, the residual is curvature, which the promise neglects.
 _NO_PROMISE = 6.0
 _CLEAN = 1e-6
-# In this order structures are fitted: those first that tell which others are hopeless.
+# Order in which structures are fitted: first those that show which others are hopeless.
 _TRIED = tuple(
     s.name
     for s in (
@@ -81,10 +81,10 @@ _TRIED = tuple(
     )
 )
 _SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
-# What is asked for whatever it leaves.
+# Structures that are fitted to the end, whatever residual they leave.
 _ALWAYS = (FOPDT.name, IPDT.name)
 
-# A structure, and where the starts of its fit lead at first.
+# A structure, and the first trials of its fit.
 _Begun = tuple[Structure, list[Trial]]
 
 
@@ -94,7 +94,7 @@ class Candidate:
 
     :param problem: what was fitted.
     :param state: the fit.
-    :param model: the fit in the terms of the field.
+    :param model: the transfer function that was fitted.
     :param criterion: Bayesian information criterion; smaller is better.
     """
 
@@ -194,7 +194,7 @@ class Ground:
         """
         problem = replace(nuisances, structure=FOPDT)
         if problem.relaxation:
-            # A FOPDT has the longest dead time of all, since it counts every small lag to it.
+            # A FOPDT has the longest dead time of all, since it includes every small lag.
             first = refine(problem, self.fopdt.theta, tolerance=_TRIAL)
             problem = after_the_unknown(problem, first)
         return replace(self, problem=problem)
@@ -234,7 +234,7 @@ class Ground:
         return None
 
     def _begun(self, structure: Structure, thetas: list[FloatArray]) -> Iterator[_Begun]:
-        """Begin fits; so few samples as may be tell no more than a first order."""
+        """Begin fits; with too few samples, of first order only."""
         enough = _SAMPLES_EACH * (structure.order + 4) <= self.problem.time.size
         if enough or structure.order <= 1:
             yield structure, begin(replace(self.problem, structure=structure), thetas)
@@ -272,7 +272,7 @@ class Ground:
     def _two_equal_lags(self) -> FloatArray:
         """Return a start of two lags and a zero: the two equal ones that fit best.
 
-        From a FOPDT, which answers the right way at once, not every inverse response is found.
+        The starts from a FOPDT do not lead to every inverse response.
         """
         problem = replace(self.problem, structure=LAG_N_ZERO.of_order(2))
         best = go_on(problem, begin(problem, self.starts.lag_n_zero(2)))[0]
@@ -295,7 +295,7 @@ def fit_all(ground: Ground) -> list[Candidate]:
     :param ground: what they are fitted to.
     """
     # Drift and initial state are decided with the better of two flexible structures, and with
-    # an integrator, to which a command off its balance is a drift.
+    # an integrator, for which a command off its balance looks like a drift.
     simple = ground.fit(_SIMPLE)
     flexible = [c for c in simple if c.structure != IPDT]
     if not flexible:
@@ -308,7 +308,7 @@ def fit_all(ground: Ground) -> list[Candidate]:
     base = decided.problem
     found = _sorted(ground.beside(base), simple)
     if found and any(nuisances_of(base)):
-        # What these two leave unexplained may pass for a drift: the best one is asked again.
+        # The residual of the simple structures may look like a drift: decide with the best again.
         plain = ground.refit(found[0])
         again = base if plain is None else ground.with_nuisances(plain).problem
         if nuisances_of(again) != nuisances_of(base):
@@ -317,9 +317,10 @@ def fit_all(ground: Ground) -> list[Candidate]:
 
 
 def _sorted(ground: Ground, ready: Sequence[Candidate]) -> list[Candidate]:
-    """Fit all structures, and return them by what their samples are worth, the best first.
+    """Fit all structures, and return them by their criterion, the best first.
 
-    Where even the best residual is correlated, it is by jitter or by what no structure holds.
+    Where even the best residual is correlated, by jitter or by what no structure explains, each
+    sample counts less.
     """
     found = sorted(ground.fit(_TRIED, ready=ready), key=lambda c: c.criterion)
     if not found or found[0].state.cost <= ground.floor:
@@ -367,7 +368,7 @@ def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | Non
     if not asked and is_hopeless(rough[0]):
         if promises_nothing(rough[:1]):
             return None
-        # Unless it was on its way still.
+        # It may not have converged yet.
         best = rough[0]
         rough = [refine(coarse(problem), best.theta, tolerance=_TRIAL, damping=best.damping)]
         if is_hopeless(rough[0]):
@@ -378,7 +379,7 @@ def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | Non
 def _without_the_unknown(
     problem: Problem, fopdt: Trial, floor: float, sign: int
 ) -> tuple[Problem, Trial]:
-    """Begin later where a record that was cut out of a movement explains itself better so.
+    """Leave out the beginning of a record that was cut out of a movement, if that fits better.
 
     :param problem: all samples.
     :param fopdt: the FOPDT that fits them best.
@@ -398,7 +399,7 @@ def _without_the_unknown(
     enough = _MUCH_BETTER * second.cost / later.time.size
     if enough >= first.cost / whole.time.size:
         return problem, fopdt
-    # A long first swing from rest shows small lags, which a FOPDT lacks.
+    # A long first swing from rest shows small lags, which a FOPDT cannot fit.
     third = replace(problem, structure=THREE_LAGS)
     flexible = refine_best(third, Starts(third, fopdt).third(), tolerance=_TRIAL)
     if flexible.cost / third.time.size <= enough:
@@ -409,8 +410,7 @@ def _without_the_unknown(
 def after_the_unknown(problem: Problem, state: Trial) -> Problem:
     """Return the samples whose input is known; all of them where the process was at rest.
 
-    What was fed to a process that was not at rest before the record is not known, and acts for
-    one dead time, unless it is estimated.
+    The input before the record is not known, unless it is estimated, and acts for one dead time.
 
     :param problem: the problem.
     :param state: a fit, for its dead time.
@@ -431,7 +431,8 @@ def _is_driven(problem: Problem) -> bool:
 
 
 _INDIFFERENT = 2.0
-# Parts of the measurement's range: left by an exact structure, and by one that is good enough.
+# Largest rms residual of an exact structure, and of one that is good enough, as shares of the
+# measurement's range.
 _EXACT = 1e-7
 _ENOUGH = 4e-3
 
@@ -450,11 +451,11 @@ def choose(candidates: list[Candidate]) -> Candidate:
 
 
 def _good_enough(candidates: list[Candidate]) -> Candidate | None:
-    """Return a FOPDT that leaves so little that jitter or rounding explains the rest as well.
+    """Return a FOPDT whose residual is so small that jitter or rounding explains it; else None.
 
-    Below that, what the criterion prefers is made of the errors of the instants, which are
-    not white. Where a structure is exact, nothing is left to such errors; and means of many
-    samples have so little of them that what a FOPDT leaves is the process's.
+    Below that, the criterion would prefer a structure that fits the errors of the sample times,
+    which are not white. They are absent where a structure is exact, and negligible in means of
+    many samples.
     """
 
     def rms(candidate: Candidate) -> float:

@@ -30,12 +30,12 @@ _LEAST_GAIN = 1e-15
 _SMALLEST_STEP = 1e-14
 _FIRST_DAMPING = 1e-3
 _LITTLE_DAMPING = 0.1
-# Trials in a row that gain nothing worth it: a rough fit stands at a kink, as of a dead time.
+# Useless trials in a row that end a rough fit: it stands at a kink, as a dead time makes.
 _PATIENCE = 10
 _LEAST_DAMPING = 1e-12
 _MOST_DAMPING = 1e12
 _GROWTH = 4.0
-# In lengths of the record: a slower lag answers as an integrator does, to a thousandth.
+# Longest lag in lengths of the record: a slower one is an integrator to a thousandth.
 _LONGEST = 1e3
 _WEAK = 1e-11
 
@@ -44,8 +44,8 @@ _WEAK = 1e-11
 class Problem:
     """Samples, inputs and structure, with the terms that are estimated beside the model.
 
-    The samples of several experiments on one process follow one another; gain and theta are
-    common to them, offset, drift and initial state are each one's own.
+    The samples of several experiments on one process follow one another. They share gain and
+    theta; each has its own offset, drift and initial state.
 
     :param time: sample times, in each experiment not decreasing [s], shape (n,).
     :param y: what is fitted, in units of its own range, shape (n,).
@@ -55,11 +55,11 @@ class Problem:
     :param bounds: number of the first sample of each experiment.
     :param drift: True: a straight line is estimated, not only an offset.
     :param relaxation: True: a free initial state is estimated.
-    :param weight: square root of what each sample counts, shape (n,); None: all count alike.
+    :param weight: square root of each sample's weight, shape (n,); None: all are equal.
     :param past: True: the command before each experiment is estimated: the process rested, or
         moved freely, under another level than its first one.
-    :param colour: of the noise; None: it is white.
-    :param averaged: True: the samples are means of several, which hide less.
+    :param colour: of the noise; None: white.
+    :param averaged: True: each sample is the mean of several.
     """
 
     time: FloatArray
@@ -100,7 +100,7 @@ class Problem:
         return found
 
     def columns(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the linear coefficients' columns and the derivatives of those that have some.
+        """Return the linear coefficients' columns, and the derivatives of the first l by theta.
 
         :param theta: shape (m,).
         :return: shapes (k, n) and (m, l, n); the k - l columns that theta does not change come
@@ -151,7 +151,7 @@ class Problem:
         return common, by_theta, own, own_by_theta, rest
 
     def seen(self, rows: FloatArray) -> FloatArray:
-        """Return rows as they count: by the samples' weights, and without the noise's colour.
+        """Return rows multiplied by the samples' weights, and whitened by the noise's colour.
 
         :param rows: shape (..., n).
         """
@@ -175,7 +175,7 @@ class Problem:
     def thinned(self, most: int) -> Problem:
         """Return the problem of evenly spaced samples.
 
-        :param most: of all experiments together; hardly more are kept.
+        :param most: about the number to keep, of all experiments together.
         """
         share = most // len(self.bounds)
         parts = self.experiments
@@ -214,12 +214,12 @@ class Trial:
 
     :param theta: shape (m,).
     :param coefficients: the best linear coefficients, shape (k,).
-    :param residual: what is left, weighted as the samples are, shape (n,).
+    :param residual: weighted and whitened, shape (n,).
     :param cost: its sum of squares.
     :param basis: orthonormal columns of the linear part, shape (n, k).
     :param derivative: of the model by theta, weighted, shape (m, n).
     :param columns: of the linear part, weighted, shape (k, n).
-    :param damping: Marquardt's, where a fit ended.
+    :param damping: Marquardt's damping at the end of a fit.
     """
 
     theta: FloatArray
@@ -233,12 +233,12 @@ class Trial:
 
     @property
     def parameters(self) -> int:
-        """Number of all that was estimated."""
+        """Number of estimated parameters, the linear ones included."""
         return int(self.theta.size + self.coefficients.size)
 
 
 def evaluate(problem: Problem, theta: FloatArray) -> Trial:
-    """Return the best linear coefficients for one theta, and what they leave.
+    """Return the fit of the linear coefficients for one theta.
 
     :param problem: the problem.
     :param theta: shape (m,).
@@ -260,8 +260,8 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
 def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
     """Solve ``r c = right`` for an upper triangle r of a few columns, each of length one.
 
-    A column that the others make up carries no information: its coefficient stays zero. So do
-    those beyond the number of samples, where r has fewer rows than columns.
+    The coefficient of a column that depends on the others stays zero. So do those of columns
+    beyond the number of samples, where r has fewer rows than columns.
     """
     # For a few columns plain numbers are quicker than arrays.
     found = [0.0] * len(r[0])
@@ -284,9 +284,9 @@ def refine(
 
     :param problem: the problem.
     :param theta: where to begin, shape (m,).
-    :param tolerance: relative gain of a step that is not worth another one; by default, rounding.
-    :param most: steps that are tried at most.
-    :param damping: Marquardt's, at the start; that of an earlier fit lets it go on.
+    :param tolerance: relative gain below which a step is the last one; by default, rounding.
+    :param most: largest number of steps that are tried.
+    :param damping: Marquardt's damping at the start; that of an earlier fit continues it.
     """
     state = evaluate(problem, theta)
     growth = _GROWTH
@@ -299,7 +299,7 @@ def refine(
         step = _solve(normal, gradient, damping)
         least = -float(state.theta[-1] / scale[-1])
         if step[-1] < least:
-            # The dead time stops at zero, and the others go where that leaves them to go.
+            # The dead time stops at zero, and the other steps are solved with it fixed there.
             rest = gradient[:-1] - normal[:-1, -1] * least
             step = np.append(_solve(normal[:-1, :-1], rest, damping), least)
         predicted = float(step @ (2.0 * gradient - normal @ step))
@@ -314,18 +314,18 @@ def refine(
         if not trial.cost < state.cost:
             damping *= growth
             growth *= 2.0
-            # Where even the undamped step promises less than rounding, no other will be seen.
+            # Not even the undamped step promises a gain above the tolerance.
             undamped = float(gradient @ _solve(normal, gradient, 0.0))
             if undamped <= tolerance * state.cost or damping > _MOST_DAMPING or smallest:
                 break
             continue
         gained = state.cost - trial.cost
-        # By how well the linear model foretold the gain (Nielsen 1999).
+        # The damping follows the ratio of the actual gain to the predicted one (Nielsen 1999).
         factor = 1.0 - (2.0 * gained / predicted - 1.0) ** 3 if predicted > 0.0 else 1.0
         damping = max(damping * min(max(factor, 0.1), 2.0), _LEAST_DAMPING)
         growth = _GROWTH
         state = trial
-        # A step that damping made small gains little wherever it begins.
+        # A small gain ends the fit only where it was not the damping that made the step small.
         if smallest or (gained <= tolerance * state.cost and damping <= _LITTLE_DAMPING):
             break
         scale, normal, gradient = _linearised(problem, state)
@@ -358,7 +358,7 @@ def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArr
     try:
         step = np.linalg.solve(scaled, gradient / size)
     except np.linalg.LinAlgError:
-        # Without damping, directions that the data do not tell apart.
+        # Singular: there is no damping, and the data do not tell some directions apart.
         step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0]
     return np.asarray(step / size)
 
@@ -369,10 +369,10 @@ def information_criterion(
     """Return the Bayesian information criterion, ``n log(cost/samples) + p log n``.
 
     :param cost: sum of squared residuals.
-    :param samples: how many they are.
-    :param parameters: p, all that was estimated.
-    :param floor: what lies below it is rounding, and counts as equal.
-    :param worth: how many independent samples each is worth, a factor of their number.
+    :param samples: number of samples.
+    :param parameters: p, number of estimated parameters.
+    :param floor: sum of squares that is rounding: smaller ones count as equal to it.
+    :param worth: number of independent samples that each is worth; n is the product.
     """
     n = samples * worth
     return n * math.log(max(cost, floor) / samples) + parameters * math.log(max(n, 3.0))

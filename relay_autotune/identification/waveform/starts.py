@@ -27,16 +27,18 @@ FloatArray = NDArray[np.float64]
 _GRID_SAMPLES = 240
 _BEST = 3
 _COARSE = 1e-4
-# Several starts: steps that each may take, how many go on, and the sum of squares that ends one.
+# Several starts: steps of each, steps and number of those that go on, and the ratio to the least
+# sum of squares beyond which one is dropped.
 _FIRST_STEPS = 5
 _SECOND_STEPS = 8
 _MORE = 3
 _HOPELESS = 4.0
-# A relay switches at no more than this part of the samples. Where a command changes more often,
-# the changes that count are those by this part of its range.
+# Largest share of the samples at which a relay switches. Where a command changes more often, only
+# changes by at least this share of its range count.
 _MOST_SWITCHES = 0.5
 _SWITCH = 0.25
-# Nearer in every direction two are one; of two whose sums differ by less, all samples decide.
+# Largest distance, in unit steps, of two fits that count as one; and the ratio of two fits' sums
+# of squares up to which all samples decide between them.
 _SAME = 0.02
 _UNDECIDED = 1.05
 _EXACT = 1e-15
@@ -50,7 +52,7 @@ _SHARES = (
 
 
 def two_lags(large: float, small: float, dead_time: float) -> FloatArray:
-    """Return theta of a second order with two lags, which are kept apart.
+    """Return theta of a second order with two lags, at least a little apart.
 
     :param large: time constant [s].
     :param small: the other one [s].
@@ -62,7 +64,7 @@ def two_lags(large: float, small: float, dead_time: float) -> FloatArray:
 
 
 def changes_within(u: Input, time: FloatArray) -> FloatArray:
-    """Return when an input changes within samples, so that one of them follows [s].
+    """Return when an input changes between the first and the last sample [s].
 
     :param u: the input.
     :param time: of the samples [s], shape (n,).
@@ -71,9 +73,9 @@ def changes_within(u: Input, time: FloatArray) -> FloatArray:
 
 
 def time_scales(problem: Problem) -> tuple[float, float]:
-    """Return the shortest time that samples resolve, and the longest that a dead time can be.
+    """Return the shortest time that samples resolve, and the longest possible dead time [s].
 
-    :param problem: the inputs change within the samples [s].
+    :param problem: its inputs change within the samples.
     """
     scales = []
     for part, u in zip(problem.experiments, problem.inputs, strict=True):
@@ -83,7 +85,7 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         inside = changes_within(u, time)
         rest = float(time[-1] - inside[0])
         if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
-            # A controller answers each sample, and now and then a set-point that is switched.
+            # A controller moves a little at each sample, and far when its set-point is switched.
             steps = np.abs(np.diff(u.values, prepend=u.initial))
             large = u.times[steps >= _SWITCH * float(np.ptp(u.values))]
             inside = large[(large >= time[0]) & (large < time[-1])]
@@ -100,9 +102,9 @@ def coarse(problem: Problem) -> Problem:
 
 
 def begin(problem: Problem, thetas: list[FloatArray]) -> list[Trial]:
-    """Return where a few steps on few samples lead from each start, the best first.
+    """Refine each start by a few steps on few samples, and return the best first.
 
-    They show which starts are worth more. A single start is followed to its end.
+    These steps show which starts are worth more. A single start is followed to its end.
 
     :param problem: the problem.
     :param thetas: starts, at least one.
@@ -113,11 +115,11 @@ def begin(problem: Problem, thetas: list[FloatArray]) -> list[Trial]:
 
 
 def go_on(problem: Problem, begun: list[Trial]) -> list[Trial]:
-    """Return the fits to few samples that a beginning leads to, the best first.
+    """Refine the best trials further on few samples, and return the best first.
 
     :param problem: the problem.
     :param begun: from :func:`begin`.
-    :return: two where few samples do not tell which of two places is the better one.
+    :return: two fits where few samples do not tell which is better, else one.
     """
     if len(begun) == 1:
         return begun
@@ -140,7 +142,7 @@ def least_promised(problem: Problem, begun: list[Trial]) -> float:
 
 
 def _apart_from_each_other(problem: Problem, states: list[Trial], limit: float) -> list[Trial]:
-    """Return the best state and those of little higher cost that are elsewhere."""
+    """Return distinct states of at most ``limit`` times the least cost, the best first."""
     states = sorted(states, key=lambda s: s.cost)
     chosen: list[Trial] = []
     for state in states:
@@ -156,7 +158,7 @@ def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float 
 
     :param problem: the problem.
     :param thetas: starts, at least one.
-    :param tolerance: relative gain of a step that is not worth another one; 0: rounding.
+    :param tolerance: relative gain below which a step is the last one; 0: rounding.
     """
     return refine_all(problem, go_on(problem, begin(problem, thetas)), tolerance or _EXACT)
 
@@ -166,7 +168,7 @@ def refine_all(problem: Problem, rough: list[Trial], tolerance: float) -> Trial:
 
     :param problem: the problem.
     :param rough: fits to few samples, at least one.
-    :param tolerance: relative gain of a step that is not worth another one.
+    :param tolerance: relative gain below which a step is the last one.
     """
     fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in rough]
     return min(fits, key=lambda s: s.cost)
@@ -201,13 +203,13 @@ def _apart(a: FloatArray, b: FloatArray) -> bool:
 def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> FloatArray:
     """Return the sums of squares that a lag and an offset leave, for each dead time.
 
-    A limit cycle looks much the same half a period later with the other sign; a lag with the
-    wrong one explains nothing here.
+    Half a period later, a limit cycle of the other sign looks much the same: a lag of the wrong
+    sign counts as no explanation.
     """
     theta = np.array((math.log(tau), 0.0))
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
     for part, u in zip(problem.experiments, problem.inputs, strict=True):
-        # A dead time only moves the response, so that one pass over moved samples gives all.
+        # A dead time only shifts the response: one pass over shifted samples gives all rows.
         moved = (problem.time[part] - dead_times[:, None]).ravel()
         table = _table(problem, theta, moved, dead_times.size, u)
         y = np.tile(problem.y[part] - problem.y[part].mean(), (dead_times.size, 1))
@@ -247,18 +249,18 @@ class Starts:
 
     def __init__(self, problem: Problem, fopdt: Trial) -> None:
         shortest, self.longest = time_scales(problem)
-        # A FOPDT that fits badly may run off to an integrator, which tells the others nothing.
+        # A FOPDT that fits badly may run off to an integrator, which is no start for the others.
         self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
         self.dead_time = float(fopdt.theta[1])
         self._least = 0.1 * shortest
         point = ultimate_point(
             TransferFunction.fopdt(1.0, self.tau, max(self.dead_time, self._least))
         )
-        # Where the fit is judged: about the frequency at which a relay test oscillates.
+        # Frequency at which starts equal the FOPDT: about that of a relay's oscillation.
         self._w = point.frequency if point is not None else 1.0 / self.longest
 
     def lag_n(self, order: int) -> FloatArray:
-        """Return (log tau, D) of n equal lags of the same gain and phase at one frequency."""
+        """Return (log tau, D) of n equal lags, with the FOPDT's response at one frequency."""
         w = self._w
         square = (1.0 + (w * self.tau) ** 2) ** (1.0 / order) - 1.0
         tau = max(math.sqrt(square) / w, self._least)

@@ -62,7 +62,7 @@ def theta_of(structure: Structure, values: FloatArray) -> FloatArray:
 
 
 def unit_steps(structure: Structure, theta: FloatArray) -> FloatArray:
-    """Return the size of a unit step in each direction; of the dead time, all lags [s].
+    """Return the size of a unit step: 1 of a logarithm, and all times together of D [s].
 
     :param structure: the structure.
     :param theta: shape (m,).
@@ -81,7 +81,7 @@ def stepped(
     :param step: shape (m,).
     :param longest: time constant beyond which a lag is an integrator [s].
     """
-    # Plain numbers are quicker than arrays of a few.
+    # For so few numbers plain floats are quicker than arrays.
     *logs, dead_time = theta.tolist()
     *moves, by_dead_time = step.tolist()
     logs = [
@@ -146,7 +146,7 @@ def _at_changes(levels: FloatArray, gaps: FloatArray) -> tuple[FloatArray, Float
         state = doubled(decay, np.append(0.0, -np.expm1(-gaps) * levels[:-1]))
         away = state[:-1] - levels[:-1]
         return state, doubled(decay, np.append(0.0, decay * away * gaps))
-    # Plain numbers are quicker than arrays of a few.
+    # For so few numbers plain floats are quicker than arrays.
     states, slopes = [0.0], [0.0]
     s = q = 0.0
     for level, gap, a in zip(levels.tolist(), gaps.tolist(), decay.tolist(), strict=False):
