@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a record determines where it does not determine every parameter, and what would."""
+"""Combinations that a record determines where it does not determine every parameter."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def is_determined(value: float, low: float, high: float) -> bool:
 def determined_combinations(
     found: Estimate, point: tuple[Uncertain, Uncertain]
 ) -> tuple[Combination, ...]:
-    """Return the combinations that the data hold, of a model that is not determined as a whole.
+    """Return the determined combinations of a model that is not determined as a whole.
 
     :param found: the model with its covariance.
     :param point: K_u and w_u, whose uncertainty is known better than to first order.
@@ -71,12 +71,12 @@ def point_of(model: TransferFunction) -> tuple[float, float]:
 def _asked(
     model: TransferFunction,
 ) -> list[tuple[str, str, Callable[[TransferFunction], float]]]:
-    """Return names, units and functions of what may be determined where parameters are not."""
+    """Return names, units and functions of the combinations that may be determined."""
     lags = len(model.time_constants)
     found: list[tuple[str, str, Callable[[TransferFunction], float]]] = []
     per = " s" * (model.integrators + 1)
     if lags:
-        # How fast it moves away: of a slow process this is all that a short test shows.
+        # Its first slope: a short test of a slow process shows nothing else.
         found.append(("gain/time_constant", f"y/(u{per})", _slope))
     if lags > 1:
         found.append(("gain/product of lags", f"y/(u{' s' * (model.integrators + lags)})", _high))

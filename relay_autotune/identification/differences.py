@@ -62,6 +62,6 @@ def exact_steps(
 
     :param at: the point, shape (p,).
     :param size: of the steps, shape (p,).
-    :param least: below which no step goes back, shape (p,).
+    :param least: lower bound of the point after a step back, shape (p,).
     """
     return (at + size) - at, at - np.maximum(at - size, least)

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A model by the values of its parameters, how sure they are, and what follows from both."""
+"""A model by its parameters and their covariance, and what follows from both."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from relay_autotune.process.transfer_function import TransferFunction
 
 FloatArray = NDArray[np.float64]
 
-# Logarithms may go so far from the estimate, and steps for derivatives are so long.
+# Largest change of a logarithm. Steps for derivatives: their bounds, and their share of a
+# standard deviation.
 _FAR = 50.0
 _STEPS = (1e-7, 1e-2)
 _SHARE = 1e-3
-# Logarithms of a model that is drawn.
+# Largest change of a logarithm in a model that is drawn.
 _FARTHEST_DRAWN = 20.0
 
 
@@ -52,9 +53,8 @@ class Estimate:
     :param structure: of the model.
     :param values: of its parameters, in their order, shape (p,).
     :param covariance: of the values, shape (p, p); NaN: not estimated.
-    :param root: B of the covariance B B', shape (p, k), where it is known: it has twice the
-        digits for what parameters leave open together that are hardly told apart; None: it is
-        not.
+    :param root: B of the covariance B B', shape (p, k), which keeps twice the digits where
+        parameters can hardly be told apart; None: not known.
     """
 
     structure: Structure
@@ -87,8 +87,7 @@ class Estimate:
 
         :param structure: of the model.
         :param values: of its parameters, shape (p,).
-        :param root: B, shape (p, k); what is so large that numbers do not hold its square leaves
-            the covariance NaN.
+        :param root: B, shape (p, k); where B B' overflows, the covariance is NaN.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             covariance = root @ root.T
@@ -115,8 +114,8 @@ class Estimate:
     def intervals(self, quantile: float = NORMAL_95) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the 95 % intervals of the values, each of shape (p,).
 
-        What cannot change sign, as a gain or a time constant, has the interval of its logarithm;
-        all else has a linear one, cut at the parameter's least value.
+        A value that cannot change sign, as a gain or a time constant, has the interval of its
+        logarithm; any other has a linear one, cut at the parameter's least value.
 
         :param quantile: half width in standard deviations.
         """
@@ -132,7 +131,7 @@ class Estimate:
 
     @cached_property
     def _spread(self) -> FloatArray:
-        """Covariance with all that cannot change sign by its logarithm, shape (p, p)."""
+        """Covariance of the values, or of logarithms of those that cannot change sign, (p, p)."""
         size = np.where(self.structure.logarithmic, self.values, 1.0)
         return np.asarray(self.covariance / np.outer(size, size))
 
@@ -210,7 +209,7 @@ class Estimate:
             log_response(values, frequency * (1.0 + step))
             - log_response(values, frequency * (1.0 - step))
         ) / (2.0 * step * frequency)
-        # A dead time or a zero of next to nothing still acts by its part of the period.
+        # The step of a dead time or a zero near 0 is relative to the period.
         radian = 1.0 / frequency
         size = np.maximum(np.abs(values), np.where(structure.logarithmic, 0.0, radian))
         size = step * np.where(size == 0.0, radian, size)
@@ -242,7 +241,7 @@ class Estimate:
             np.zeros(self.values.size),
             self._spread,
             count,
-            # What is not determined has variances whose rounding is no small number.
+            # Undetermined parameters have variances so large that their rounding is not small.
             check_valid="ignore",
             method="eigh",
         )

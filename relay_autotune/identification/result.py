@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an identification gives: model, uncertainty, quality of fit."""
+"""The result of an identification: model, uncertainty, quality of fit."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Validation:
 
     Differences of times are relative to the period, those of y to half of the record's peak to
     peak; NaN: the model has no limit cycle. The shape compares the two curves, each from its own
-    mean over its own half of peak to peak, with the half periods laid upon each other, and
-    without what noise leaves of itself in the record's curve.
+    mean over its own half of peak to peak, with the half periods laid upon each other, and with
+    the noise of the record's curve subtracted.
     """
 
     period: float = told("", "Difference of the whole period.", math.nan)
@@ -173,8 +173,8 @@ class Identification:
         "", "Other structures with some support, the best first.", (), message=None
     )
     # The model's measurement at the record's samples, with all that was estimated beside the
-    # model [y], shape (n,); NaN: not part of the fit; empty: not computed. As long as the record,
-    # it is left to those who have both.
+    # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
+    # record, and so in no document or message.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
     # Models on which gains have to hold, too: of the halves of the record where they differ by
     # more than chance, and plain ones that simulate it nearly as well.

@@ -15,18 +15,18 @@ from relay_autotune.identification.combinations import DETERMINED
 from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Record
 
-# A test that is longer or larger by more than this is another one.
+# Largest factor of the amplitude that is advised.
 _MOST_TIMES = 5.0
 _FEW_SAMPLES = 3.0
 _LITTLE_BIAS = 0.1
-# A rest before the first change shorter than this share of the time between changes fixes little.
+# Least rest before the first change, as a share of the time between changes.
 _SHORT_REST = 0.5
 _SLOW = ("gain", "time_constant", "time_constant_1")
 
 
 @dataclass(frozen=True)
 class _Tests:
-    """What the records were.
+    """Properties of the records.
 
     :param biased: one of them has a mean command off the baseline.
     :param rested: one of them begins with samples at rest.
@@ -79,7 +79,7 @@ def _tests_of(records: Sequence[Record]) -> _Tests:
 
 
 def _for_slow(found: Identification, tests: _Tests) -> list[str]:
-    """Return what shows a static gain and a slow lag: where the measurement stops rising."""
+    """Return tests for a static gain and a slow lag: the measurement has to stop rising."""
     said = []
     slowest = max((abs(t) for t in found.model.time_constants), default=0.0)
     if tests.relay and not tests.biased:
@@ -101,7 +101,7 @@ def _for_slow(found: Identification, tests: _Tests) -> list[str]:
 
 
 def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> list[str]:
-    """Return what tells dead time, small lags and zeros apart: high frequencies."""
+    """Return tests that tell dead time, small lags and zeros apart: by high frequencies."""
     said = []
     text = ", ".join(name.replace("_", " ") for name in names)
     fast = found.model.dead_time
@@ -119,7 +119,7 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
 
 
 def _for_noise(found: Identification, missing: set[str]) -> list[str]:
-    """Return how much more of the same test would do."""
+    """Return how much larger or longer the same test would have to be."""
     # An interval is as wide as the noise over the amplitude, and narrows with the cycles.
     widest = 0.0
     for name, value, low, high in zip(

@@ -34,7 +34,7 @@ _NEGLIGIBLE = 1e-10
 
 
 def assess(models: Sequence[Identification], record: Record) -> tuple[Identification, ...]:
-    """Complete identified models by what the record says of each.
+    """Add to identified models how well each one agrees with the record.
 
     Each gets the comparison of its limit cycle with the record's (Thyagarajan and Yu 2003,
     Fig 9), its error from the first model over two decades about w_u (eqs 29 and 30), and, where
@@ -70,7 +70,7 @@ def fit_of_model(model: TransferFunction, record: Record, rest: float) -> FitRep
     Estimated with it are the offset and, for a self-regulating process, the command before the
     record: a record may begin with its first step.
 
-    :param model: any; of an unstable one, which no open loop follows, nothing is estimated.
+    :param model: any; an unstable one, which no open loop follows, gets no estimates.
     :param record: any record.
     :param rest: measurement about which it moves [y].
     """
@@ -102,8 +102,8 @@ def fit_of_model(model: TransferFunction, record: Record, rest: float) -> FitRep
 def operating_point(record: Record) -> float:
     """Return the measurement about which a record moves [y].
 
-    That at rest before the command first changes, of a relay test without such samples its
-    set-point, of any other record without them the mean.
+    It is the mean at rest, before the command first changes. Without such samples it is the
+    set-point of a relay test, and the mean of any other record.
 
     :param record: any record.
     """
@@ -118,7 +118,7 @@ def _averaged(record: Record) -> Fold | None:
     try:
         return fold(record)
     except (IdentificationError, RecordError):
-        # A step test, say: it has no limit cycle to compare with.
+        # Such as a step test: it has no limit cycle to compare with.
         return None
 
 

@@ -28,16 +28,16 @@ _LEAST_ASYMMETRY = 0.05
 _OTHER_AMPLITUDE = 1.2
 _LEAST_DISAGREEMENT = 0.03
 _LEAST_CYCLES = 3
-# With fewer samples in a cycle, straight lines between them miss more than a percent.
+# Least number of samples in a cycle: with fewer, straight lines between them miss more than 1 %.
 _LEAST_SAMPLES = 24
 # Levels at which the effect of a command may end, in shares of its range; beside its first level.
 _SHARES = (0.25, 0.5, 0.75)
-# Curves that differ by less than this part count as the same.
+# Relative difference up to which curves count as the same.
 _ALIKE = 1e-6
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
 # Least range of the levels on one side, as a share of the command's range.
 _OWN = 0.2
-# Share of the direct effect at the same instant that stands out from that a sample away.
+# Largest share left unexplained at the same instant, relative to that left one sample away.
 _AT_ONCE = 0.5
 
 
@@ -62,7 +62,7 @@ def unequal_gains(
         return None
     u = record.input()
     if u.initial != settings.baseline:
-        # Between two levels alone, either part is the other one scaled and moved.
+        # With two levels alone, each part is the other one scaled and shifted.
         return None
     parts = []
     for keep in (np.maximum, np.minimum):
@@ -94,7 +94,8 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
 
     :param record: any record.
     :param model: the model fitted to it.
-    :return: None where the command has two levels alone, or the process grows by itself.
+    :return: None where the command has two levels alone, samples are few, or the process grows
+        by itself.
     """
     if any(t.real < 0.0 for t in model.time_constants) or len(record) < _LEAST_SAMPLES:
         return None
@@ -119,7 +120,7 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
             continue
         own = max(float(np.ptp(levels[side])) for side in (levels >= level, levels <= level))
         if own < _OWN * float(np.ptp(levels)):
-            # Where no side has moves of its own, either part is the other one scaled and moved.
+            # Where no side has moves of its own, each part is the other one scaled and shifted.
             continue
         parts = [
             response(
@@ -142,15 +143,15 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
 
 
 def followed_share(record: Record, sign: int) -> float | None:
-    """Return which share of the command's variance follows the measurement at the same instant.
+    """Return the share of the command's variance that follows the measurement at once.
 
-    A proportional controller makes ``u = c + b y``, with b against the process's sign. Between
-    samples of a process y comes after u; so the share at the same instant, the square of the
-    correlation, has to stand out from those at one sample earlier and later.
+    A proportional controller makes ``u = c + b y``, with b against the process's sign. In a
+    process y comes after u; so the share at the same instant, the square of the correlation, has
+    to stand out from those one sample earlier and later.
 
     :param record: any record.
-    :param sign: of the process; a b of the same sign is a loop that would run away.
-    :return: None where b is against it, or what does not follow is not least at the same instant.
+    :param sign: of the process; with a b of the same sign a loop would run away.
+    :return: None where b has the other sign, or the share at the same instant does not stand out.
     """
     u, y = record.command, record.measurement
     if len(record) < _LEAST_SAMPLES or not (np.ptp(u) > 0.0 and np.ptp(y) > 0.0):
@@ -171,7 +172,7 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
 
     Each record's response gets a gain of its own, in the least-squares sense, beside an offset and
     a drift; a valve that sticks, or a flow that goes with the root of a pressure, has gains that
-    hang on the amplitude.
+    depend on the amplitude.
 
     :param records: tests of one process, at least two.
     :param model: the model fitted to all of them, of a stable or integrating process.
@@ -212,7 +213,7 @@ def _factors(
 
     :param parts: each of the record's length.
     :param beside: further curves of free size, NaN where they are not known.
-    :param correlated: True: samples count by what they are worth beside their neighbours.
+    :param correlated: True: correlated samples count less.
     """
     line = record.time - record.time.mean()
     columns = np.stack((*parts, np.ones(len(record)), line, *beside))
@@ -221,7 +222,7 @@ def _factors(
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     scaled = columns / size[:, None]
-    # A curve beside that is offset and drift alone tells nothing more.
+    # A further curve that is offset and drift alone adds nothing.
     factors, *_ = np.linalg.lstsq(scaled.T, measured, rcond=_ALIKE)
     residual = measured - factors @ scaled
     variance = float(residual @ residual) / measured.size

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a record speaks for a process of the other direction than its relay worked in.
+"""Whether a record fits a process of the opposite direction to its relay's.
 
 A process with an inverse response (a zero in the right half plane) first answers the other way.
 A relay of the wrong direction then oscillates on that first answer, and models of the relay's
@@ -40,20 +40,20 @@ from relay_autotune.record.record import Input, PiecewiseConstant, Record
 FloatArray = NDArray[np.float64]
 
 _MOST_SAMPLES = 4096
-# Standard errors from which a correlation of neighbours counts as one.
+# Least correlation of neighbours that counts, in standard errors.
 _CORRELATED = 2.0
-# Part of the measurement's range from which something was estimated beside the model.
+# Least share of the measurement's range that counts as estimated beside the model.
 _BESIDE = 1e-6
-# How many times the fast lag the slow one is at the start.
+# Slow lags at the start, relative to the fast one.
 _SLOWER = (2.0, 6.0, 20.0)
-# A response that turns later than this after a step, in lengths of the test, is a drift.
+# Latest turn of an inverse response, in lengths of the test: a later one is a drift.
 _HORIZON = 2.0
 _TRIAL = 1e-6
 
 
 @dataclass(frozen=True)
 class OtherDirection:
-    """A model of the other direction than the relay worked in.
+    """A model of the opposite direction to the relay's.
 
     :param model: the best one.
     :param lead: criterion of the relay's own direction minus this one's; a difference of 6 is
@@ -70,9 +70,9 @@ def other_direction(
     """Return the best model of the other direction; None: the record does not ask for one.
 
     A process at rest before the relay needs neither drift nor load nor initial state in its own
-    direction, so the other one is given none of them, and is asked only where the model of the
-    relay's direction needs them or leaves something unexplained. The two are compared by the
-    Bayesian information criterion.
+    direction. So the other one is fitted without them, and only where the model of the relay's
+    direction needs them or leaves something unexplained. The two are compared by the Bayesian
+    information criterion.
 
     :param found: what was identified from all samples, in the direction of the relay.
     :param record: the relay test.
@@ -100,7 +100,7 @@ def other_direction(
     model, state = min(
         inverse, key=lambda f: information_criterion(f[1].cost, n, f[1].parameters, floor)
     )
-    # Both by what the samples are worth to the other one.
+    # The worth of a sample in both criteria comes from the other direction's residual.
     each = worth(state.residual)
     parameters = len(found.parameters) + 1 + beside + moved + left_out
     left = n * float(np.mean(residual**2)) / scale**2
@@ -119,7 +119,7 @@ def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:
 
 
 def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, Trial]]:
-    """Fit what answers the other way at first; with other structures no oscillation stays.
+    """Fit structures with an inverse response; with others no oscillation lasts.
 
     In the direction of the relay, a FOPDT shows the fast part of an inverse response.
     """

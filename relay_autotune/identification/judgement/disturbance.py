@@ -16,10 +16,10 @@ from relay_autotune.identification.judgement.quality import is_contradicted, mis
 from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Cycle, Record
 
-# The end of a record alone is better if its residual beyond the noise is less by this factor.
+# Ratio of residuals beyond the noise below which the end of a record alone is better.
 _BETTER = 0.5
 
-# A load is looked for in these structures, the second one being what was found without it.
+# Structures in which a load is searched for; empty: the one that was found without a load.
 _SIMPLE = ("sopdt", "", "fopdt")
 
 # Number of last cycles that are kept.
@@ -27,7 +27,7 @@ KEPT_CYCLES = 3
 
 
 def _unexplained(found: Identification, record: Record) -> float:
-    """Return what a model leaves beyond the noise, as a root mean square [y]."""
+    """Return a model's residual beyond the noise, as a root mean square [y]."""
     noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
     return math.sqrt(max(found.fit.residual_rms**2 - noise**2, 0.0))
 
@@ -60,7 +60,8 @@ def without_disturbance(
     :param record: the record.
     :param cycles: its whole cycles.
     :param identify: identifies a record by the same method.
-    :return: the better identification; what it has left out is a warning, and NaN in ``fitted``.
+    :return: the better identification; a warning tells what it left out, and ``fitted`` is NaN
+        there.
     """
     end = last_cycles(record, cycles) if misfit(found, record) > 1.0 else None
     if end is None:
@@ -90,16 +91,16 @@ def with_its_load(
 ) -> tuple[Identification, Record]:
     """Estimate a load step together with the model, where no model fits without one.
 
-    It is looked for in a simple structure first, since a model that was fitted without the load
-    has been bent to follow it.
+    It is searched for in a simple structure first: a model that was fitted without the load has
+    adapted to it.
 
     :param found: what was identified.
     :param record: the record.
     :param cycles: its whole cycles.
-    :param identify: identifies a record in a structure, "": in the one that explains it, by the
-        method that fits samples.
-    :return: the identification and the record as it was driven; those given, where a load does
-        not explain what no model does.
+    :param identify: identifies a record in a structure by the method that fits samples; "": it
+        chooses the structure.
+    :return: the identification, and the record with the load added to its command; those given,
+        where a load does not explain the misfit.
     """
     relay = record.settings is not None and bool(cycles)
     samples = relay and len(found.fitted) == len(record)

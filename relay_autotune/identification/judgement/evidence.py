@@ -21,9 +21,9 @@ from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
 
-# Number of its time constants in which a process that grows by itself leaves any rest.
+# Number of time constants within which an unstable process leaves any rest.
 MOST_GROWTH = 7.0
-# Residual of a rival relative to the model's, at most; its share of the support, at least.
+# Largest residual of a rival relative to the model's, and its least share of the support.
 _AS_WELL = 1.1
 _WORTH_HEARING = 0.01
 
@@ -51,7 +51,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Evidence:
-    """One experiment with what was made of it.
+    """One experiment with its results.
 
     :param record: the samples.
     :param found: the model that counts, with its uncertainty, its fit and its limit cycle.
@@ -61,7 +61,7 @@ class Evidence:
     :param others: other methods' models of the record, with the quality of their fit.
     :param settled: True if the record has a limit cycle whose last cycles agree.
     :param loop: the gains; None: there are none yet.
-    :param driven: the record as the process was driven, with a load that came; None: as it is.
+    :param driven: the record with the estimated load added to its command; None: no load.
     """
 
     record: Record
@@ -75,7 +75,7 @@ class Evidence:
     driven: Record | None = None
 
     def with_loop(self, loop: Loop) -> Evidence:
-        """Return the same experiment with some gains; what its record tells is found once.
+        """Return the same experiment with some gains, and what was computed without them.
 
         :param loop: the gains.
         """
@@ -86,7 +86,7 @@ class Evidence:
 
     @cached_property
     def other(self) -> OtherDirection | None:
-        """The best model of the other direction than the relay's; None: it is not asked for."""
+        """The best model of the opposite direction to the relay's; None: not needed."""
         ended_well = self.record.outcome in (Outcome.COMPLETED, Outcome.UNKNOWN)
         relay = self.record.settings is not None and ended_well
         if not (relay and self.samples and self.free):
@@ -118,7 +118,7 @@ class Evidence:
 
     @cached_property
     def halves(self) -> tuple[Part, ...]:
-        """What either half of the record tells in the chosen structure; empty: not asked for."""
+        """The models that each half of the record allows in the chosen structure; may be empty."""
         if not self.samples:
             return ()
         try:
@@ -128,7 +128,7 @@ class Evidence:
 
     @cached_property
     def plain(self) -> tuple[TransferFunction, ...]:
-        """Plain models of the whole record that explain it as well; empty: not asked for."""
+        """Plain models of the whole record that explain it as well; may be empty."""
         if not self.samples:
             return ()
         try:
@@ -137,9 +137,9 @@ class Evidence:
             return ()
 
     def growth(self, model: TransferFunction) -> float:
-        """Return the longest stay of the command over the time with which a model grows.
+        """Return the longest time of a constant command in time constants of a model's growth.
 
-        :param model: any; one that does not grow by itself has 0.
+        :param model: any; 0 where it does not grow by itself.
         """
         growing = [-t.real for t in model.time_constants if t.real < 0.0]
         return self.longest_stay / min(growing) if growing else 0.0

@@ -20,14 +20,14 @@ from relay_autotune.process.response import response
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import FloatArray, PiecewiseConstant, Record
 
-# Instants at which a load is looked for first, and how many of the best are followed up.
+# Numbers of instants at which a load is tried, and of the best ones that are followed up.
 _INSTANTS = 60
-# Share of the sum of squares that the best guess may leave; a load leaves next to nothing.
-_PROMISE = 0.7
 _FOLLOWED = 6
-# Number of samples that tell a load as well as more would.
+# Largest share of the sum of squares that the best guess leaves; a load leaves next to nothing.
+_PROMISE = 0.7
+# Number of samples that is enough to find a load.
 _SAMPLES = 1500
-# Part of a parameter by which it is varied.
+# Step for derivatives, relative to the parameter.
 _STEP = 1e-5
 
 
@@ -62,11 +62,11 @@ def identify_with_load(
 ) -> tuple[Identification, Record] | None:
     """Identify a record together with a step of the load that came during it.
 
-    :param found: the model that was found without a load, in whose structure it is looked for.
+    :param found: the model that was found without a load; its structure is kept.
     :param record: the record, of which the command was held between samples.
     :param identify: identifies a record by the method that fits samples.
-    :return: the identification, whose intervals allow for what is not known of the load, and the
-        record with the load; None where no load can be told.
+    :return: the identification, whose intervals include the uncertainty of the load, and the
+        record with the load; None where no load is found.
     """
     load = find_load(found, record)
     if load is None:
@@ -79,13 +79,13 @@ def find_load(found: Identification, record: Record) -> LoadStep | None:
     """Estimate when a load came and how large it was, in the structure that was identified.
 
     The model's parameters theta, an offset c, and instant t1 and size d of the load minimise the
-    sum of squares of ``y - c - G(theta) (u + d 1(t - t1))``. Where to begin is told by the
-    residual of the model without a load: it is linear in d, in c and, nearly, in the change of
-    theta, so that each t1 has its sum of squares at once.
+    sum of squares of ``y - c - G(theta) (u + d 1(t - t1))``. The starts come from the residual of
+    the model without a load: it is linear in d and c, and nearly so in the change of theta, so
+    that one linear fit gives the sum of squares for each t1.
 
     :param found: the model that was found without a load.
     :param record: the record, of which the command was held between samples.
-    :return: the load; None where none can be told.
+    :return: the load; None where none is found.
     """
     fit = _Fit(found, record)
     best: tuple[float, LoadStep] | None = None
@@ -97,7 +97,7 @@ def find_load(found: Identification, record: Record) -> LoadStep | None:
 
 
 class _Fit:
-    """The sum of squares about a model; unknown: its parameters, instant and size, the offset."""
+    """The sum of squares; unknown: a model's parameters, a load's time and size, an offset."""
 
     def __init__(self, found: Identification, record: Record) -> None:
         every = max(1, len(record) // _SAMPLES)
@@ -118,7 +118,7 @@ class _Fit:
         return response(self._build(values), self._time, u)
 
     def residual(self, unknown: FloatArray) -> FloatArray:
-        """Return what is left of the measurement [y]."""
+        """Return measurement minus model [y]."""
         *values, time, size, offset = unknown.tolist()
         if not 0.0 < time < self._span:
             return np.full(self._time.size, 10.0 * self._spread)
@@ -141,7 +141,7 @@ class _Fit:
         )
 
     def starts(self) -> list[FloatArray]:
-        """Return the best few guesses; none where no instant promises to explain what is left."""
+        """Return the best few guesses; empty where a load explains too little at any instant."""
         now = self._output(self._values, self._u)
         left = self._measurement - now
 
@@ -149,7 +149,7 @@ class _Fit:
             try:
                 return self._output(values, self._u)
             except RelayAutotuneError:
-                # It cannot be varied upwards: at the edge of what it may be.
+                # A value at its upper bound cannot be increased.
                 return now
 
         columns = [np.ones(self._time.size), *_slopes(output, self._values).T]
@@ -168,9 +168,9 @@ class _Fit:
         return [guess for _, guess in guesses[:_FOLLOWED]]
 
     def with_doubt(self, load: LoadStep) -> Identification:
-        """Add to the covariance what is not known of the load, and say that there was one.
+        """Add the uncertainty of the load to the covariance, and a warning that there was one.
 
-        With J the derivatives of the output by all unknowns, that is ``sigma^2`` times the part of
+        With J the derivatives of the output by all unknowns, it is ``sigma^2`` times the part of
         ``(J'J)^-1`` that belongs to the model's parameters, less the same without the load.
         """
         found = self._found
@@ -185,7 +185,7 @@ class _Fit:
         open_ = np.linalg.pinv(slopes)[:count]
         noise = found.fit.residual_rms**2
         more = noise * (open_ @ open_.T - known @ known.T)
-        # Samples that were passed over here would have told as much again.
+        # The samples that were left out here would reduce it further.
         more /= self._share
         variance = np.diag(found.covariance)
         ratio = np.zeros(count)

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""How much of a record a model leaves unexplained, with one set of thresholds for all who ask."""
+"""How much of a record a model leaves unexplained, with one set of thresholds."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from relay_autotune.record.record import Record
 # the noise is noise alone; 2 % of the measurement's spread is left by any simple structure.
 _OF_NOISE = 1.3
 _OF_SPREAD = 0.02
-# A model whose misfit is this many times as large is of another process.
+# Misfit beyond which a model is of another process.
 _FAR_OFF = 2.0
-# Less probable than this as white noise.
+# Probability as white noise below which a residual is clearly not white.
 _NOT_WHITE = 1e-6
 
 
 def misfit(found: Identification, record: Record, *, noise: float | None = None) -> float:
-    """Return the residual over what noise and a simple structure may leave; up to 1 is a good fit.
+    """Return the residual over the largest one of a good fit, so that up to 1 is good.
 
     :param found: what was identified.
     :param record: the record.
-    :param noise: standard deviation of the noise [y]; default: that measured before the test,
-        none where it was not measured.
+    :param noise: standard deviation of the noise [y]; default: that measured before the test, 0
+        where it was not measured.
     :return: NaN where the residual is not known.
     """
     known = record.noise_std if noise is None else noise
@@ -39,9 +39,9 @@ def misfit(found: Identification, record: Record, *, noise: float | None = None)
 
 
 def is_contradicted(found: Identification, record: Record) -> bool:
-    """Return whether what a model leaves is clearly no noise.
+    """Return whether the residual of a model is clearly not noise.
 
-    Where the noise was not measured only its shape tells.
+    Where the noise was not measured, only the residual's correlation shows it.
 
     :param found: what was identified.
     :param record: the record.

@@ -3,10 +3,10 @@
 
 """Other fits of a record, on whose models gains have to hold: of its halves, and plain ones.
 
-A part of a record tells some directions of the parameters and not others. So its models are drawn
-from what is known with it: the whole record's model, each time a factor of e either way, and what
-the samples of the part say beside it (Gauss and Newton with a prior; Laplace's approximation). A
-part that tells nothing has models all around that of the whole, and objects to nothing.
+A part of a record determines some combinations of the parameters and not others. So its models
+are drawn from a posterior (Gauss-Newton steps, then Laplace's approximation). The prior is the
+whole record's model, each time known to a factor of e; the data are the samples of the part. A
+part that determines nothing gives models all around that of the whole, and contradicts nothing.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ FloatArray = NDArray[np.float64]
 _MOST_SAMPLES = 1200
 _FEWEST = 24
 _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
-# Standard deviations of what is known beforehand: of logarithms of times, of a gain relative to
-# its value, of a dead time relative to all times together.
+# Standard deviations of the prior: of logarithms of times, of a gain relative to its value, of a
+# dead time relative to all times together.
 _TIMES, _GAIN, _DEAD_TIME = 1.0, 2.0, 1.0
 _DRAWS = 40
 _FARTHEST = 20.0
-# A sum of squares that is larger by less counts as equal.
+# Ratio of two sums of squares up to which they count as equal.
 _AS_WELL = 1.1
-# A criterion that is larger by less is as good: odds of e^3.
+# Excess of the criterion up to which a model is as good: odds of e^3.
 _AS_GOOD = 6.0
 _TRIAL = 1e-6
 
 
 @dataclass(frozen=True)
 class Part:
-    """What a part of a record tells of the process.
+    """The models that a part of a record allows.
 
     :param begin: its first time [s].
     :param end: its last time [s].
-    :param models: drawn from those that it allows.
+    :param models: drawn from their posterior.
     """
 
     begin: float
@@ -67,16 +67,15 @@ class Part:
 
     @property
     def span(self) -> str:
-        """Its times, for people."""
+        """Its times as text."""
         return f"{self.begin:.4g} s to {self.end:.4g} s"
 
 
 def halves(found: Identification, record: Record) -> tuple[Part, ...]:
-    """Return what either half of a record tells of the process in the chosen structure.
+    """Return the models that each half of a record allows in the chosen structure.
 
-    The record is parted where half of the information on the parameters has come. Each half has
-    an offset and a free initial state of its own, but the first one where the record explains
-    itself from rest.
+    The halves hold equal information on the parameters. Each has its own offset and free initial
+    state; the first half has no free state where the record began at rest.
 
     :param found: a fit to the samples.
     :param record: what was fitted.
@@ -102,7 +101,7 @@ def halves(found: Identification, record: Record) -> tuple[Part, ...]:
 
 
 def _problem(found: Identification, record: Record, structure: Structure) -> Problem:
-    """Return the samples that were fitted, thinned, with what is not known of their beginning."""
+    """Return the samples that were fitted, thinned, with terms for their unknown beginning."""
     y = (record.measurement - record.measurement[0]) / float(np.ptp(record.measurement))
     problem = problem_of([(record.time, y, record.drive())], structure)
     problem = problem.part(np.isfinite(found.fitted)).thinned(_MOST_SAMPLES)
@@ -129,7 +128,7 @@ def _begins_at_rest(problem: Problem, found: Identification, record: Record) -> 
 def _allowed(
     problem: Problem, gain: FloatArray, theta: FloatArray, scale: float
 ) -> tuple[TransferFunction, ...]:
-    """Draw models from those that some samples allow beside a model that is known.
+    """Draw models from the posterior that some samples give to a known model.
 
     :param problem: the samples.
     :param gain: coefficients of the known model's numerator, shape (k,).
@@ -163,13 +162,13 @@ def _allowed(
         else:
             break
         gained, at, left, jacobian = cost - now, trial, new, slopes
-        # Noise of this part, each sample by what it is worth beside its neighbours.
+        # Noise of this part; correlated samples count less.
         variance = max(float(left @ left) / left.size / worth(left), NEGLIGIBLE**2)
         cost = float(left @ left) / variance + float(precision @ (at - known) ** 2)
         if gained < _SETTLED * cost:
             break
     normal = jacobian @ jacobian.T / variance + np.diag(precision)
-    # In units of what is known beforehand, so that the root has no small numbers.
+    # In units of the prior, so that the root has no small numbers.
     root = np.linalg.cholesky(np.linalg.inv(normal * np.outer(deviation, deviation)))
     shifts = np.random.default_rng(0).standard_normal((_DRAWS, at.size))
     models = []
@@ -192,12 +191,12 @@ def _bounded(point: FloatArray) -> FloatArray:
 
 
 def _linearised(problem: Problem, point: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return what a model leaves beside offset and initial state, and its derivatives.
+    """Return a model's residual and its derivatives, both after the fit of the nuisances.
 
     :param problem: the samples.
     :param point: coefficients of the numerator, then theta.
     :param count: of these coefficients.
-    :return: shapes (n,) and (p, n), both without what the nuisances explain.
+    :return: shapes (n,) and (p, n).
     """
     gain = point[:count]
     theta = np.concatenate((np.clip(point[count:-1], -_FARTHEST, _FARTHEST), point[-1:]))
@@ -214,9 +213,8 @@ def plain_models(found: Identification, record: Record) -> tuple[TransferFunctio
     """Return the plain models that explain a record as well as the one that was chosen.
 
     They are a lag and two lags with dead time, fitted to all samples by simulation with an unknown
-    offset and initial state. Samples count by what they are worth beside their neighbours, so that
-    in noise with a colour, or where no structure is true, less than a visible difference decides
-    nothing.
+    offset and initial state. Correlated samples count less: in coloured noise, or where no
+    structure is true, only a visible difference decides.
 
     :param found: a fit to the samples.
     :param record: what was fitted.
@@ -236,7 +234,7 @@ def plain_models(found: Identification, record: Record) -> tuple[TransferFunctio
         fits.append((second, refine_best(second, Starts(every, first).sopdt(), tolerance=_TRIAL)))
     models = []
     for problem, state in fits:
-        # The unknown state before the record is no merit and no fault of a model.
+        # The unknown state before the record is not counted as a parameter.
         parameters = len(problem.structure.names) + 1
         other = information_criterion(state.cost, n, parameters, floor, each)
         model = problem.structure.model_at(state.theta, state.coefficients * scale)
@@ -249,7 +247,7 @@ def plain_models(found: Identification, record: Record) -> tuple[TransferFunctio
 
 
 def other_sign(models: Sequence[TransferFunction], sign: int) -> float:
-    """Return the share of models whose process has not this sign.
+    """Return the share of models whose process does not have this sign.
 
     :param models: at least one.
     :param sign: 1 or -1.

@@ -25,9 +25,9 @@ from relay_autotune.text import process_text
 from relay_autotune.verdict import Check, Measured
 
 _FREQUENCIES = 300
-# Share of the models that a half allows on which the gains may be better.
+# Quantile of Ms over the models of a half that counts: nine of ten are worse.
 _BUT_FEW = 0.1
-# K_u is known where its interval is no wider than this to either side.
+# Half width of the interval of K_u, relative to K_u, up to which K_u is known.
 _KNOWN = 0.2
 
 
@@ -65,8 +65,8 @@ def _resolution(evidence: Evidence) -> Measured | None:
 
 
 def _residual(evidence: Evidence) -> Measured | None:
-    # What was not measured at rest is no measure: instruments and processes have noise of any
-    # colour, and second differences show its fast part alone.
+    # Only noise measured at rest counts: noise may have any colour, and second differences show
+    # its fast part alone.
     if not math.isfinite(evidence.record.noise_std):
         return None
     value = misfit(evidence.found, evidence.record)
@@ -125,7 +125,7 @@ def _worst(
 ) -> tuple[float, TransferFunction]:
     """Return the largest Ms of the gains on models, and its model.
 
-    :param sign: on a process of another sign Ms is infinite; 0: whatever it is.
+    :param sign: on a process of another sign Ms is infinite; 0: any sign.
     """
     ms = loop.ms_of(models)
     if sign:
@@ -146,7 +146,7 @@ def _halves(evidence: Evidence) -> Measured | None:
     loop = evidence.loop
     if loop is None or not evidence.halves:
         return None
-    # Most of what a half allows has to object, so that one which tells little is not heard.
+    # Nine of ten models have to be bad, so that a half that determines little does not count.
     found = [
         (float(np.quantile(loop.ms_of(part.models), _BUT_FEW, method="lower")), part)
         for part in evidence.halves
@@ -178,7 +178,7 @@ def _beyond(evidence: Evidence) -> Measured | None:
     longest = max(
         (abs(t) for t in (*found.model.time_constants, found.model.dead_time)), default=0
     )
-    # What the loop needs of a lag much longer than the record is its slope, which is in K_u.
+    # Of a lag much longer than the record the loop needs the slope alone, which is part of K_u.
     if half <= _KNOWN or not evidence.record.duration > 0.0:
         return None
     return Measured(longest / evidence.record.duration)
@@ -231,7 +231,8 @@ MODEL_CHECKS = (
         what="time between samples over the model's dead time and lags together",
         unit="",
         doubtful=0.4,
-        sentence="one sample takes {value} of the whole answer, whose form is not seen so",
+        sentence="the time between samples is {value} of the whole response, whose form cannot be "
+        "seen",
         remedy="sample faster",
         measure=_resolution,
     ),
@@ -242,8 +243,8 @@ MODEL_CHECKS = (
         "the model grows",
         unit="",
         failed=MOST_GROWTH,
-        sentence="the model grows by itself and would have run away {value} time constants long, "
-        "which the record did not",
+        sentence="the model grows by itself: under a constant command it would have run away for "
+        "{value} time constants, and the record did not",
         remedy="name a stable structure, or record the controller's command if a loop was closed",
         measure=_growth,
     ),
@@ -254,7 +255,8 @@ MODEL_CHECKS = (
         "measurement's spread",
         unit="",
         doubtful=4.0,
-        sentence="the model leaves {value} times what noise and a simple structure may leave",
+        sentence="the residual is {value} times the largest one that noise and a simple structure "
+        "explain",
         remedy="look at the residual in the report: what repeats with the command is not in the "
         "model, what comes once is a disturbance",
         measure=_residual,
@@ -276,7 +278,7 @@ MODEL_CHECKS = (
         "recorded one",
         unit="",
         doubtful=0.1,
-        sentence="the same relay on the model swings with another period, {value} off{detail}",
+        sentence="the same relay on the model oscillates with another period, {value} off{detail}",
         remedy="look at the limit cycle in the report; a valve that sticks or a saturated "
         "actuator is not in the model",
         measure=_limit_cycle,
@@ -287,21 +289,21 @@ MODEL_CHECKS = (
         what="half width of the 95 % interval of K_u over K_u",
         unit="",
         doubtful=2.0,
-        sentence="K_u is known to {value} of itself only",
+        sentence="the 95 % interval of K_u reaches {value} of K_u to either side",
         remedy="run more cycles, or use a larger amplitude",
         measure=_ultimate,
     ),
     Check(
         name="beyond_record",
         title="Long times",
-        what="longest time of the model over the length of the record, where K_u is not known to "
-        "a fifth",
+        what="longest time of the model over the length of the record, where K_u is not known "
+        "within a fifth",
         unit="",
         doubtful=1.0,
         failed=10.0,
         sentence="a time of the model is {value} times as long as the record, which cannot show "
-        "it, and K_u is not known without it",
-        remedy="record longer, or run a relay test, which tells K_u without it",
+        "it, and K_u depends on it",
+        remedy="record longer, or run a relay test, which shows K_u directly",
         measure=_beyond,
     ),
     Check(
@@ -339,7 +341,7 @@ LOOP_CHECKS = (
         what="Ms that 95 % of the models within the uncertainty stay below, over Ms on the model",
         unit="",
         doubtful=1.8,
-        sentence="the gains are {value} times as fragile on models that the data allow",
+        sentence="on models that the data allow Ms is up to {value} times as large",
         remedy="run more cycles, use a larger amplitude, or choose the rule robust",
         measure=_models_around,
     ),
@@ -347,11 +349,11 @@ LOOP_CHECKS = (
         name="visible_response",
         title="Visible response",
         what="difference between the model and the response that the record shows without any "
-        "structure, over what the loop bears (1: it may be unstable), at the worst frequency",
+        "structure, over what the loop tolerates (1: it may be unstable), at the worst frequency",
         unit="",
         doubtful=0.6,
         sentence="the record shows another response than the model's: at {detail} the difference "
-        "is {value} of what the loop bears",
+        "is {value} of what the loop tolerates",
         remedy="look at the model over the data; name another structure, or record from rest "
         "without other inputs",
         measure=_visible,
@@ -370,12 +372,12 @@ LOOP_CHECKS = (
     Check(
         name="halves",
         title="Halves",
-        what="Ms of the gains that nine of ten models which one half of the record allows exceed, "
+        what="Ms that the gains exceed on nine of ten models that one half of the record allows, "
         "over Ms on the model",
         unit="",
         doubtful=2.0,
-        sentence="{detail} of the record alone shows a process on which Ms is {value} times as "
-        "large or larger",
+        sentence="{detail} of the record alone shows a process on which Ms is at least {value} "
+        "times as large",
         remedy="see whether load, operating point or other inputs changed, and record again",
         measure=_halves,
     ),

@@ -54,8 +54,8 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: SteadyState) -> Val
 
     :param model: any model.
     :param seen: the averaged period.
-    :param rest: measurement under the baseline; where it was not measured, and the process comes
-        to rest at all, what the model and the means over the period make of it.
+    :param rest: measurement under the baseline; where it was not measured, the set-point or, for
+        a stable model, its gain and the means over the period replace it.
     """
     settings = as_switched(seen)
     high, low, middle = seen.period_high, seen.period_low, seen.settings.setpoint
@@ -72,8 +72,8 @@ def validate_fold(model: TransferFunction, seen: Fold, rest: SteadyState) -> Val
     try:
         point = rest.value
         if not rest.measured:
-            # The limit cycle depends on the levels, not on the baseline of others' relays, which
-            # is a guess: so it starts from the command that holds the model at the set-point.
+            # The limit cycle depends on the levels alone, and this baseline is a guess: so it
+            # starts from the command that holds the model at the set-point.
             shift = (middle - _rest_by(model, seen, middle)) / model.gain
             settings = replace(
                 settings, baseline=settings.baseline + shift, bias=settings.bias - shift
@@ -121,7 +121,7 @@ def _limit_cycle(
             break
     at = b.start + _instants(b.period_high, b.period_low)
     if all(t.real > 0.0 for t in model.time_constants):
-        # What does not grow has its command's response in one step.
+        # Without growing modes, the response to the whole command is computed at once.
         delayed = replace(model, dead_time=model.dead_time + settings.extra_delay)
         return b, rest + response(delayed, at, run.command)
     again = simulate_relay(model, settings, cycles=count, operating_point=rest, kick=kick, time=at)

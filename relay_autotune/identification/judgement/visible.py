@@ -3,12 +3,11 @@
 
 """What a record shows of a process without any structure, beside the model that was chosen.
 
-The model is run on the recorded command alone, from rest at an unknown constant command and
-without drift or load, and what it leaves is regressed on the past of the command: an impulse
-response in bins of the lag, ``e(t) = c + sum_j g_j int u(t - lag) dlag`` over each bin. Its
-frequency response is the model's error (a model-error model, Ljung 1999): where it is large
-against what the loop bears, the gains are those of another process. A ridge keeps it at zero
-where the command excites nothing.
+The model is simulated with the recorded command, from rest at an unknown constant command and
+without drift or load. Its residual is regressed on the past command: an impulse response in bins
+of the lag, ``e(t) = c + sum_j g_j int u(t - lag) dlag`` over each bin. Its frequency response is
+the model's error (a model-error model, Ljung 1999): where it exceeds what the loop tolerates, the
+gains suit another process. A ridge keeps it at zero where the command excites nothing.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ ComplexArray = NDArray[np.complexfloating]
 _BINS = 24
 _MOST_SAMPLES = 2000
 _LEAST_SAMPLES = 60
-# Excitation below this share of the regression's size counts as none.
+# Share of the largest excitation below which the command excites nothing.
 _RIDGE = 1e-3
-# Standard deviations that a difference has to stand clear of.
+# Number of standard deviations that chance explains.
 _SURE = 3.0
 
 
@@ -42,7 +41,7 @@ class VisibleError:
     :param edges: of the bins of the lag [s], shape (m + 1,).
     :param height: impulse response of the difference in each bin [y/(u s)], shape (m,).
     :param covariance: of the heights, shape (m, m).
-    :param residual: what is left then, rms [y].
+    :param residual: rms of what the difference does not explain either [y].
     """
 
     edges: FloatArray
@@ -75,7 +74,7 @@ class VisibleError:
 def visible_error(model: TransferFunction, record: Record) -> VisibleError | None:
     """Return what a record shows of a model's error; None where it cannot tell.
 
-    :param model: any; of an unstable one no open loop can tell.
+    :param model: any; an unstable one cannot be simulated in open loop.
     :param record: the record.
     """
     if any(t.real < 0.0 for t in model.time_constants) or len(record) < _LEAST_SAMPLES:
@@ -103,7 +102,7 @@ def visible_error(model: TransferFunction, record: Record) -> VisibleError | Non
     height = inverse @ (scaled.T @ error)
     left = error - scaled @ height
     rms = math.sqrt(float(np.mean(left**2)))
-    # A residual that goes on from sample to sample is worth less than its number of samples.
+    # A residual that is correlated from sample to sample counts as fewer samples.
     neighbours = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
     colour = (1.0 + max(neighbours, 0.0)) / max(1.0 - neighbours, 1e-3)
     covariance = rms**2 * colour * (inverse @ normal @ inverse) / np.outer(size, size)

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A relay test as its averaged limit cycle, and the uncertainty that its cycles tell."""
+"""A relay test as its averaged limit cycle, and the uncertainty from cycle to cycle."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from relay_autotune.record.record import PiecewiseConstant, Record, RelaySetting
 FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
-# Distance from both levels, in amplitudes, and share of the time: beyond both, the command is not
-# that of a relay.
+# Least distance from both levels, in amplitudes, that counts as between them, and the largest
+# share of the time that the command of a relay is there.
 _OFF_LEVEL = 0.05
 _MOST_BETWEEN = 0.01
 _LEAST_SAMPLES = 4
-# Number of cycles that tells their scatter within 10 %.
+# Number of cycles that gives their scatter within 10 %.
 _MOST_SINGLES = 60
 
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
@@ -53,10 +53,10 @@ class CycleRun:
 
 @dataclass(frozen=True)
 class RelayTest:
-    """A relay test, as the methods see it that need a limit cycle only.
+    """A relay test for the methods that need a limit cycle only.
 
     :param whole: the cycles that agree, averaged.
-    :param singles: each of them by itself; where they are very many, some, evenly spread.
+    :param singles: each of them by itself; of many, an evenly spread selection.
     """
 
     whole: CycleRun
@@ -83,16 +83,16 @@ class RelayTest:
         quantile = float(stdtrit(max(count - 1, 1), 0.975))
         if count < _LEAST_CYCLES:
             return None, quantile
-        # From the first one, so that what is given has no rounding for scatter.
+        # Relative to the first one, so that equal values have no scatter by rounding.
         away = np.array(found) - found[0]
         away = away - np.mean(away, axis=0)
-        # The mean is over all cycles, of which those here may be some.
+        # The mean is over all cycles, of which these may be a selection.
         averaged = count * len(self.whole.cycle.cycles) / len(self.singles)
         return away.T @ away / ((count - 1) * averaged), quantile
 
 
 def relay_test(method: str, record: Record, *, two_levels: bool = True) -> RelayTest:
-    """Take a record for a relay test.
+    """Read a record as a relay test.
 
     :param method: on whose behalf, for the message.
     :param record: the record.
@@ -147,7 +147,7 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
 def _require_two_levels(
     method: str, settings: RelaySettings, u: PiecewiseConstant, span: FloatArray
 ) -> None:
-    """Refuse a command that is on its way between the levels for some time, as of a rate limit."""
+    """Refuse a command that takes time between the levels, as under a rate limit."""
     inside = (u.times > span[0]) & (u.times < span[1])
     times = np.concatenate((span[:1], u.times[inside], span[1:]))
     held = np.diff(times)

@@ -21,7 +21,8 @@ from relay_autotune.record.record import Record, RelaySettings
 
 FloatArray = NDArray[np.float64]
 
-# The rate of one lag jumps by more than its largest value where the command arrives.
+# Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by
+# more than 1 where the command arrives.
 _JUMP = 0.6
 _BESIDE = 0.01
 _MOST_SINGLES = 8
@@ -45,13 +46,13 @@ def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool
     """Return the dead time that is known, or read it from the record.
 
     One lag turns at once when the command arrives, so that the measurement has an edge there in
-    each half cycle; where the averaged half cycles have one, it is taken. Otherwise the time
-    from the first kick to the first sample outside the noise is.
+    each half cycle. If the averaged half cycles have one, its time is taken, otherwise the time
+    from the first kick to the first sample outside the noise.
 
     :param test: the relay test.
     :param record: the whole record, with the samples before the kick.
     :param known: a known dead time.
-    :param noisy: True if there is noise to speak of.
+    :param noisy: True if noise matters.
     :raises IdentificationError: if it is not known and the record does not show it.
     """
     if not math.isnan(known.dead_time):
@@ -80,7 +81,7 @@ def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool
 
 
 def _edge(stretch: CycleRun) -> tuple[float, bool]:
-    """Return the time from a switch to the edge after it, and whether it is that of one lag."""
+    """Return the time from a switch to the edge after it, and whether it is sharp."""
     try:
         curve = fold(stretch.record, tuple(range(len(stretch.record.cycle_start) - 1)))
     except IdentificationError:
@@ -101,7 +102,7 @@ def _is_sharp(curve: Fold) -> bool:
 def _scatter_of_edge(test: RelayTest, noisy: bool) -> float:
     """Return the standard deviation of the edge [s].
 
-    In noise single cycles tell it; without, it is somewhere between two samples.
+    In noise it is the scatter of single cycles; without, the edge is between two samples.
     """
     if not noisy:
         return test.whole.record.interval / math.sqrt(12.0 * len(test.whole.cycle.cycles))
@@ -127,7 +128,7 @@ def _first_response(record: Record, settings: RelaySettings) -> tuple[float, flo
     noise = record.noise_std
     if math.isnan(noise):
         noise = float(np.std(before)) if before.size >= 10 else 0.0
-    # Without noise rounding is what is left.
+    # Without noise, rounding remains.
     floor = 1e-9 * float(np.ptp(record.measurement))
     rest = RestState(
         mean=float(np.mean(before)),

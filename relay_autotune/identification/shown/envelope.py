@@ -72,8 +72,8 @@ def envelope(record: Record) -> Envelope:
 def growth_time(peaks: Envelope, noise_std: float = 0.0) -> float:
     """Return the time constant tau_G with which the peaks grow, or shrink, to their limit [s].
 
-    ``height = limit + c exp(-t/tau_G) + d (-1)^k`` is fitted by least squares, d being what an
-    offset of the set-point makes. In the end the differences of successive peaks shrink by
+    ``height = limit + c exp(-t/tau_G) + d (-1)^k`` is fitted by least squares, with d from an
+    offset of the set-point. In the end the differences of successive peaks shrink by
     ``exp(-P/(2 tau_G))``, the multiplier of the limit cycle; but while they are small the half
     cycles are shorter than P/2, so that their number is no measure of time.
 
@@ -130,7 +130,7 @@ def curvature_time(peaks: Envelope, limit: float) -> float:
 
     :param peaks: of a test from its start.
     :param limit: height of the steady peaks [y].
-    :return: NaN if the first peak is above that already, or none is.
+    :return: NaN if no peak reaches that.
     """
     target = _CONSTANT_RATE * limit
     above = np.flatnonzero(peaks.height >= target)

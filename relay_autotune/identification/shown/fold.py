@@ -26,13 +26,13 @@ from relay_autotune.record.record import PiecewiseConstant, Record, RelaySetting
 
 FloatArray = NDArray[np.float64]
 
-# Knots in half a period, from the fewest on; each needs some samples of its own.
+# Numbers of knots in half a period, from the fewest on, and least number of samples for each.
 _KNOTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 _SAMPLES_PER_KNOT = 3.0
 _MOST_POINTS = 1200
 _PLACES = 40
 _PATIENCE = 2
-# With this many knots and fewer the kink is sought everywhere, with more near where it was.
+# Number of knots up to which the kink is searched for everywhere; with more, near the last one.
 _SEARCHED = 16
 _NEGLIGIBLE = 1e-9
 _SYMMETRIC = 0.05
@@ -53,7 +53,7 @@ class Fold:
     :param settings: the relay.
     :param edge: time from each switch to the kink that follows it [s]; NaN: the curve is smooth.
     :param noise_std: scatter of the samples about the curve [y].
-    :param samples: how many were laid over one another.
+    :param samples: number of samples laid over one another.
     :param mirrored: True if each half is the other one upside down, up to an offset.
     :param coefficients: of the spline's functions, of those of the kinks, and the offset [y].
     """
@@ -102,8 +102,8 @@ class Fold:
     def peaks(self) -> tuple[float, float]:
         """Return the lowest and the highest measurement about the set-point [y].
 
-        Noise would place a smooth maximum beside a kink too high; so the kink counts where it is
-        the peak but for what the curve is uncertain by.
+        Noise makes a smooth maximum beside a kink too high; so the kink counts where it is the
+        peak within the uncertainty of the curve.
         """
         y = self(np.linspace(0.0, self.period, _GRID))
         ends = float(np.min(y)), float(np.max(y))
@@ -125,7 +125,7 @@ class Fold:
         nodes, weights = _QUADRATURE
         answer = 0.0j
         for begin, end in pairwise(bounds):
-            # In each piece between kinks the spline is smooth but for its knots.
+            # In each piece between kinks the spline is smooth except at its knots.
             cells = np.linspace(begin, end, _CELLS + 1)
             half = 0.5 * (end - begin) / _CELLS
             time = (cells[:-1, None] + half * (nodes + 1.0)).ravel()
@@ -256,7 +256,7 @@ def _switches(
     up, end = ends
     inside = (u.times > up) & (u.times < end)
     edges = np.concatenate((u.times[inside], [end]))
-    # Noise may make the relay switch to and fro; the longest stay at the low level counts.
+    # Noise may make the relay switch back and forth; the longest stay at the low level counts.
     levels = u.values[inside]
     stays = [(b - a, a) for (a, b), v in zip(pairwise(edges), levels, strict=True) if v < middle]
     if not stays:
@@ -286,7 +286,7 @@ def _smoothed(
     x, value, weight = _binned(time / unit, y)
     n = x.size
     basis = Basis(mirrored, high / unit)
-    # The command reaches the process before the next switch, or that would not have come.
+    # The command reaches the process before the next switch, which it causes.
     places = np.linspace(0.0, min(high, low) / unit, _PLACES + 1, endpoint=False)[1:]
 
     def smoothed(spline: Spline, edge: float) -> Fold:

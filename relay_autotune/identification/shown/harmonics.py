@@ -27,7 +27,8 @@ FloatArray = NDArray[np.float64]
 Points = tuple[FrequencyPoint, ...]
 
 _MOST = 9
-# Straight lines between samples h apart miss a harmonic by about (w h)^2/12 of itself.
+# Largest w h of a harmonic with samples h apart, and the factor of the relative error
+# (w h)^2/12 of straight lines between them.
 _COARSEST = 0.5
 _POLYGON = 1.0 / 12.0
 _TOO_UNCERTAIN = 0.2
@@ -77,17 +78,17 @@ def measured_points(whole: CycleRun) -> Points:
 
 
 def with_noise_about(model: TransferFunction, whole: CycleRun, points: Points) -> Points:
-    """Return points with the standard deviations that the noise about a model tells.
+    """Return points with standard deviations from the residual of a model.
 
-    What the model leaves of the samples is noise; its Fourier integrals at the frequencies
-    between the harmonics, where neither the limit cycle nor what the model lacks has a part, tell
-    how large they are at the harmonics, whatever its colour.
+    Between the harmonics the residual's Fourier integrals show noise alone: neither the limit
+    cycle nor the error of the model has a part there. So they give the size of the noise at the
+    harmonics, whatever its colour.
 
     :param model: near the points, without unstable poles.
     :param whole: the cycles that they were measured in.
     :param points: from :func:`measured_points`.
     :return: those that are certain enough.
-    :raises IdentificationError: if that at the frequency of the limit cycle is not.
+    :raises IdentificationError: if the point at the frequency of the limit cycle is not.
     """
     record = whole.record
     start, end, cycles = cycle_window(record)

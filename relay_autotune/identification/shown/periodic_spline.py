@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 _RIDGE = 1e-13
 _TOLERANCE = 1e-7
-# Functions that differ by less than the square root of it are one, where places are compared.
+# Ridge where places are compared: functions that differ by less than its root count as one.
 _ALIKE = 1e-10
 
 
@@ -40,10 +40,10 @@ class Kinks:
     def at(cls, basis: Basis, places: FloatArray, x: FloatArray, weight: FloatArray) -> Kinks:
         """Return the functions at some places.
 
-        :param basis: what they are.
+        :param basis: the functions.
         :param places: phases, shape (m,).
         :param x: phases of the points, shape (n,).
-        :param weight: how many samples each point stands for, shape (n,).
+        :param weight: number of samples that each point stands for, shape (n,).
         """
         columns = np.stack([basis.edges(x, p, 0) for p in places], axis=1)
         columns = columns * np.sqrt(weight)[:, None, None]
@@ -58,10 +58,10 @@ class Spline:
     little more than they do.
 
     :param basis: the functions.
-    :param knots: how many of the spline.
+    :param knots: number of the spline's knots.
     :param x: phases, shape (n,).
     :param y: shape (n,).
-    :param weight: how many samples each point stands for, shape (n,).
+    :param weight: number of samples that each point stands for, shape (n,).
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Spline:
         self._columns = csr_array(columns * self._root)
         self._transposed = csr_array(self._columns.T)
         gram = (self._transposed @ self._columns).toarray()
-        # Knots without samples leave functions that nothing tells of.
+        # Knots without samples leave functions without data.
         gram[np.diag_indices_from(gram)] += _RIDGE * float(np.trace(gram))
         self._factor = cho_factor(gram)
         target = self._root[:, 0] * y
@@ -89,7 +89,7 @@ class Spline:
         return np.asarray(found)
 
     def fitted(self, edge: float) -> tuple[FloatArray, float]:
-        """Return the coefficients and the sum of squares that they leave.
+        """Return the coefficients and the sum of squared residuals.
 
         :param edge: phase of the kink; NaN: none.
         :return: coefficients of the spline, of the kink's functions, and the offset.
@@ -109,11 +109,11 @@ class Spline:
         return float(rest @ rest), np.asarray(part), along
 
     def searched(self, kinks: Kinks) -> float:
-        """Return the one of some places at which a kink leaves the least.
+        """Return the place at which a kink leaves the least sum of squares.
 
-        With E the functions of a place and S those of the spline, what E takes of the residual
-        r is ``r'E (E'E - E'S (S'S)^-1 S'E)^-1 E'r``: less exact than :meth:`fitted`, which the
-        choice does not need.
+        With E the functions of a place, S those of the spline and r its residual, E reduces the
+        sum of squares by ``r'E (E'E - E'S (S'S)^-1 S'E)^-1 E'r``. This is less exact than
+        :meth:`fitted`, but good enough for the choice.
 
         :param kinks: the functions of each place, weighted as the points are.
         """
@@ -193,7 +193,7 @@ class Basis:
         return columns
 
     def edges(self, phase: FloatArray, edge: float, derivative: int) -> FloatArray:
-        """Return functions whose rate, or the rate's rate, jumps, shape (n, kinks).
+        """Return functions whose first or second derivative jumps, shape (n, kinks).
 
         Repeating: Bernoulli's polynomials of second and third degree, at ``edge`` and at
         ``high + edge``. Mirrored: a triangular wave and one of parabolas, at ``edge``.

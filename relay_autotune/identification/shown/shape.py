@@ -55,7 +55,7 @@ class Curve(Protocol):
 class Shape:
     """Shape factors of the half of a limit cycle in which the deviation is positive.
 
-    Of a direct-acting process: the command switches to low at t = 0, where y rises through the
+    The command of a direct-acting process switches to low at t = 0, where y rises through the
     switching level; for an ideal relay that is the zero crossing.
 
     :param half_period: T, to the next switch [s].
@@ -228,10 +228,10 @@ class Reading:
     """The shape of a relay test with its uncertainty.
 
     :param shape: the mean of its two halves.
-    :param names: those numbers of the shape that the covariance is of.
+    :param names: the numbers of the shape in the covariance, in its order.
     :param covariance: of these, by leaving out one cycle after the other, shape (n, n); None for
         fewer than three cycles.
-    :param cycles: how many cycles were averaged.
+    :param cycles: number of cycles that were averaged.
     """
 
     shape: Shape
@@ -310,7 +310,7 @@ def shape_of_fold(period: Fold, growth: float = math.nan) -> Shape:
     :param growth: tau_G/P, see :class:`Shape`.
     :raises IdentificationError: if a half never passes the set-point.
     """
-    # The switch to low begins the half above the set-point, of a reverse process that below.
+    # The switch to low begins the half above the set-point; if reverse-acting, the one below.
     sign = -1.0 if period.settings.reverse_acting else 1.0
     # At an edge the curve is less certain than on average, and splines swing a little about it.
     swing = 0.5 * float(np.ptp(period(np.linspace(0.0, period.period, _GRID))))

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The state about which a relay test moves, and the static gain that its means tell."""
+"""The state about which a relay test moves, and the static gain from its means."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class StaticGain:
 
     :param value: K [y/u], with its sign.
     :param scatter: its standard deviation from cycle to cycle [y/u]; NaN: not estimated.
-    :param excursion: how far the mean command lay from the baseline [u].
+    :param excursion: mean command minus baseline [u].
     """
 
     value: float
@@ -79,8 +79,8 @@ def steady_state(record: Record, settings: RelaySettings) -> SteadyState:
 def static_gain(test: RelayTest, rest: SteadyState) -> StaticGain:
     """Return the static gain (Wang, Hang and Zou 1997, eq 6).
 
-    ``K = (mean(y) - rest)/(mean(u) - baseline)`` over whole cycles; a steady state that is wrong,
-    or a load that came after it was measured, is wrong in K by its own share of the denominator.
+    ``K = (mean(y) - rest)/(mean(u) - baseline)`` over whole cycles. An error of the steady state,
+    or a load that came after it was measured, enters K divided by the same denominator.
 
     :param test: a relay test with a bias.
     :param rest: the measurement under the baseline.

@@ -32,15 +32,15 @@ _LEAST_NEAR = 4
 
 @dataclass(frozen=True)
 class SymmetricCycle:
-    """What the methods for an unbiased relay take from a limit cycle.
+    """The numbers of a limit cycle that the methods for an unbiased relay need.
 
     :param period: P [s].
     :param amplitude: a, half of peak to peak [y].
     :param relay: h, amplitude of the relay [u].
     :param hysteresis: epsilon [y].
     :param dead_time: D, of the process and what the relay added to it [s].
-    :param switch_level: measurement at the switch, where it is not the hysteresis since the
-        relay is sampled or sees noise [y]; NaN: the hysteresis.
+    :param switch_level: measurement at the switch, which sampling and noise move away from the
+        hysteresis [y]; NaN: the hysteresis.
     """
 
     period: float
@@ -62,7 +62,7 @@ class SymmetricCycle:
 
     @property
     def part(self) -> float:
-        """Part of a half period that is left when the command has arrived, m of Chang et al."""
+        """Share of a half period that is left after the dead time, m of Chang et al."""
         return 1.0 - 2.0 * self.dead_time / self.period
 
 
@@ -97,8 +97,8 @@ def known_gain(known: Known, sign: int) -> float:
 class CycleReader:
     """Reads the numbers of a limit cycle from stretches of one relay test.
 
-    :param excess: how much higher noise makes the peaks on average [y].
-    :param noisy: True if the noise matters for where the measurement is at a switch.
+    :param excess: what noise adds to the height of a peak, on average [y].
+    :param noisy: True if noise matters for the measurement at a switch.
     """
 
     excess: float
@@ -122,7 +122,7 @@ class CycleReader:
 
         :param stretch: the cycles.
         :param dead_time: of the process [s].
-        :raises IdentificationError: if they do not stand out of the noise.
+        :raises IdentificationError: if their amplitude does not exceed that of noise alone.
         """
         settings = stretch.settings
         period, amplitude = features(stretch).tolist()
@@ -144,7 +144,7 @@ class CycleReader:
 
 
 def skew_warning(stretch: CycleRun) -> str:
-    """Return a sentence if the half periods differ too much for a symmetric relay, else none."""
+    """Return a sentence if the half periods differ too much for a symmetric relay, else ""."""
     cycle = stretch.cycle
     skew = abs(cycle.period_high - cycle.period_low) / cycle.period
     if skew < _MOST_SKEW:
@@ -204,10 +204,10 @@ def _excess_of_peaks(whole: CycleRun, noise: float) -> float:
 
 
 def _level_at_switch(stretch: CycleRun, noisy: bool) -> float:
-    """Return where the measurement is at a switch, from the middle of the peaks [y].
+    """Return the measurement at a switch, from the middle of the peaks [y].
 
-    In noise a straight line through the samples around each switch tells it, without the sample
-    that made the relay switch: that one's noise was on the side of the switch.
+    In noise it is read from a straight line through the samples around each switch. The sample
+    that made the relay switch is left out: its noise is biased to the side of the switch.
     """
     record, settings, cycle = stretch.record, stretch.settings, stretch.cycle
     first, last = record.cycle_start[0], record.cycle_start[-1]
@@ -217,7 +217,7 @@ def _level_at_switch(stretch: CycleRun, noisy: bool) -> float:
     window = min(_WINDOW * cycle.period, 0.8 * peak)
     middle = 0.5 * (cycle.peak_max + cycle.peak_min)
     u = record.input()
-    # Where noise makes the relay switch to and fro, the switch before a long stay counts.
+    # Where noise makes the relay switch back and forth, the switch before a long stay counts.
     stay = np.diff(np.append(u.times, time[-1]))
     chosen = (u.times >= time[first]) & (u.times < time[last]) & (stay > 0.2 * cycle.period)
     found = []
