@@ -51,9 +51,9 @@ from relay_autotune_msgs.msg import PidGains, TransferFunction
 RUNS = 200
 # Kills come at a random moment between the call of ~/apply and this time after it [s].
 WITHIN = 2.5
-SILENT = "any; that node is silent"
+SILENT = "any; nobody answers"
 PHASES = ("apply", "between", "verify", "after it", SILENT)
-# A target that has seen many peers die may answer nobody any more: kills until a new one comes.
+# A process that has seen many peers die may hear nobody any more: kills until new ones come.
 EACH = 25
 
 
@@ -117,7 +117,17 @@ def rig_of_its_own() -> Iterator[Rig]:
             rig.close()
 
 
-def own(runs: int, deadline: float) -> list[Kill]:
+def kills_of(
+    stretch: Callable[[Iterable[int], float], list[Kill]], runs: int, deadline: float
+) -> list[Kill]:
+    """Return the kills of one kind, with new processes for each stretch of them."""
+    found: list[Kill] = []
+    while len(found) < runs and time.monotonic() < deadline:
+        found += stretch(range(len(found), min(len(found) + EACH, runs)), deadline)
+    return found
+
+
+def own(counts: Iterable[int], deadline: float) -> list[Kill]:
     """Kill a node that controls: it must start with the gains that it had proven."""
     found: list[Kill] = []
     with rig_of_its_own() as rig:
@@ -126,7 +136,7 @@ def own(runs: int, deadline: float) -> list[Kill]:
         result = loop.verify(setpoint_step=0.3)
         assert result.passed, result.reason
         course = Course(rig, loop.step)
-        for count in range(runs):
+        for count in counts:
             if time.monotonic() > deadline:
                 break
             random = Random(f"own {count}")
@@ -137,24 +147,20 @@ def own(runs: int, deadline: float) -> list[Kill]:
             loop.node.signal(signal.SIGKILL)
             loop.node.wait()
             begun = time.monotonic()
-            loop.start()
-            kc, ti = loop.gains_shown()
+            try:
+                loop.start()
+                kc, ti = loop.gains_shown()
+            except AssertionError:
+                found.append(Kill("own", SILENT, math.nan, ""))
+                break
             right = (kc, ti) == (0.5, 0.6)
             taken = time.monotonic() - begun
             found.append(Kill("own", phase, taken, "" if right else f"kc {kc}, ti {ti}"))
     return found
 
 
-def another(runs: int, deadline: float) -> list[Kill]:
+def another(counts: Iterable[int], deadline: float) -> list[Kill]:
     """Kill a node that sets another node's gains: that node must get back its previous gains."""
-    found: list[Kill] = []
-    while len(found) < runs and time.monotonic() < deadline:
-        found += _of_one_target(range(len(found), min(len(found) + EACH, runs)), deadline)
-    return found
-
-
-def _of_one_target(counts: Iterable[int], deadline: float) -> list[Kill]:
-    """Return kills with one other node, until it does not answer any more."""
     found: list[Kill] = []
     with rig_of_its_own() as rig:
         loop = Loop(rig)
@@ -234,7 +240,7 @@ def main() -> int:
     runs = 2 if asked.quick else asked.runs // 2
     deadline = time.monotonic() + 60.0 * asked.minutes
     with multiprocessing.get_context("spawn").Pool(2, end_in_order) as pool:
-        parts = [pool.apply_async(work, (runs, deadline)) for work in (own, another)]
+        parts = [pool.apply_async(kills_of, (work, runs, deadline)) for work in (own, another)]
         kills = [kill for part in parts for kill in part.get()]
     headings = (
         *("gains", "killed in", "kills", "other gains than before"),
