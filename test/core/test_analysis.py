@@ -66,6 +66,7 @@ def test_margins_agree_with_python_control(control, controller, model):
     assert found.phase_margin == pytest.approx(math.radians(np.abs(phases).min()), rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("controller", "model"), RATIONAL)
 def test_responses_agree_with_scipy(control, controller, model):
     weighted = Controller(controller.kc, controller.ti, controller.td, controller.tf, 0.4)

@@ -32,6 +32,7 @@ def _record(seed: int = 0, noise: float = 0.02) -> Record:
     return simulate_sampled_relay(model, relay, period=0.2, noise=draws)
 
 
+@pytest.mark.long
 def test_a_completed_experiment_yields_models_and_gains():
     found = analyse(_record())
     assert found.reason == ""
@@ -51,6 +52,7 @@ def test_the_chosen_method_and_rule_come_first():
     assert found.best_gains.rule == "imc"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
 def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
     found = analyse(replace(_record(), outcome=outcome, reason="the operator said stop"))
@@ -96,6 +98,7 @@ def test_data_that_tell_nothing_are_a_reason():
     assert "constant" in found.reason
 
 
+@pytest.mark.long
 def test_a_rule_that_does_not_apply_says_so():
     found = analyse(_record(), rule="itae")
     assert found.best_gains.rule == "itae"
@@ -118,6 +121,7 @@ def test_unknown_names_are_refused_at_once():
         analyse(_record(), rule="magic")
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=20)
 @given(
     seed=st.integers(0, 1000),

@@ -152,6 +152,7 @@ def test_an_oven_that_rests_and_then_warms_has_a_positive_gain():
     assert found.model.dead_time < 30.0
 
 
+@pytest.mark.long
 def test_a_step_after_a_rest_of_few_samples_is_no_drift():
     # An unknown state and command before the record explain all of it, too, but need not.
     rng = np.random.default_rng(1)

@@ -29,6 +29,7 @@ MODELS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 @pytest.mark.parametrize("hysteresis", [0.0, 0.1])
 def test_it_is_the_limit_cycle_of_the_experiment(model, hysteresis):
@@ -67,6 +68,7 @@ def test_multiplier(name, inputs, exact, tol):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.eq25.grid"))
 def test_growth_of_two_equal_lags(name, inputs, exact, tol):
     for case in exact:

@@ -23,6 +23,7 @@ from relay_autotune.record.record import Outcome
 PART = 30
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", range(10))
 def test_random_histories_end_within_their_bound(part):
     for seed in range(part * PART, (part + 1) * PART):

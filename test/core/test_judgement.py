@@ -81,6 +81,7 @@ def test_the_right_model_has_no_visible_error(record):
     assert np.max(error.sure(w) / np.abs(PROCESS(1j * w))) < 0.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "passes"),
     [
@@ -97,6 +98,7 @@ def test_a_response_that_is_not_the_models_makes_its_gains_doubtful(record, gain
     assert passes or "what the loop bears" in found.sentence
 
 
+@pytest.mark.long
 def test_a_model_that_would_have_run_away_is_refused(record, gains):
     growing = TransferFunction.unstable_fopdt(2.0, 5.0, 1.0)
     found = findings(record, growing, gains)["growth"]
@@ -126,6 +128,7 @@ def test_steps_and_relays_of_ordinary_processes_are_trusted(record):
     assert completed().verdict is Verdict.TRUSTED
 
 
+@pytest.mark.long
 def test_a_record_that_is_mostly_another_input_is_doubtful():
     record = steps(PROCESS, noise=0.0)
     other = np.cumsum(np.random.default_rng(8).normal(0.0, 0.35, len(record)))
@@ -198,6 +201,7 @@ def test_each_half_of_a_record_tells_its_own_process():
             assert np.median(value) == pytest.approx(truth, rel=0.1)
 
 
+@pytest.mark.long
 def test_gains_that_do_not_hold_on_one_half_are_doubtful(gains):
     other = TransferFunction.fopdt(6.0, 10.0, 6.0)
     assert ms_on(gains, other) == np.inf
@@ -248,6 +252,7 @@ def test_a_plain_model_that_explains_less_is_not_asked():
     assert plain_models(identify(record, "waveform"), record) == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("times", "spread", "result"),
     [(0.5, 1.0, Result.PASSED), (3.0, 1.0, Result.DOUBTFUL), (30.0, 1.0, Result.FAILED)],
@@ -343,6 +348,7 @@ def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse_alone(clipped_steps(1.5)).verdict is not Verdict.TRUSTED
 
 
+@pytest.mark.long
 def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     process = TransferFunction.fopdt(1.0, 8.0, 3.0)
     plant = VirtualProcess(

@@ -105,6 +105,7 @@ def _records(
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("epsilon", [0.0, 0.2])
 @pytest.mark.parametrize(

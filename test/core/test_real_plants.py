@@ -94,6 +94,7 @@ def test_the_end_alone_is_judged_by_what_it_leaves_beyond_the_noise(end, left_ou
     assert (chosen is whole) is not left_out
 
 
+@pytest.mark.long
 def test_a_load_that_stops_the_oscillation_is_borne():
     tune = run(load_time=150.0, load_size=1.5, noise_std=0.01, max_cycles=20)
     assert tune.outcome is Outcome.COMPLETED, tune.reason

@@ -64,6 +64,7 @@ MODELS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MODELS)
 def test_response_equals_the_matrix_exponential(name):
     model = MODELS[name]
