@@ -100,6 +100,7 @@ def test_lockstep_finds_the_process_and_replays_to_the_same_digits(rig: Rig) -> 
         assert recommended[name] == getattr(gains, name), name
 
 
+@pytest.mark.nightly
 def test_lockstep_gives_the_same_numbers_every_time(tmp_path: Path) -> None:
     seen = []
     for name in ("first", "second"):
