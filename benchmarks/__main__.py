@@ -30,8 +30,15 @@ GROUPS = {
     ),
     "design": ("design_known", "design_identified"),
     "time": (
-        *("fit_time", "design_time", "replay_time", "replay_shapes", "bag_reading", "fleet_time"),
-        *("lockstep", "latency", "endurance", "back_to_back"),
+        *(
+            "fit_time",
+            "design_time",
+            "replay_time",
+            "replay_shapes",
+            "bag_reading",
+            "joint_reading",
+        ),
+        *("fleet_time", "lockstep", "latency", "endurance", "back_to_back"),
     ),
     "papers": ("chang_studies", "thyagarajan_studies", "paper_designs"),
     "faults": (

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import struct
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,7 +17,7 @@ from rosidl_parser import definition
 from relay_autotune.bag.field_path import Step, reading, setting, steps_of
 from relay_autotune.bag.schema import Number, Repeated, Struct, Type
 from relay_autotune.errors import FieldError, ParameterError
-from relay_autotune.nodes.live_types import message_class, struct_of
+from relay_autotune.nodes.live_types import FLOAT64, message_class, struct_of
 
 # Sequences that a message must have of the same length, or its consumer reads beyond an end.
 _ALIKE = {"control_msgs/msg/MultiDOFCommand": ("dof_names", "values", "values_dot")}
@@ -36,7 +37,13 @@ class CommandMessage:
     """
 
     def __init__(
-        self, type_name: str, field: str, given: str, *, taken: bool, now_ns: Callable[[], int]
+        self,
+        type_name: str = FLOAT64,
+        field: str = "data",
+        given: str = "",
+        *,
+        taken: bool = False,
+        now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         if taken and given:
             raise ParameterError(

@@ -13,9 +13,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from std_msgs.msg import Float64
 
 from relay_autotune.nodes import quality, signs_of_life
 from relay_autotune.nodes.command_message import CommandMessage
@@ -39,8 +39,10 @@ class Ends:
     :param on_status: called with each sign of life of the identifier.
     :param cycles_kept: number of cycles kept for late subscribers (depth of the latched topic).
     :param reader: how the measurement is read from its messages.
-    :param commands: writes a command into its message.
+    :param commands: writes what the relay sends into its message.
     :param relay_on_setpoint: True if the relay publishes set-points.
+    :param is_reported: True if the controller commands the actuator itself and reports how; the
+        relay then sends nothing but set-points.
     """
 
     def __init__(
@@ -55,22 +57,26 @@ class Ends:
         reader: Reader,
         commands: CommandMessage,
         relay_on_setpoint: bool = False,
+        is_reported: bool = False,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
         # No event callbacks: each one costs time in every turn of the executor. /diagnostics and
         # the answer to a start report an incompatible QoS.
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
+        plain = CommandMessage()
+        self.is_reported = is_reported
+        self.commands = commands
+        self._setpoints = commands if is_reported else plain
+        passed = plain if is_reported else commands
+        self._written = passed.written
         self.setpoint = None
         if relay_on_setpoint:
             self.setpoint = node.create_publisher(
-                Float64, "setpoint", quality.COMMAND, event_callbacks=quiet
+                self._setpoints.kind, "setpoint", quality.COMMAND, event_callbacks=quiet
             )
-        self._setpoint_message = Float64()
-        self.commands = commands
-        self._written = commands.written
         self.command = node.create_publisher(
-            commands.kind,
+            passed.kind,
             "command",
             quality.COMMAND,
             event_callbacks=quiet,
@@ -110,7 +116,7 @@ class Ends:
         # Looked up once, because it is called for each measurement.
         self._publish = self.command.publish
         self.last: float | None = None
-        """The last command that was published [u]; None: none was."""
+        """The last number that the relay's message carried; None: there was none."""
         self.is_fresh = False
         """Set to True by each command."""
 
@@ -147,8 +153,22 @@ class Ends:
     def send_setpoint(self, setpoint: float) -> None:
         """Publish a set-point."""
         assert self.setpoint is not None
-        self._setpoint_message.data = setpoint
-        self.setpoint.publish(self._setpoint_message)
+        message = self._setpoints.written(setpoint)
+        if message is None:
+            return
+        self.setpoint.publish(message)
+        if self.is_reported:
+            self.last, self.is_fresh = setpoint, True
+
+    def send_again(self) -> None:
+        """Publish the last command again, or the last set-point if these alone are sent."""
+        if self.last is not None:
+            (self.send_setpoint if self.is_reported else self.send)(self.last)
+
+    @property
+    def sent_to(self) -> Publisher:
+        """The publisher of what the relay's message carries."""
+        return self.setpoint if self.is_reported and self.setpoint else self.command
 
     def relay(self, value: float) -> None:
         """Publish the relay's output: a command, or a set-point."""

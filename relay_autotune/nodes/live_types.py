@@ -39,18 +39,19 @@ class Reader:
     stamp_ns: Callable[[Any], int] | None
 
 
-def reader_of(type_name: str, field: str) -> Reader:
-    """Return the reader of the measurement for a message type.
+def reader_of(type_name: str, field: str, parameter: str = "measurement_field") -> Reader:
+    """Return the reader of the measurement, or of a number beside it, for a message type.
 
     :param type_name: such as ``sensor_msgs/msg/Temperature``.
     :param field: path of a numeric field, such as ``velocity[left_wheel]`` or ``twist.linear.x``.
+    :param parameter: which one names the field, for the error.
     :raises ParameterError: if the type does not exist, or the field is not a number.
     """
     kind = message_class(type_name, "measurement_type")
     try:
         steps = steps_of(struct_of(kind), field, type_name)
     except FieldError as error:
-        raise ParameterError(f"measurement_field: {error}") from None
+        raise ParameterError(f"{parameter}: {error}") from None
     example = kind()
     is_plain = steps == ("data",) and isinstance(example.data, float)
     stamp = _header_stamp if hasattr(example, "header") else None

@@ -196,7 +196,7 @@ class LoopClient:
         :param others: what stands in their other elements, as for `CommandMessage`.
         :raises ParameterError: if the messages of this type do not have such a command.
         """
-        commands = CommandMessage(type_name, field, others, taken=False, now_ns=time.time_ns)
+        commands = CommandMessage(type_name, field, others)
         name = self._resolved(topic)
         if not self._node.count_publishers(name):
             return math.nan

@@ -79,7 +79,7 @@ class LoopEnds:
                 quality.COMMAND,
                 event_callbacks=unheard,
             )
-        else:
+        elif not ends.is_reported:
             self._controller = node.create_subscription(
                 Float64,
                 "controller_command",
@@ -152,7 +152,8 @@ class LoopEnds:
         if self._ends.setpoint is not None and not self.is_connected:
             raise NotReadyError(
                 "relay_on is setpoint, but no controller_command comes: connect the controller of "
-                "the present loop, with path passthrough"
+                "the present loop, with path passthrough, or give controller_command_field where "
+                "the messages of the measurement have it"
             )
         if self._takeover:
             if self._driven and self.handover.is_connected(self._value("controller_timeout")):
@@ -171,7 +172,7 @@ class LoopEnds:
     def _several(self) -> str:
         """Return a sentence on a second sensor, controller or relay_node, or ""."""
         several = second_source(self._node, self._ends.measurement)
-        if not several and not self._takeover:
+        if not several and not self._takeover and not self._ends.is_reported:
             several = second_source(self._node, self._controller)
         return several or namesake(self._node)
 
@@ -198,7 +199,8 @@ class LoopEnds:
             )
         if connected:
             timeout = self._value("controller_timeout")
-            topic = self._controller.topic_name
+            reported = self._ends.is_reported
+            topic = (self._ends.measurement if reported else self._controller).topic_name
             checks.append(Silence(f"no command on {topic}", timeout, lambda: self.handover.age))
         timeout = self._value("feedback_timeout")
         self._follow = None
@@ -255,6 +257,11 @@ class LoopEnds:
     def _note_own(self, command: float) -> None:
         self._own.append(self._ends.commands.on_wire(command))
 
+    def report(self, command: float) -> None:
+        """Take what the controller says that it commands the actuator itself [u]."""
+        if math.isfinite(command):
+            self.handover.note(command)
+
     def _on_command(self, message: Any) -> None:
         """Take a message on the command topic, where other nodes may publish, too."""
         try:
@@ -284,8 +291,8 @@ class LoopEnds:
         ends = self._ends
         if ends.is_fresh:
             ends.is_fresh = False
-        elif ends.last is not None and not self.is_driven:
-            ends.send(ends.last)
+        elif not self.is_driven:
+            ends.send_again()
 
     def _on_feedback(self, message: Float64) -> None:
         self._feedback_at = time.monotonic()

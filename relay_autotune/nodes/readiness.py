@@ -82,9 +82,10 @@ def require_actuator(node: Node, ends: Ends) -> None:
     :raises NotReadyError: with the reason, as far as the graph shows it.
     """
     # In takeover one of the subscriptions is the node's own.
-    own = sum(s.topic_name == ends.command.topic_name for s in node.subscriptions)
-    if ends.command.get_subscription_count() <= own:
-        why = why_no_subscriber(node, ends.command.topic_name, ends.commands.type_name)
+    sent = ends.sent_to
+    own = sum(s.topic_name == sent.topic_name for s in node.subscriptions)
+    if sent.get_subscription_count() <= own:
+        why = why_no_subscriber(node, sent.topic_name, ends.commands.type_name)
         raise NotReadyError(f"no command would arrive: {why}")
     if unknown := ends.commands.why_unknown:
         raise NotReadyError(

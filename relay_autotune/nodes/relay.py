@@ -69,7 +69,7 @@ from relay_autotune.nodes.reports import (
 )
 from relay_autotune.nodes.results import OwnResults
 from relay_autotune.nodes.session import Session
-from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint
+from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint, reported_by
 from relay_autotune.nodes.signs_of_life import said_by
 from relay_autotune.nodes.silence import Sensor, require_own_time
 from relay_autotune.nodes.tune_action import Started, TuneAction
@@ -117,6 +117,7 @@ class RelayNode(ServedNode):
         self._alarm = ""
         self._reader = reader_of(fixed["measurement_type"], fixed["measurement_field"])
         self._value = self._reader.value
+        self._reported = reported_by(fixed)
         self._ends = Ends(
             self,
             on_measurement=self._on_measurement,
@@ -134,6 +135,7 @@ class RelayNode(ServedNode):
                 now_ns=self._now_ns if self._simulated else time.time_ns,
             ),
             relay_on_setpoint=fixed["relay_on"] == "setpoint",
+            is_reported=self._reported is not None,
         )
         self._send, self._relay = self._ends.send, self._ends.relay
         self._on_setpoint = fixed["relay_on"] == "setpoint"
@@ -190,6 +192,14 @@ class RelayNode(ServedNode):
             if not self._loop.is_driven:
                 self._answer_idle(value)
             self._last_samples.add(value)
+        if self._reported is not None:
+            # After the answer: it belongs to this sample, and the one before is still needed.
+            try:
+                self._loop.report(self._reported(message))
+            except FieldError as error:
+                self._stop_now(
+                    f"the controller's command on {self._topic} cannot be read: {error}"
+                )
         self._counter.add(info["publication_sequence_number"])
 
     def _on_silence(self, value: float, ago: float) -> None:
@@ -330,7 +340,7 @@ class RelayNode(ServedNode):
 
     def _served(self) -> str:
         """Say who takes the commands."""
-        topic = self._ends.command.topic_name
+        topic = self._ends.sent_to.topic_name
         there = self.get_subscriptions_info_by_topic(topic)
         takers = ", ".join(described(e) for e in there if who(e) != self._name)
         return f"{self._ends.commands.described} on {topic} to {takers}"

@@ -6,16 +6,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.readiness import NotReadyError
 from relay_autotune.nodes.session import Session
 from relay_autotune.record.record import FloatArray, Record, RelaySettings
+
+
+def reported_by(values: Mapping[str, Any]) -> Callable[[Any], float] | None:
+    """Return what reads the controller's command from the measurement's messages.
+
+    :param values: the fixed parameters of relay_node.
+    :return: None: these messages do not have it.
+    :raises ParameterError: if they cannot have it, or nothing is done with it.
+    """
+    field = values["controller_command_field"]
+    if not field:
+        return None
+    if values["relay_on"] != "setpoint" or values["path"] != "passthrough":
+        raise ParameterError(
+            f"controller_command_field is {field!r}, which is for relay_on setpoint with path "
+            f"passthrough: found {values['relay_on']} and {values['path']}"
+        )
+    return reader_of(values["measurement_type"], field, "controller_command_field").value
 
 
 def on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters, float]:

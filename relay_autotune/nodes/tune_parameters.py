@@ -169,6 +169,14 @@ FIXED_PARAMETERS = (
         "counts as a new sample, and measurement_timeout does not apply; 0: silence is a fault.",
         0.0,
     ),
+    Quantity(
+        "controller_command_field",
+        "",
+        "",
+        "For relay_on setpoint, where the controller commands the actuator itself: path of its "
+        "command in the messages of the measurement; command_type and all below are then those of "
+        "setpoint. Empty: it comes on controller_command and is passed on.",
+    ),
     Quantity("command_type", FLOAT64, "", "Message type of the command."),
     Quantity(
         "command_field",

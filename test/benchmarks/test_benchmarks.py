@@ -48,6 +48,7 @@ QUICK = {
     "design_identified": ("--quick",),
     "design_time": ("--quick",),
     "bag_reading": ("--quick",),
+    "joint_reading": ("--quick",),
     "fuzz_bags": ("--quick",),
     "fleet_time": ("--quick",),
     "paper_designs": ("--quick",),

@@ -179,7 +179,7 @@ def test_launch_files_in_commands_exist_and_take_these_arguments() -> None:
 def test_remapped_names_are_those_of_the_loop() -> None:
     for page in GUIDE:
         for name in re.findall(r"-r (\w+):=", page.read_text()):
-            assert name in {"measurement", "command", "other_commands", "__ns"}
+            assert name in {"measurement", "command", "other_commands", "setpoint", "__ns"}
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import message_type
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes.live_types import reader_of, struct_of
+from relay_autotune.nodes.setpoint_session import reported_by
 
 JOINTS = [f"arm_{k}" for k in range(7)]
 
@@ -92,3 +93,27 @@ def test_a_class_has_the_fields_of_its_definition(name: str) -> None:
     text = find_definition(name).text.encode()
     recorded = message_type(Channel(1, "/t", name, "cdr", "ros2msg", text, {}))
     assert struct_of(getattr(importlib.import_module(f"{package}.msg"), short)) == recorded
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"relay_on": "command"}, "which is for relay_on setpoint with path passthrough"),
+        ({"path": "takeover"}, "found setpoint and takeover"),
+        ({"controller_command_field": "force[left]"}, "controller_command_field: sensor_msgs/"),
+    ],
+)
+def test_a_controller_that_cannot_report_its_command_is_refused(
+    given: dict[str, str], sentence: str
+) -> None:
+    values = {
+        "measurement_type": "sensor_msgs/msg/JointState",
+        "controller_command_field": "effort[left]",
+        "relay_on": "setpoint",
+        "path": "passthrough",
+    }
+    read = reported_by(values)
+    assert read is not None
+    assert read(JointState(name=["arm", "left"], effort=[1.0, 2.0])) == 2.0
+    with pytest.raises(ParameterError, match=sentence):
+        reported_by(values | given)
