@@ -37,7 +37,7 @@ METHODS: dict[str, Method] = {
     "luyben_step": identify_step,
     "fourier": identify_fourier,
 }
-# These take several records of one process; the first ones of them nothing else.
+# Methods that take several records of one process; ONLY_JOINT take nothing else.
 JOINT_METHODS: dict[str, JointMethod] = {
     "li": identify_li_jointly,
     "waveform": identify_waveform_jointly,
@@ -49,7 +49,7 @@ DEFAULT_METHOD = "waveform"
 def method_named(name: str) -> Method:
     """Return a method by its name.
 
-    :raises IdentificationError: if there is none of that name; the message lists those there are.
+    :raises IdentificationError: if there is none of that name; the message lists the names.
     """
     return look_up(METHODS, name, "method", IdentificationError)
 
@@ -68,7 +68,7 @@ def identify(
     :param record: the experiment.
     :param method: one of ``METHODS``.
     :param known: what is known of the process beforehand.
-    :raises IdentificationError: if the method is unknown or the record does not tell a model.
+    :raises IdentificationError: if the method is unknown or the record does not give a model.
     :raises RecordError: if it is not a record.
     """
     return method_named(method)(one_record(record, "identify"), known)
@@ -82,7 +82,7 @@ def identify_jointly(
     :param records: the experiments.
     :param method: one of ``JOINT_METHODS``.
     :param known: what is known of the process beforehand.
-    :raises IdentificationError: if the method does not take several records, or they do not tell
+    :raises IdentificationError: if the method does not take several records, or they do not give
         a model.
     """
     if method not in JOINT_METHODS:

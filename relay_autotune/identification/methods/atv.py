@@ -53,7 +53,7 @@ def ultimate_estimate(period: float, amplitude: float, relay: float) -> tuple[fl
 def phase_of_lags(
     period: float, dead_time: float, amplitude: float = 1.0, hysteresis: float = 0.0
 ) -> float:
-    """Return the phase that the lags must make up [rad].
+    """Return the phase lag that remains for the lags [rad].
 
     :param period: P [s].
     :param dead_time: D [s].
@@ -77,11 +77,11 @@ def phase_of_lags(
 
 
 def time_constant_from_phase(order: int, period: float, phase: float) -> float:
-    """Return tau of n equal lags from the phase: eq 13 for n = 1, and its likes.
+    """Return tau of n equal lags from the phase: eq 13 for n = 1, and the same for other n.
 
     :param order: n >= 1.
     :param period: P [s].
-    :param phase: what the lags make up, from :func:`phase_of_lags` [rad].
+    :param phase: of the lags, from :func:`phase_of_lags` [rad].
     :raises IdentificationError: if this number of lags cannot have that phase.
     """
     each = phase / order
@@ -95,7 +95,7 @@ def time_constant_from_phase(order: int, period: float, phase: float) -> float:
 
 
 def time_constant_from_magnitude(order: int, period: float, attenuation: float) -> float:
-    """Return tau of n equal lags from the magnitude: eqs 21 to 23, and their likes.
+    """Return tau of n equal lags from the magnitude: eqs 21 to 23, and the same for other n.
 
     :param order: n >= 1.
     :param period: P [s].
@@ -113,7 +113,7 @@ def two_time_constants(period: float, phase: float, attenuation: float) -> tuple
     cosines, so that cos(alpha - beta) = 2/(K K_u) - cos(alpha + beta).
 
     :param period: P [s].
-    :param phase: what the lags make up [rad].
+    :param phase: of the lags, from :func:`phase_of_lags` [rad].
     :param attenuation: K K_u.
     :raises IdentificationError: if there is no solution.
     """
@@ -133,7 +133,7 @@ def two_equal_and_one(
     """Return the time constants (repeated, single) of model 5 (eq 25 and the phase).
 
     :param period: P [s].
-    :param phase: what the lags make up [rad].
+    :param phase: of the lags, from :func:`phase_of_lags` [rad].
     :param attenuation: K K_u.
     :return: one or two solutions, the one with the larger single constant first.
     :raises IdentificationError: if there is none.
@@ -180,13 +180,13 @@ def _no_solution(lags: str, phase: float, attenuation: float) -> IdentificationE
 def identify_atv(record: Record, known: Known = NOTHING) -> Identification:
     """Identify one of models 1 to 5 from an unbiased relay test, by the original ATV.
 
-    The ultimate point reported is that of eqs 1 and 2; with a hysteresis, which shifts it, that
-    of the model.
+    The ultimate point is that of eqs 1 and 2; with a hysteresis, which shifts it, that of the
+    model.
 
     :param record: a relay test without bias.
     :param known: gain, dead time, structure and order where they are known. Without the gain
-        only equal lags can be had, without the dead time it is read from the record, without the
-        structure the simplest model that fits is taken.
+        only equal lags can be found; a dead time that is not known is read from the record;
+        without the structure the simplest model that fits is taken.
     :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
     """
     return _with_estimate(from_record(ATV, record, known))
@@ -243,7 +243,7 @@ def _mismatch(order: int, cycle: SymmetricCycle, gain: float) -> float:
 
 
 def _remarks(model: Structure, cycle: SymmetricCycle, gain: float) -> list[str]:
-    """Say what eqs 1 and 2 give literally, where a hysteresis makes them wrong."""
+    """Return what eqs 1 and 2 give literally, where a hysteresis makes them wrong."""
     if cycle.hysteresis == 0.0:
         return []
     k_u, w_u = ultimate_estimate(cycle.period, cycle.amplitude, cycle.relay)

@@ -60,7 +60,7 @@ def time_constant_from_period(
     :param dead_time: D [s].
     :param switch_level: epsilon/(K h), 0 for an ideal relay.
     :raises IdentificationError: if no such process has this period; for n = 1 and an ideal relay
-        that is so unless P/4 < D < P/2.
+        P/4 < D < P/2 is needed.
     """
     _require_dead_time(period, dead_time)
     _require_level(switch_level)
@@ -192,8 +192,8 @@ def gain_and_time_constant(
     :param relay: h [u].
     :param hysteresis: epsilon [y].
     :param harmonics: terms of eq 19 that make the amplitude; 1: eqs 21 to 23; None: all.
-    :raises IdentificationError: if no such process has this limit cycle; for n = 1 that is so
-        unless (1 - epsilon/a) P/4 < D < P/2.
+    :raises IdentificationError: if no such process has this limit cycle; for n = 1
+        (1 - epsilon/a) P/4 < D < P/2 is needed.
     """
     _require_dead_time(period, dead_time)
     share = hysteresis / amplitude
@@ -217,11 +217,11 @@ def gain_and_time_constant(
 def _with_amplitude(
     shares: Sequence[float], period: float, relative_amplitude: float, harmonics: int | None
 ) -> tuple[float, ...]:
-    """Time constants of a given amplitude that divide the attenuation, in logarithms.
+    """Return time constants that share the attenuation of a given amplitude.
 
-    Eqs 21 to 25 in one: 4 K h/(pi a_1) = prod(1 + (w tau_i)^2)^(1/2), of which factor i is to the
-    power ``shares[i]``. With more harmonics a_1 is less or more than a, by a ratio that depends
-    on the time constants; it is solved for, which is where the paper's iteration converges.
+    Eqs 21 to 25 in one: 4 K h/(pi a_1) = prod(1 + (w tau_i)^2)^(1/2), where factor i is the
+    attenuation to the power ``shares[i]``. With more harmonics a_1 differs from a by a ratio that
+    depends on the time constants; solving for it gives the limit of the paper's iteration.
     """
     w = 2.0 * math.pi / period
     whole = math.log(4.0 / (math.pi * relative_amplitude))
@@ -266,7 +266,7 @@ def _smallest(order: int, period: float, part: float, excess: Callable[[float], 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
     at_low, at_high = function(low), function(high)
     if at_low * at_high > 0.0:
-        # At the very end of where there is a solution, rounding may put it outside.
+        # At the very end of the range of solutions, rounding may put the root outside.
         return low if abs(at_low) < abs(at_high) else high
     return float(brentq(function, low, high, xtol=1e-300, rtol=1e-15))
 
@@ -310,13 +310,13 @@ _AGREEMENT = 0.05
 def identify_chang(record: Record, known: Known = NOTHING) -> Identification:
     """Identify one of models 1 to 5 from an unbiased relay test, by the exact equations.
 
-    Where the relay has a hysteresis, so have the equations; all harmonics are in the amplitude.
-    What the paper's equations give literally is said in a warning.
+    The equations include the hysteresis of the relay, and all harmonics of the amplitude. A
+    warning tells what the paper's equations give literally.
 
     :param record: a relay test without bias.
     :param known: gain, dead time, structure and order where they are known. Without the gain
-        only equal lags can be had, without the dead time it is read from the record, without the
-        structure the simplest model that fits is taken.
+        only equal lags can be found; a dead time that is not known is read from the record;
+        without the structure the simplest model that fits is taken.
     :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
     """
     return from_record(CHANG, record, known).identification
@@ -393,7 +393,7 @@ _EQUATIONS = {1: ("eq 8", "eq 21"), 2: ("eq 9", "eq 22"), 3: ("eq 10", "eq 23")}
 
 
 def _remarks(model: Structure, cycle: SymmetricCycle, gain: float) -> list[str]:
-    """Say what the paper's equations, with their errata, give literally, where that differs."""
+    """Return what the paper's equations, with their errata, give literally, if it differs."""
     unknown = math.isnan(gain)
     left_out = []
     if cycle.hysteresis > 0.0:

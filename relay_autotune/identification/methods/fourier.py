@@ -5,9 +5,8 @@
 
 The ratio of two Fourier integrals over whole cycles is the frequency response itself, without any
 structure (Wang, Hang and Zou 1997, eq 23): at the frequency of the limit cycle, at its odd
-harmonics, and at the even ones where a biased relay excites them.
-
-The ultimate point of a frequency response that is known at some points only.
+harmonics, and at the even ones where a biased relay excites them. The ultimate point is
+interpolated between these points.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def interpolated(
     ``log(G/M)`` runs straight over log(w) from point to point and is constant beyond them.
 
     :param model: M, near the points.
-    :param frequency: of the points [rad/s], increasing, shape (m,); one at zero tells nothing.
+    :param frequency: of the points [rad/s], increasing, shape (m,); one at zero is not used.
     :param value: G there [y/u], shape (m,).
     :return: None where the phase does not pass -180 degrees near the lowest points.
     """
@@ -144,20 +143,21 @@ _LARGEST, _SMALLEST = 300.0, 1e-300
 _LONGEST = 1e4
 _BEYOND = 1.3
 _STEP = 0.1
-# In logarithms, or in times of a radian: step of derivatives; distance that is at an end.
+# Step of derivatives, and distance that counts as at an end: in logarithms, or in times of a
+# radian.
 _DIFFERENCE = 1e-4
 _AT_END = 1e-6
 
 
-# Beside equal lags: with a gain, at most one time constant, and a dead time.
+# Structures beside equal lags: gain, at most one time constant, and dead time.
 _STRUCTURES = {s.name: s for s in (FOPDT, IPDT, INTEGRATOR_LAG, UNSTABLE_FOPDT)}
 
 
 @dataclass(frozen=True)
 class _Points:
-    """What is measured of the frequency response.
+    """Measured points of the frequency response.
 
-    :param frequency: w [rad/s], shape (m,); 0 where the means over whole cycles tell the gain.
+    :param frequency: w [rad/s], shape (m,); 0 for a static gain from means over whole cycles.
     :param value: G(j w) [y/u], shape (m,).
     :param std: of its real and its imaginary part [y/u], shape (m,).
     """
@@ -168,7 +168,7 @@ class _Points:
 
     @property
     def numbers(self) -> int:
-        """How many real numbers were measured."""
+        """Number of real numbers that were measured."""
         return 2 * self.value.size - int(np.sum(self.frequency == 0.0))
 
 
@@ -176,10 +176,10 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
     """Identify points of the frequency response from a relay test, and a model through them.
 
     The model is the FOPDT (or another of one time constant, where the structure is known) that
-    comes nearest to the points, each weighed by its variance; the static gain that a biased relay
-    tells counts as a point at w = 0. K_u and w_u are those of the points, where the phase between
-    them passes -180 degrees: by :func:`interpolated`, or by :func:`smooth` where the points are
-    not those of the model's structure.
+    comes nearest to the points, each weighted by its variance; the static gain from a biased
+    relay counts as a point at w = 0. K_u and w_u are those of the points, where the phase between
+    them passes -180 degrees: by :func:`interpolated`, or by :func:`smooth` where the points do
+    not fit the model's structure.
 
     :param record: a relay test, biased or not.
     :param known: a structure ("fopdt", "lag_n" with its order, "ipdt", "integrator_lag",
@@ -200,7 +200,7 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
         values = fit.values(x)
     remarks = [] if test.whole.cycle.converged else [NOT_SETTLED]
     freedom = points.numbers - fit.free.size
-    # The deviations are estimates themselves.
+    # The standard deviations are estimates with few degrees of freedom.
     told = max(4 * (len(test.whole.cycle.cycles) - 1), 1)
     unlikely = freedom > 0 and fdtrc(freedom, told, cost / freedom) < _UNLIKELY
     if unlikely:
@@ -243,7 +243,7 @@ def _with_static_gain(
     points: tuple[FrequencyPoint, ...],
     structure: Structure,
 ) -> _Points:
-    """Add the static gain as a point at w = 0, where the means tell it and the model has one."""
+    """Add the static gain as a point at w = 0, where the means show it and the model has one."""
     frequency = [p.frequency for p in points]
     value = [p.value for p in points]
     std = [p.std for p in points]
@@ -295,7 +295,7 @@ class _Fit:
 
     @cached_property
     def given(self) -> FloatArray:
-        """What is known of the values; NaN: to be fitted."""
+        """The known values; NaN: to be fitted."""
         facts = {"gain": self.known.gain, "dead_time": self.known.dead_time}
         return np.array([facts.get(n, math.nan) for n in self.structure.names])
 
@@ -323,11 +323,11 @@ class _Fit:
         return np.where(self.delays, at, np.log(np.maximum(at, _SMALLEST)))
 
     def residual(self, x: FloatArray, points: _Points) -> FloatArray:
-        """Return what the model misses of each number, over its deviation."""
+        """Return the model's error in each number, over its standard deviation."""
         model = self.structure.build(self.values(x))
         with np.errstate(over="ignore", invalid="ignore"):
             away = (model(1j * points.frequency) - points.value) / points.std
-        # A search that strays meets models without a value: as bad as can be.
+        # A search that strays meets models without a value: they get a huge error.
         away = np.where(np.isfinite(away), away, _NO_VALUE)
         return np.concatenate((away.real, away.imag[points.frequency > 0.0]))
 
@@ -353,7 +353,7 @@ class _Fit:
         return 1.0 / float(points.frequency[points.frequency > 0.0][0])
 
     def _bounds(self, unit: float) -> tuple[FloatArray, FloatArray]:
-        """Return both ends of the search: a lag so long is an integrator."""
+        """Return both ends of the search: the longest lag is an integrator."""
         ends = {
             "gain": _LARGEST,
             "time_constant": math.log(_LONGEST * unit),
@@ -372,7 +372,7 @@ class _Fit:
             start = {"gain": float(self.sign), "time_constant": lag / w, "dead_time": 0.0}
             trial = self.structure.build(np.array([start[n] for n in names]))
             ratio = target / complex(trial(1j * w))
-            # What the lag leaves of the phase is dead time.
+            # The rest of the phase is dead time.
             start["gain"] = abs(ratio)
             start["dead_time"] = (-float(np.angle(ratio)) % (2.0 * math.pi)) / w
             found.append(self.refined(self.searched(np.array([start[n] for n in names])), points))
@@ -387,7 +387,7 @@ class _Fit:
         """Return the covariance of the values, and the deviations of K_u and w_u.
 
         Each measured number is moved by a share of its deviation; the least of the sum of
-        squares then lies one Newton step away. Of fewer numbers than values the covariance is
+        squares then lies one Newton step away. With fewer numbers than values the covariance is
         NaN.
 
         :param points: what was measured.
@@ -415,14 +415,14 @@ class _Fit:
         spread = jacobian(answer, none, none + _STEP)
         squares = spread @ spread.T
         if points.numbers < self.free.size:
-            # A single point does not tell three values apart, whatever comes nearest to it.
+            # A single point does not determine three values.
             squares[:-2, :-2] = math.nan
         return squares[:-2, :-2], (math.sqrt(squares[-2, -2]), math.sqrt(squares[-1, -1]))
 
     def _newton_steps(self, x: FloatArray, points: _Points) -> FloatArray:
-        """Return how the search's end moves with each measured number, by one deviation.
+        """Return how the minimum moves with each measured number, by one standard deviation.
 
-        ``(J'J + sum_i r_i r_i'')^-1 J'`` with the residuals r and their derivatives J; what is at
+        ``(J'J + sum_i r_i r_i'')^-1 J'`` with the residuals r and their derivatives J; a value at
         an end of its range stays there.
 
         :param x: where the sum of squares is least, shape (p,).

@@ -26,12 +26,12 @@ FloatArray = NDArray[np.float64]
 
 MODEL_1, MODEL_4, MODEL_5 = FOPDT, SOPDT, TWO_EQUAL_ONE
 
-# What people call them.
+# Their names in messages.
 _TEXTS = {FOPDT: "one lag", SOPDT: "two lags", TWO_EQUAL_ONE: "two equal lags and one"}
 
 
 def model_text(model: Structure) -> str:
-    """Return what a model is called, with the paper's number where it has one."""
+    """Return the name of a model, with the paper's number where it has one."""
     numbers = {MODEL_1: 1, MODEL_4: 4, MODEL_5: 5}
     number = numbers.get(model, model.order if model.order in (2, 3) else 0)
     text = _TEXTS.get(model, f"{model.order} equal lags")
@@ -56,7 +56,7 @@ class Solution:
 
     :param gain: K > 0 [y/u].
     :param constants: tau, or tau1 and tau2 [s].
-    :param others: further constants that the same numbers allow [s].
+    :param others: the constants of other solutions [s].
     """
 
     gain: float
@@ -76,7 +76,7 @@ class Solution:
 
 
 def constants_text(constants: tuple[float, ...]) -> str:
-    """Return time constants for people."""
+    """Return time constants as text."""
     if len(constants) == 1:
         return f"tau = {constants[0]:.4g} s"
     return ", ".join(f"tau{i} = {c:.4g} s" for i, c in enumerate(constants, 1))
@@ -85,7 +85,7 @@ def constants_text(constants: tuple[float, ...]) -> str:
 def model_asked_for(method: str, known: Known) -> Structure | None:
     """Return the model that is known, or None where the choice is the method's.
 
-    :param method: on whose behalf, for the message.
+    :param method: its name, for the message.
     :param known: a known structure, a known order.
     :raises IdentificationError: if the method has no such model.
     """

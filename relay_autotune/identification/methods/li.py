@@ -3,12 +3,10 @@
 
 """The method `li`: gain, lags and dead time from several relay tests (Li et al. 1991).
 
-Gain, lags and dead time from two relay tests, one with a dead time added to the relay.
-
 Li, Eskinat and Luyben, "An Improved Autotune Identification Method", Ind. Eng. Chem. Res. 1991.
-Where the gain of the process is not known, one test leaves one number too many. A second test
-with a known dead time Delta added to the relay oscillates more slowly and gives a second point:
-by the describing function
+Where the gain of the process is not known, one test leaves one number open. A second test with a
+known dead time Delta added to the relay oscillates more slowly and gives a second point: by the
+describing function
 
     G(j w) = -(pi a/4 h) exp(j (w Delta + asin(epsilon/a))),   w = 2 pi/P,
 
@@ -218,7 +216,7 @@ AGREEMENT = 2.0
 
 
 def require_difference(tests: Sequence[SymmetricCycle]) -> None:
-    """Refuse tests of which the second tells nothing new.
+    """Refuse tests that do not differ in the dead time added to the relay.
 
     :raises IdentificationError: if there are fewer than two, or all have the same dead time
         added.
@@ -259,7 +257,7 @@ def _exact_residuals(
         rise = (excess(test.period * (1 + step)) - excess(test.period * (1 - step))) / (2 * step)
         missed = excess(test.period) / max(rise, 1e-9)
         found.append(min(max(missed / period_error, -_PENALTY), _PENALTY))
-        # The response of extremely long lags is lost in rounding.
+        # The response of extremely long lags is below rounding.
         amplitude = max(gain * test.relay * peak(lags, test.period), _TINY * test.amplitude)
         found.append(math.log(amplitude / test.amplitude) / amplitude_error)
     return np.array(found)
@@ -320,8 +318,8 @@ def _starts(
 
 METHOD = "li"
 
-# Averages over cycles are hardly better than this, whatever their scatter: a sampled relay's
-# limit cycle is not quite that of an ideal one.
+# Least relative errors of averages over cycles, whatever their scatter: a sampled relay's limit
+# cycle is not quite that of an ideal one.
 _LEAST_PERIOD_ERROR = 2e-4
 _LEAST_AMPLITUDE_ERROR = 1e-3
 _SHARE_OF_INTERVAL = 0.3
@@ -430,14 +428,14 @@ def _errors(test: RelayTest) -> tuple[float, float]:
 
 
 def _covariance(fit: JointFit) -> FloatArray:
-    """Covariance of the values; what was not fitted has none."""
+    """Return the covariance of the values; zero for those that were not fitted."""
     size = np.linalg.norm(fit.jacobian, axis=0)
     fitted = size > 0.0
     scaled = fit.jacobian[:, fitted] / size[fitted]
     covariance = np.zeros((size.size, size.size))
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True)
     covariance[np.ix_(fitted, fitted)] = inverse / np.outer(size[fitted], size[fitted])
-    # Errors that were assumed too small show in the misfit.
+    # A misfit above 1 shows that the assumed errors were too small.
     return covariance * max(fit.misfit, 1.0) ** 2
 
 
@@ -452,7 +450,7 @@ def _warnings(tests: Sequence[RelayTest]) -> list[str]:
 def _remarks(
     model: Structure, cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit
 ) -> list[str]:
-    """Say how well the tests agree, and what the paper's describing function gives."""
+    """Return how well the tests agree, and what the paper's describing function gives."""
     found = []
     if not math.isnan(known.gain):
         found.append("the gain given was not used: li finds it from the tests")

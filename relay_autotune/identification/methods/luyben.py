@@ -4,10 +4,8 @@
 """The method `luyben_step`: an integrating process with inverse response, from a step test.
 
 Dead time, extremum and return are read off a smooth curve: the baseline, and from the end of the
-dead time on a polynomial that leaves it. The dead time is where the two fit best; how many powers
-the noise allows is decided by Akaike's information criterion.
-
-Integrating processes with inverse response, from three numbers of a step response.
+dead time on a polynomial that leaves it. The dead time is where the two fit best; Akaike's
+information criterion decides the number of powers.
 
 Luyben, "Identification and Tuning of Integrating Processes with Deadtime and Inverse Response",
 Ind. Eng. Chem. Res. 2003. The process is K (1 - tau1 s) exp(-D s)/(s (tau2 s + 1)). All times here
@@ -15,7 +13,7 @@ count from the end of the dead time; y is the deviation from before the step of 
 
 The paper solves its eqs 4 to 6 by iteration in three unknowns, with a program whose third equation
 has a divisor tau2 too many (its printed example follows from that). With
-r = (tau1 + tau2)/tau2 and z = t2/tau2 they are in closed form but for one monotone equation:
+r = (tau1 + tau2)/tau2 and z = t2/tau2 only one monotone equation has to be solved:
 
     t1 = tau2 ln r,   r = z/(1 - exp(-z)),   t2/t1 = z/ln r,   y_ext = du K (t1 - tau1).
 """
@@ -315,7 +313,7 @@ def _return_time(test: StepTest, noise_known: float) -> float:
 
 
 def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, FloatArray | None]:
-    """Return the smooth curve; and the covariance of dead time, coefficients and baseline."""
+    """Return the smooth curve, and the covariance of dead time, coefficients and baseline."""
     end = test.begin + _BEYOND * until
     part = test.time <= end
     stride = max(1, int(np.count_nonzero(part)) // _MOST_POINTS)
@@ -344,7 +342,7 @@ def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, Floa
             def left(place: float, powers: int = powers) -> float:
                 return solved(place, powers)[0]
 
-            # With few powers the end of the dead time is sought everywhere, then near there.
+            # With few powers the end of the dead time is searched for everywhere, then near it.
             if powers <= _SEARCHED:
                 dead_time = float(places[np.argmin([left(p) for p in places])])
             dead_time = _refined(left, dead_time, places)
@@ -360,7 +358,7 @@ def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, Floa
             f"the inverse response holds {n} samples, too few to read it: sample faster"
         )
     _, dead_time, powers = best
-    # One power more than fits best: the intervals tell of noise, not of what powers leave out.
+    # One power more than fits best, so that the intervals hold the noise and no missing power.
     powers = min(powers + 1, _MOST_POWERS)
     if math.isnan(known):
         dead_time = _refined(lambda p: solved(p, powers)[0], dead_time, places)
@@ -393,7 +391,7 @@ def _averaged(
 
 
 def _refined(left: Callable[[float], float], near: float, places: FloatArray) -> float:
-    """Return the dead time that leaves the least, between the two places about one."""
+    """Return the dead time of the least sum of squares, between the two places about one."""
     i = int(np.argmin(np.abs(places - near)))
     bounds = (float(places[max(i - 1, 0)]), float(places[min(i + 1, places.size - 1)]))
     options = {"xatol": 1e-9 * float(places[-1])}
@@ -444,7 +442,7 @@ def _jacobian(curve: StepCurve, step: float) -> FloatArray:
 
     def values(x: FloatArray) -> FloatArray:
         dead_time = float(x[0])
-        # Moved by its coefficients alone, the curve reaches as far as it does.
+        # A derivative by a coefficient keeps the span; one by the dead time keeps the end.
         span = curve.span if dead_time == curve.dead_time else end - dead_time
         return _values(StepCurve(dead_time, span, x[1:]), step)
 

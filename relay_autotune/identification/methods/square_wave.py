@@ -3,14 +3,13 @@
 
 r"""Steady oscillation of real lags driven by a symmetric square wave, in closed form.
 
-All is for unit static gain and unit height of the square wave, so that y here is y/(K h). With T
-half a period, x = T/tau and m the part of a half period since the square wave went up, one lag is
-at
+Static gain and height of the square wave are 1, so that y here is y/(K h). With T half a period,
+x = T/tau and m the part of a half period since the square wave went up, the output of one lag is
 
-    f(m, x) = 1 - 2 exp(-m x)/(1 + exp(-x)),
+    f(m, x) = 1 - 2 exp(-m x)/(1 + exp(-x)).
 
-and lags x_1 ... x_n in a row at the value at 0 of the polynomial that runs through the points
-(x_i, f(m, x_i)): Newton's form of it is what partial fractions give (Chang, Shen and Yu 1992,
+That of lags x_1 ... x_n in a row is the value at 0 of the polynomial through the points
+(x_i, f(m, x_i)). Newton's form of it equals the partial fractions (Chang, Shen and Yu 1992,
 appendix), but stays accurate where lags are equal or nearly so. For n equal lags it is
 
     F_n = sum over k < n of (-x)^k/k! d^k f/dx^k.
@@ -74,7 +73,7 @@ def peak_part(time_constants: Sequence[float], period: float) -> float:
     :param period: P [s].
     """
     x = _ratios(time_constants, period)
-    # Beyond this every trace of the half period before has died away, below rounding.
+    # Beyond this the effect of the half period before is below rounding.
     if len(x) == 1 or min(x) > 50.0 + 5.0 * len(x):
         return 0.0
     # The amplitude there is flat, so that this accuracy gives it to the last digit.
@@ -164,7 +163,7 @@ def _differences(m: float, x: tuple[float, ...]) -> list[float]:
 def _taylor(m: float, x: float, count: int) -> list[float]:
     """First coefficients of f(m, x + d) in powers of d, from the quotient of two series."""
     e = math.exp(-x)
-    # Written so that nothing cancels where x is small.
+    # In a form without cancellation where x is small.
     found = [(math.expm1(-x) - 2.0 * math.expm1(-m * x)) / (1.0 + e)]
     if count == 1:
         return found

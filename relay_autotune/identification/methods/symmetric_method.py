@@ -3,9 +3,9 @@
 
 """What the methods for an unbiased relay have in common: choice of a model, uncertainty, remarks.
 
-Of models 1 to 3 period and amplitude give a time constant each, if the gain is known; how much
-the two differ tells whether the structure is right. Generally, the simplest model that fits is
-used (Luyben 1987, Chang, Shen and Yu 1992).
+If the gain is known, period and amplitude each give a time constant of models 1 to 3; their
+difference shows whether the structure is right. The simplest model that fits is used (Luyben 1987,
+Chang, Shen and Yu 1992).
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ FloatArray = NDArray[np.float64]
 
 MOST_EQUAL = 20
 
-# A structure is as good as another whose half cycles are nearer by up to this factor; less
-# than a share of the amplitude is what sampling makes of any.
+# Ratio of two misfits of the half cycles up to which structures are equally good, and the misfit
+# that sampling causes, as a share of the amplitude.
 _ALIKE = 1.02
 _ALIKE_SHARE = 3e-3
 _SHAPE_SAMPLES = 300
@@ -65,14 +65,14 @@ _SMALL = 0.1
 
 @dataclass(frozen=True)
 class SymmetricMethod:
-    """A method that makes one of models 1 to 5 of a symmetric limit cycle.
+    """A method that finds one of models 1 to 5 from a symmetric limit cycle.
 
     :param name: its name in the registry.
     :param solve: from model, limit cycle and gain (> 0; NaN: not known) to the numbers.
     :param mismatch: from order, limit cycle and gain to log(tau by the period/tau by the
         amplitude) of equal lags. Zero: the structure fits. Positive: the process has more lag;
         infinite: no time constant gives the period. Negative: it has less lag.
-    :param agreement: how large a mismatch counts as none where nothing else is known of it.
+    :param agreement: largest mismatch that counts as zero where its scatter is not known.
     :param remarks: from model, limit cycle and gain to sentences for the user.
     """
 
@@ -85,7 +85,7 @@ class SymmetricMethod:
 
 @dataclass(frozen=True)
 class Found:
-    """An identification with what it was made from.
+    """An identification with the limit cycle that it was found from.
 
     :param identification: the model.
     :param model: its structure.
@@ -156,7 +156,7 @@ def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
 
 
 def _covariance_of(values_at: Callable[[float], FloatArray], dead_time: DeadTime) -> FloatArray:
-    """Return what the uncertainty of a dead time that was read adds to that of the values.
+    """Return the covariance that the uncertainty of a dead time that was read adds.
 
     :param values_at: from a dead time [s] to the values.
     :param dead_time: as it was read.
@@ -167,7 +167,7 @@ def _covariance_of(values_at: Callable[[float], FloatArray], dead_time: DeadTime
         try:
             ends.append((delay, values_at(delay)))
         except IdentificationError:
-            # At the end of where there is a solution one side tells as much.
+            # At the end of the range of solutions a difference to one side is enough.
             ends.append((dead_time.value, values_at(dead_time.value)))
     (low, below), (high, above) = ends
     if not high > low:
@@ -212,7 +212,7 @@ def choose(
     :param method: whose mismatch counts.
     :param cycle: the limit cycle.
     :param gain: K > 0 [y/u].
-    :param tolerance: from the order of equal lags to the mismatch that still counts as none;
+    :param tolerance: from the order of equal lags to the largest mismatch that counts as zero;
         default: the method's agreement.
     :return: the model, and a sentence where none fits well, else an empty one.
     """
@@ -284,7 +284,7 @@ def _choose_without_gain(
 ) -> tuple[Structure, str]:
     """Choose among equal lags by the shape of the half cycles.
 
-    Period and amplitude are then used up by gain and time constant.
+    Period and amplitude only give gain and time constant then.
 
     :param whole: the cycles; None: nothing is known of their shape.
     """
@@ -304,7 +304,7 @@ def _choose_without_gain(
             misfit = shape_misfit(whole, equal_lags(order), cycle, solved[order])
             away[order] = misfit / cycle.amplitude
     if not solved:
-        # The refusal of the simplest model says what is wrong.
+        # The error of the simplest model says what is wrong.
         method.solve(MODEL_1, cycle, math.nan)
     order = min(n for n in solved if alike(away[n], min(away.values())))
     why = "its simplicity" if whole is None else "the shape of its half cycles"
@@ -378,7 +378,7 @@ def _mismatch_text(model: Structure, difference: float) -> str:
 def _by_shape(
     whole: CycleRun, model: Structure, cycle: SymmetricCycle, solution: Solution
 ) -> Solution:
-    """Put the one of several solutions first whose half cycles are most like the record's."""
+    """Put the solution first whose half cycles are most like the record's."""
     if not solution.others:
         return solution
 
@@ -390,7 +390,7 @@ def _by_shape(
 
 
 def _alike(solution: Solution, reference: Solution) -> Solution:
-    """Of several solutions, return the one nearest to another."""
+    """Return the one of several solutions that is nearest to another."""
 
     def away(constants: tuple[float, ...]) -> float:
         pairs = zip(constants, reference.constants, strict=True)

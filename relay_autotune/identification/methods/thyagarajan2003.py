@@ -7,10 +7,10 @@ Thyagarajan and Yu, "Improved Autotuning Using the Shape Factor from Relay Feedb
 Chem. Res. 2003. t = 0 is where y rises through the level at which the relay switches; P is the
 period, a the amplitude, h that of the relay.
 
-Each set of equations is here twice. Literally: for an ideal relay that switches at zero, of which
-eqs 21 to 24, 26 and 27 use the first harmonic alone. And exactly: for a relay that switches at the
-level epsilon, with all harmonics. Corrected are eq 17, where the bracket divides, and eq 23, which
-the paper solved with 22/7 for pi.
+Each set of equations is here twice. The literal one is for an ideal relay that switches at zero;
+its eqs 21 to 24, 26 and 27 use the first harmonic alone. The exact one is for a relay that
+switches at the level epsilon, with all harmonics. Corrected are eq 17, where the bracket divides,
+and eq 23, which the paper solved with 22/7 for pi.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def first_half(
     relay: float,
     level: float = 0.0,
 ) -> FloatArray:
-    """Return y from one switch to the next (eqs 8 and 9; 14 and 15 of an unstable process).
+    """Return y from one switch to the next (eqs 8 and 9; 14 and 15 for an unstable process).
 
     With K h = g, y = g - (g - epsilon) exp(-t/tau) until the dead time has passed, and falls
     towards -g from there. An unstable process is the same with negative K and tau.
@@ -321,8 +321,8 @@ def equal_lags(
     :param amplitude: a [y].
     :param relay: h [u].
     :param level: epsilon [y].
-    :param ratio: what D has in proportion to tau, and
-    :param dead_time: what it has beside that [s].
+    :param ratio: of D = ratio tau + dead_time.
+    :param dead_time: of the same sum [s].
     :raises IdentificationError: if no such process has this limit cycle.
     """
     share = level / amplitude

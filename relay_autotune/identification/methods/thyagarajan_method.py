@@ -4,7 +4,7 @@
 """The method `thyagarajan`: the structure by the shape of the limit cycle, then its parameters.
 
 Thyagarajan and Yu 2003. The exact equations are used, with the level at which the relay was seen
-to switch; what the paper's own give is said in a warning.
+to switch; a warning tells what the paper's own equations give.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _OTHER_RATIO = 0.01
 class Solver:
     """One structure with its equations, for a relay of amplitude 1 that turns a process upwards.
 
-    :param name: the structure, for people.
+    :param name: the structure, as text.
     :param equations: their numbers in the paper.
     :param structure: of the model.
     :param exact: from shape to values, shape (p,).
@@ -76,11 +76,11 @@ class Solver:
 
 @dataclass(frozen=True)
 class _TiedLags(Structure):
-    """Equal lags whose dead time is known, or follows from the lag: it is no parameter.
+    """Equal lags whose dead time is known, or follows from the lag: it is not a parameter.
 
     :param given: dead time [s]; NaN: it follows from the lag.
     :param ratio: dead time over time constant.
-    :param extra: dead time of the relay, which is in the others [s].
+    :param extra: dead time of the relay, which the two others include [s].
     """
 
     given: float = math.nan
@@ -140,7 +140,7 @@ def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str)
     :param shape: NaN where a number is not known.
     :param relay: amplitude of the relay, negative for a reverse-acting process [u].
     :param known: as for :func:`identify_thyagarajan`.
-    :param categorised: category to be taken where no structure is known.
+    :param categorised: category that is taken where no structure is known.
     :raises IdentificationError: if no such model has the limit cycle.
     """
     reading = Reading(shape, (), None, 1)
@@ -149,7 +149,7 @@ def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str)
 
 
 def choose(reading: Reading, known: Known, categorised: str = "") -> tuple[Solver, str]:
-    """Choose the structure, and say why.
+    """Choose the structure, and return it with the reason.
 
     :param reading: the shape.
     :param known: what is known, with the dead time as the relay saw it.
@@ -329,7 +329,6 @@ def _identified(
 def _jacobian(solve: Callable[[Shape], FloatArray], reading: Reading) -> FloatArray | None:
     """Return the derivatives of the values by the shape; None where one has no solution."""
     shape, names = reading.shape, reading.names
-    # The others are times.
     size = [shape.amplitude if n in ("amplitude", "level") else shape.half_period for n in names]
     spread = np.array([reading.std(name) for name in names])
     at = np.array([getattr(shape, name) for name in names])
@@ -349,7 +348,7 @@ def _literal(
     scaled: Callable[[FloatArray], FloatArray],
     found: Identification,
 ) -> list[str]:
-    """Say what the paper's equations give, where that differs."""
+    """Return what the paper's equations give, where that differs."""
     begin = f"as in the paper, for an ideal relay, {solver.equations} "
     if solver.equations not in ("eqs 10 and 11", "eqs 16 and 17"):
         begin = f"as in the paper, by the first harmonic, {solver.equations} "
@@ -369,7 +368,7 @@ def _literal(
 
 
 def _sensitive(solver: Solver, shape: Shape) -> list[str]:
-    """Say how much hangs on the dead time that two lags are assumed to have."""
+    """Return how much K_u depends on the dead time that two lags are assumed to have."""
     if solver.name != "2 equal lags":
         return []
     points = []
@@ -392,7 +391,7 @@ def _sensitive(solver: Solver, shape: Shape) -> list[str]:
 
 
 def refinements(shape: Shape, record: Record) -> list[str]:
-    """Report what eqs 25 and 28 would say; nothing is chosen by them.
+    """Return what eqs 25 and 28 would give; nothing is chosen by them.
 
     :param shape: of the record.
     :param record: the relay test, from its start.

@@ -3,15 +3,13 @@
 
 """The methods `wang_biased` and `wang_unbiased`: FOPDT models from one relay test.
 
-Wang, Hang and Zou 1997. Peaks and fundamental are those of the averaged period, whose peaks noise
-does not raise; the levels at which the relay was seen to switch take the place of its hysteresis.
+Wang, Hang and Zou, "Low-Order Modeling from Relay Feedback", Ind. Eng. Chem. Res. 1997. The
+equations are exact for FOPDT. T_u1 is the duration of u = mu0 + mu, T_u2 of u = mu0 - mu. Two
+equations are corrected: eq 10 has T_u2 where T_u1 is printed, and the first logarithm of eq 22 has
+``mu K - A`` where ``mu K + A`` is printed.
 
-FOPDT models from one biased or unbiased relay test, exact for FOPDT.
-
-Wang, Hang and Zou, "Low-Order Modeling from Relay Feedback", Ind. Eng. Chem. Res. 1997.
-T_u1 is the duration of u = mu0 + mu, T_u2 of u = mu0 - mu. Two equations are used as corrected:
-eq 10 has T_u2 where T_u1 is printed, and the first logarithm of eq 22 has ``mu K - A`` where
-``mu K + A`` is printed.
+Peaks and fundamental are those of the averaged period, whose peaks noise does not raise; the
+levels at which the relay was seen to switch take the place of its hysteresis.
 """
 
 from __future__ import annotations
@@ -191,7 +189,7 @@ def _log_ratio(numerator: float, denominator: float, where: str) -> float:
 
 _LEAST_CYCLES = 3
 _MOST_PARTS = 20
-# Standard deviations above an integrator's ratio from which a ratio is not one of noise.
+# Standard deviations above an integrator's ratio beyond which noise does not explain a ratio.
 _CERTAIN = 3.0
 _LIKE_AN_INTEGRATOR = (
     "the peaks are those of an integrator's limit cycle, or noise lets them look so: gain and "
@@ -202,13 +200,13 @@ _LIKE_AN_INTEGRATOR = (
 
 @dataclass(frozen=True)
 class _Facts:
-    """What is the same for all cycles.
+    """The facts that are the same for all cycles.
 
     :param sign: +1, or -1 for a reverse-acting relay.
     :param gain: K [y/u], with its sign; NaN: to be found.
     :param rest: measurement at rest [y].
     :param ratio: amplitude of the measurement over that of the relay times the response at the
-        fundamental; NaN: as it is in the cycles.
+        fundamental; NaN: that of the cycles.
     """
 
     sign: int
@@ -221,8 +219,8 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a FOPDT model from a biased relay test (eqs 6 to 11).
 
     Deviations are taken from the measured steady state; where the set-point lies elsewhere, the
-    bias about it is ``mu0 - (setpoint - rest)/K``. What is not certain of the steady state is not
-    certain of the gain either.
+    bias about it is ``mu0 - (setpoint - rest)/K``. The uncertainty of the steady state is part of
+    that of the gain.
 
     :param record: a relay test with a bias.
     :param known: a known gain takes the place of eq 6.
@@ -255,10 +253,9 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
 def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a FOPDT model from an unbiased relay test (eqs 21 to 25).
 
-    Gain and time constant come of what the amplitude is above that of the fundamental, which is
-    at most that of an integrator. With a short dead time it is hardly less, and noise may put it
-    above: then the value that is expected of it below that limit takes its place, and what that
-    leaves open is told as uncertain.
+    Gain and time constant come from the ratio of the amplitude to that of the fundamental, which
+    is at most that of an integrator. With a short dead time it is hardly less, and noise may put
+    it above. Then its expected value below that limit takes its place, with its uncertainty.
 
     :param record: a relay test without bias.
     :param known: a known gain takes the place of eqs 23 to 25.
@@ -296,11 +293,11 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
 
 
 def _likely_ratio(test: RelayTest, record: Record) -> tuple[float, float] | None:
-    """Return what is expected of the ratio below that of an integrator, and how far it scatters.
+    """Return expectation and scatter of the ratio, given that it is below an integrator's.
 
     :param test: the relay test.
     :param record: the record.
-    :return: None where the cycles are too few to tell, or the ratio is above by far.
+    :return: None where the cycles are too few, or the ratio is far above.
     """
     cycles = test.whole.cycle.cycles
     if len(cycles) < _LEAST_CYCLES:
@@ -325,7 +322,7 @@ def _ratio(seen: Fold) -> float:
 
 
 def _without_each(record: Record, cycles: tuple[int, ...]) -> Iterator[Fold]:
-    """Yield the averages without one cycle after the other, of some where they are many."""
+    """Yield the averages that leave out one cycle each; of many cycles, not every one."""
     for left_out in cycles[:: -(-len(cycles) // _MOST_PARTS)]:
         yield fold_without(record, cycles, left_out)
 
@@ -372,9 +369,9 @@ def _identified(
     uncertain: tuple[_Facts, ...],
     remark: str,
 ) -> Identification:
-    """Measure on the averaged period; what leaving out each cycle changes is the uncertainty.
+    """Measure on the averaged period, with the uncertainty by leaving out each cycle.
 
-    :param uncertain: the facts, each with one of them off by its standard deviation.
+    :param uncertain: facts of which one each is off by its standard deviation.
     :param remark: for the user; may be empty.
     """
     settings = test.whole.settings
@@ -383,7 +380,7 @@ def _identified(
 
     def values(seen: Fold, known: _Facts) -> FloatArray:
         found = measure(seen, known)
-        # What the relay added to the dead time is no part of the process.
+        # The dead time that the relay added is not the process's.
         found[2] = max(found[2] - settings.extra_delay, 0.0)
         return found
 
@@ -425,7 +422,7 @@ def _jackknife(
         try:
             parts.append(measure(part))
         except IdentificationError:
-            # Without that cycle the numbers are no limit cycle; the others tell the scatter.
+            # Without that cycle the numbers are no limit cycle; the others show the scatter.
             continue
     if len(parts) < (_LEAST_CYCLES if partly else tried):
         return None
@@ -436,7 +433,7 @@ def _jackknife(
 def _by(
     measure: Callable[[_Facts], FloatArray], uncertain: _Facts, best: FloatArray
 ) -> FloatArray:
-    """Return the covariance that one uncertain fact makes."""
+    """Return the covariance that one uncertain fact causes."""
     if math.isnan(uncertain.ratio) and not math.isfinite(uncertain.gain + uncertain.rest):
         return np.full((best.size, best.size), math.nan)
     try:
