@@ -31,7 +31,7 @@ def document(
     """Return the document of one recording.
 
     :param bag: the recording, as it was given.
-    :param analyses: what was made of its experiments.
+    :param analyses: of its experiments.
     :param error: why the recording could not be read.
     """
     found: dict[str, Any] = {"bag": bag, "experiments": [_experiment(a) for a in analyses]}
@@ -76,7 +76,7 @@ def judgement_fields(judgement: Judgement) -> dict[str, Any]:
 
 
 def judgement_of_fields(e: dict[str, Any]) -> Judgement:
-    """Return what a document says of an experiment; one without a verdict was not judged."""
+    """Return the judgement in a document's experiment; without a verdict it was not judged."""
     verdict = verdict_named(str(e.get("verdict", "unknown")))
     if verdict is Verdict.UNKNOWN:
         return NOT_JUDGED
@@ -87,7 +87,7 @@ def judgement_of_fields(e: dict[str, Any]) -> Judgement:
 
 
 def _reason(analysis: Analysis) -> str:
-    """Return why the experiment ended as it did; if it ended well, why nothing came of it."""
+    """Return why the experiment ended as it did; if it ended well, why it has no result."""
     record = analysis.record
     if record.outcome in (Outcome.ABORTED, Outcome.FAILED):
         return record.reason or analysis.reason

@@ -1,12 +1,11 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-r"""What an experiment lets one expect of a model and of gains that are said to be of it.
+r"""Checks of a model and of gains against the experiment that they are said to be of.
 
-Anybody who may publish on a topic may say what a process is and how to control it. The record says
-how large the process's answer was at the frequency of its oscillation, and in which direction: a
-model that contradicts it, or gains whose loop could not be at that frequency, are of another
-process, or of nobody's fit.
+Anybody who may publish on a topic can publish a model or gains. The record shows the response of
+the process at the frequency of its oscillation, and its direction. A model that contradicts it,
+and gains that do not go with that frequency, are refused.
 """
 
 from __future__ import annotations
@@ -22,18 +21,18 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
 
-# A model of the same process is nearer than this factor, and turned by less [rad].
+# Largest ratio of the responses of model and record, and largest difference of phase [rad].
 _FACTOR = 10.0
 _TURN = 2.0
-# Where there is no whole cycle, peak to peak tells the size, which is less sure.
+# Largest ratio where the response is known by peak to peak alone, for lack of a whole cycle.
 _ROUGH_FACTOR = 30.0
-# The loop's gain at the frequency of the oscillation, with any gains that are worth applying.
+# Least and largest gain of the loop at the frequency of the oscillation.
 _LEAST_LOOP, _LARGEST_LOOP = 1e-3, 10.0
-# Times of a controller, over the period of the oscillation.
+# Least and largest time of a controller, in periods of the oscillation.
 _LEAST_TIME, _LARGEST_TIME = 1e-3, 1e4
-# No structure that is fitted has more poles.
+# Largest number of poles: no structure that is fitted has more.
 _LARGEST_ORDER = 30
-# A relay commands a few levels; a controller that it moves by its set-point commands many.
+# Largest number of levels of a relay's command; a controller whose set-point it moves has more.
 _LEVELS = 8
 
 
@@ -42,12 +41,12 @@ class ExperimentFacts:
     """What is known of one experiment.
 
     :param experiment_id: its id.
-    :param outcome: how it ended; UNKNOWN: it still runs, or nobody says.
+    :param outcome: how it ended; UNKNOWN: it still runs, or it is not known.
     :param duration: of the record [s].
     :param frequency: of the oscillation [rad/s]; NaN: the record has none.
     :param answer: G at that frequency [y/u], where ``whole``; else its magnitude alone.
     :param whole: True if there is a whole cycle.
-    :param sign: sign that the relay took the process's gain to have; 0: not known.
+    :param sign: sign of the process's gain that the relay assumed; 0: not known.
     """
 
     experiment_id: str
@@ -60,7 +59,7 @@ class ExperimentFacts:
 
     @classmethod
     def of(cls, record: Record) -> ExperimentFacts:
-        """Return what a record tells.
+        """Return the facts of a record.
 
         :param record: of the experiment.
         """
@@ -126,7 +125,7 @@ class ExperimentFacts:
             said = complex(model(1j * self.frequency))
         ratio = said / self.answer if self.whole else abs(said) / abs(self.answer)
         factor = _FACTOR if self.whole else _ROUGH_FACTOR
-        # Not a number is no answer, either.
+        # A ratio that is not a number is refused, too.
         if not 1.0 / factor <= abs(ratio) <= factor:
             raise ModelError(
                 f"the model answers with {abs(said):.3g} y/u at {self.frequency:.3g} rad/s, where "
@@ -181,8 +180,8 @@ class ExperimentFacts:
 def _fundamental(record: Record) -> tuple[float, complex]:
     """Return the frequency of the oscillation, and measurement over command there; NaN: none.
 
-    The first half of the cycles may still be settling. Rectangles are good enough to tell a model
-    of the process from one of another, and this needs to load no method.
+    The first half of the cycles may still be settling. Sums of rectangles are accurate enough
+    here, and need no method to be loaded.
     """
     starts = record.cycle_start[len(record.cycle_start) // 2 - 1 :]
     if len(record.cycle_start) < 2 or not record.time[starts[-1]] > record.time[starts[0]]:
@@ -203,9 +202,9 @@ def _fundamental(record: Record) -> tuple[float, complex]:
 def check_finding(
     found: FitProgress, *, sign: int, amplitude: float = math.nan, relay: float = math.nan
 ) -> None:
-    """Refuse what cannot be true of a running experiment.
+    """Refuse a finding that contradicts a running experiment.
 
-    :param found: said of it.
+    :param found: the finding.
     :param sign: that of the process; 0: not known.
     :param amplitude: half of peak to peak of its last cycle [y]; NaN: there is none.
     :param relay: half the distance of its levels [u]; NaN: not known.

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.quantities import Told, told_fields
 
-# How far a number that follows from others may be from what they make it, by rounding.
+# Largest relative difference, by rounding, of a number from the one that follows from others.
 _SAME = 1e-9
 
 
@@ -50,7 +50,7 @@ def _part_of(kind: Any) -> tuple[Any, bool]:
 
 @dataclass(frozen=True)
 class Special:
-    """How a class is written and read that does it otherwise than by its fields.
+    """How a class is written and read, if not by its fields.
 
     :param to_document: its fields in documents; those of the result that holds it lie beside
         them.
@@ -69,7 +69,7 @@ _SPECIAL: dict[type, Special] = {}
 
 
 def register(kind: type, special: Special) -> None:
-    """Say how a class is written and read.
+    """Register how a class is written and read.
 
     :param kind: the class.
     :param special: the functions that do it.
@@ -184,7 +184,7 @@ def _plain(value: Any) -> Any:
 
 
 def json_number(value: Any) -> Any:
-    """Return what JSON has for a number: null for none, [re, im] for a complex one."""
+    """Return a number as JSON has it: null if not finite, [re, im] for a complex one."""
     if isinstance(value, bool | int):
         return value
     told = complex(value)
@@ -257,7 +257,7 @@ def to_message(message: Any, value: object, prefix: str = "") -> None:
 
 
 def _parts(each: Told, prefix: str) -> tuple[tuple[str, str], ...]:
-    """Return the names in messages of what makes up a field, each with the attribute it is."""
+    """Return the names in messages of a field's parts, each with the attribute that it holds."""
     if each.kind is complex:
         return (f"{prefix}real", "real"), (f"{prefix}imaginary", "imag")
     return ((each.message or prefix + each.name, ""),)
@@ -282,8 +282,7 @@ def of_message(
     :param of: what the fields belong to, as in "of the model".
     :param prefix: of the names of its fields.
     :raises RelayAutotuneError: of that kind, if a number is outside of its declared range, arrays
-        that go together differ in length, or a number is another one than those that it follows
-        from make it.
+        that go together differ in length, or a derived number contradicts the others.
     """
     special = _SPECIAL.get(kind)
     if special is not None and special.of_message is not None:
@@ -360,7 +359,7 @@ def _check_derived(
     kind: Any = type(value)
     derived = [f for f in told_fields(kind) if f.derived]
     said = {f.name: float(getattr(message, prefix + f.name)) for f in derived}
-    # Who writes a message by hand may leave out what follows from the rest.
+    # A message that is written by hand may leave out the derived numbers.
     for name in said if any(said.values()) else ():
         follows = getattr(value, name)
         if not abs(said[name] - follows) <= _SAME * abs(follows):

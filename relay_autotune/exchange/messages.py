@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Between the core's dataclasses and the messages of `relay_autotune_msgs`.
+"""Conversions between the core's dataclasses and the messages of `relay_autotune_msgs`.
 
 Nothing here imports ROS: every function takes any object with the fields of the message, an
 rclpy message or one decoded from a bag, so a live node and a replay read a record alike.
@@ -83,9 +83,9 @@ def fill_settings(message: Any, settings: RelaySettings | None) -> None:
 
 
 def settings_from_message(message: Any) -> RelaySettings | None:
-    """Read a `RelaySettings` message; None if its amplitude says that no relay acted.
+    """Read a `RelaySettings` message; None if its amplitude is 0, since no relay acted.
 
-    :raises RecordError: if a number cannot be.
+    :raises RecordError: if a number is out of range.
     """
     if float(message.amplitude) == 0.0:
         return None
@@ -170,7 +170,7 @@ def fill_cycle(
     :param measurement: the samples [y], shape (n,).
     :param command: the answers [u], shape (n,).
     :param lead_in: number of samples before the cycle. The first cycle carries the settling and
-        the kick, so that who holds all cycles holds the experiment from its start at rest.
+        the kick, so that all cycles together hold the experiment from its start at rest.
     """
     first = float(time[0])
     set_stamp(message.header.stamp, start_ns + round(first * 1e9))
@@ -261,7 +261,7 @@ def fill_transfer_function(
     :param finding: of a running experiment, with the predicted Ms; None: it is not predicted.
     :param judgement: of the experiment; None: it was not judged.
     """
-    # A relay_node, which has no models, need not load what they need.
+    # Imported here, since a relay_node has no models.
     from relay_autotune.exchange import models  # noqa: F401  (it says how they are written)
 
     _fill_envelope(message, experiment_id, final, stamp_ns, judgement)
@@ -282,10 +282,10 @@ def _fill_envelope(
 
 
 def finding_from_message(message: Any) -> FitProgress:
-    """Read what a `TransferFunction` message says of a running experiment.
+    """Read the finding on a running experiment in a `TransferFunction` message.
 
     :param message: the message.
-    :raises ParameterError: if its numbers cannot be.
+    :raises ParameterError: if a number is out of range.
     """
     found: FitProgress = of_message(FitProgress, message, ParameterError, "of the experiment")
     return found
@@ -296,7 +296,7 @@ def identification_from_message(message: Any) -> Identification:
 
     :param message: the message, of rclpy or decoded from a bag.
     :raises ModelError: if its coefficients are no transfer function, its parameters make another
-        one, or the numbers that tell how sure it is cannot be.
+        one, or its uncertainty is out of range.
     """
     from relay_autotune.exchange import models  # noqa: F401  (it says how they are read)
     from relay_autotune.identification.result import Identification
@@ -309,8 +309,8 @@ def transfer_function_from_message(message: Any) -> TransferFunction:
     """Read the model in a `TransferFunction` message.
 
     :param message: the message, of rclpy or decoded from a bag.
-    :raises ModelError: if its coefficients are no transfer function, or the arrays that tell how
-        sure it is do not go with its parameters.
+    :raises ModelError: if its coefficients are no transfer function, or the arrays of its
+        uncertainty do not go with its parameters.
     """
     from relay_autotune.exchange.models import model_of_message
 
@@ -323,7 +323,7 @@ def gains_from_message(message: Any) -> Gains:
     """Read the gains in a `PidGains` message.
 
     :param message: the message, of rclpy or decoded from a bag.
-    :raises TuningError: if they cannot be, or its two forms contradict each other.
+    :raises TuningError: if a number is out of range, or its two forms contradict each other.
     """
     from relay_autotune.loop.gains import Gains
 
@@ -343,7 +343,7 @@ def fill_gains(
     """Write controller gains into a `PidGains` message.
 
     :param message: the message to fill.
-    :param gains: the gains with what they promise.
+    :param gains: the gains with their predicted performance.
     :param experiment_id: the id of the experiment they come from.
     :param final: True once the experiment has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
@@ -354,7 +354,7 @@ def fill_gains(
 
 
 def without_impossible(message: Any) -> list[str]:
-    """Empty the model and the gains of a result or feedback of `Tune` where they cannot be.
+    """Empty the model and the gains of a result or feedback of `Tune` if they are impossible.
 
     :param message: of the action; changed in place.
     :returns: a sentence for each part that was emptied.

@@ -28,11 +28,11 @@ from relay_autotune.identification.result import Rival
 from relay_autotune.process.structures import GENERAL, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
 
-# The roots of more take long, and no structure has as many.
+# Largest number of coefficients: no structure has more, and finding the roots would take long.
 _MOST_COEFFICIENTS = 50
-# How far the polynomials may be from what the parameters make them, by rounding.
+# Largest relative difference, by rounding, of the polynomials from those of the parameters.
 _SAME = 1e-6
-# What a model is in documents, and in the tables of many bags.
+# Fields of a model in the tables of many bags.
 COLUMNS = ("structure", "gain", "zeros", "time_constants", "dead_time")
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a notebook or an interpreter shows of an analysis that stands at the end of a cell."""
+"""An analysis as an interpreter or a notebook shows it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models and controllers as systems of python-control, for those who go on with it."""
+"""Models and controllers as systems of python-control."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from relay_autotune.loop.sampled import filter_matrices, require_period
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
-# A weight that is larger by less than this counts as the same.
+# Largest excess of a weight that counts as the same.
 _SAME_WEIGHT = 0.005
 
 
@@ -106,7 +106,7 @@ class Integral(enum.Enum):
 
 
 class Slope(enum.Enum):
-    """Of what a law takes the derivative."""
+    """The signal whose derivative a law takes."""
 
     MEASUREMENT = "the measurement"
     ERROR = "the error"
@@ -117,7 +117,7 @@ class Slope(enum.Enum):
 class Smoothing:
     """How a law smooths its derivative, or the whole measurement.
 
-    :param words: for people.
+    :param words: its description in the guide.
     :param setting: the time constant that it has, from the one that is wanted and the period [s].
     :param slope: the derivative of a signal, for its own time constant and the period.
     :param value: the filter on the measurement in the other parts; likewise.
@@ -151,7 +151,7 @@ def _first_order(tf: float, period: float) -> Rational:
 
 
 def averaged_over(tf: float, period: float) -> int:
-    """Return of how many differences the mean has the lag ``tf`` more than one difference.
+    """Return the number of differences whose mean lags ``tf`` more than one difference.
 
     :param tf: s.
     :param period: of the samples [s].
@@ -201,7 +201,7 @@ class Setting:
     """A parameter of the program that runs a law.
 
     :param name: its name there.
-    :param value: its value, or what it is from the gains and the period; a text stands as it is.
+    :param value: its value, or a function of the law with its gains; text is written as it is.
     """
 
     name: str
@@ -220,7 +220,7 @@ class Law:
     :param program: the program and the version whose source was read.
     :param equation: the difference equation.
     :param integral: when the error is added to the integral.
-    :param slope: of what the derivative is taken.
+    :param slope: the signal whose derivative is taken.
     :param smoothing: of the derivative, or of the measurement.
     :param limits: what happens at the limits of the command.
     :param settings: its parameters.
@@ -230,7 +230,7 @@ class Law:
     :param only_positive: True if it has no gains for a process of negative gain.
     :param needs_integral: True if it does not run without integral action.
     :param line: how a setting is written, with ``{name}`` and ``{value}``.
-    :param remark: what begins a line that the program does not read.
+    :param remark: beginning of a line that is a comment.
     """
 
     name: str
@@ -250,7 +250,7 @@ class Law:
     remark: str = "#"
 
     def best(self, wanted: Controller, period: float) -> Controller:
-        """Return the nearest controller that this law can be.
+        """Return the nearest controller that this law can run.
 
         :param wanted: the gains that are wanted.
         :param period: of the samples [s].
@@ -379,7 +379,7 @@ class RunningLaw:
 def _tracking(law: SampledLaw) -> float | None:
     """Return the time constant that control_toolbox would use for 0.
 
-    It is given, since its documentation has had two versions of it.
+    It is written out, since versions of its documentation differ.
     """
     gains = law.gains
     if gains.ti == 0.0:

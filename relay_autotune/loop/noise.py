@@ -52,8 +52,8 @@ def _outer(left: FloatArray, right: FloatArray) -> FloatArray:
 def open_noise_gain(td: FloatArray, tf: FloatArray, period: float) -> FloatArray:
     """Return the standard deviation of ``yf + td dyf/dt`` per that of white sampled noise.
 
-    Times kp it is the standard deviation of the command, without the integral part and without
-    feedback through the loop.
+    Multiplied by kc it is the standard deviation of the command, without the integral part and
+    without feedback through the loop.
 
     :param td: derivative times [s], shape (k,).
     :param tf: time constants of the filter [s], shape (k,).

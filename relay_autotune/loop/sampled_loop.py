@@ -39,9 +39,9 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _PER_DECADE = 60
 _MOST_TURNS = 800.0 * math.pi
-# The grid ends this part before half the sampling frequency.
+# Distance of the grid's end from half the sampling frequency, relative to it.
 _BEFORE_END = 1e-9
-# A step of the phase that is small enough to follow it, and how often cells are divided for it.
+# Largest step of the phase that can be followed, and largest number of divisions of a cell.
 _CLEAR, _MOST_DIVISIONS = 1.0, 40
 _ANGLES = 4096
 # Least and largest number of samples of a response.
@@ -201,7 +201,7 @@ class SampledLoop:
 
         They are inverted by a fast Fourier transform on a circle outside the unit circle.
 
-        :param samples: how many.
+        :param samples: number of samples.
         """
         growth = _DECAY / (2.0 * samples)
         z = np.exp(growth + 1j * np.arange(samples + 1) * (math.pi / samples))

@@ -12,10 +12,10 @@ zeros in the right half plane are those of the closed loop, and
 
 The turning of H is not read from a grid: the axis is divided until, on every piece, a bound on
 ``|H'|`` times the length of the piece is smaller than ``|H|`` at its beginning. So H cannot pass
-around the origin unseen. From the frequency on at which H can no longer be as far
-from its limit as zero is, it cannot turn any more. A loop of neutral type, whose L_k with dead
-time do not vanish at infinity, is stable only if their magnitudes there have a sum below that of
-the rest (Bellman and Cooke 1963).
+around the origin unseen. From the frequency on where H stays nearer to its limit than zero is, it
+cannot turn any more. A loop of neutral type, whose L_k with dead time do not vanish at infinity,
+is stable only if their magnitudes there have a sum below that of the rest (Bellman and Cooke
+1963).
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 
 r"""Exact steady oscillation of a model under a symmetric relay.
 
-Between two switches the state moves freely, but for the delayed step of the command that arrives
-a dead time D after the first of them. In the limit cycle of half period T each half mirrors the
-one before, x(T) = -x(0), which is one linear system for the state at the switch:
+Between two switches the state moves freely, except for the delayed step of the command that
+arrives a dead time D after the first of them. In the limit cycle of half period T each half
+mirrors the one before, x(T) = -x(0), which is one linear system for the state at the switch:
 
     (Phi(T) + 1) z_0 = 2 h Phi(T - D) b.
 

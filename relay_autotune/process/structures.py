@@ -242,7 +242,7 @@ class Structure:
     def holds(self, model: TransferFunction) -> bool:
         """Return whether a model is of this structure, by its poles and zeros.
 
-        :param model: any; lags of which some are equal are lags, unless all of them are.
+        :param model: any; lags of which only some are equal count as different ones.
         """
         lags, zeros = model.time_constants, model.zeros
         unstable = sum(f.unstable for f in self.factors)
@@ -337,7 +337,7 @@ class GivenModel(Structure):
         return self.model
 
     def values_of(self, model: TransferFunction) -> FloatArray:
-        """Return NaN for each value: only who identified the model knows them."""
+        """Return NaN for each value: they do not follow from the transfer function."""
         del model
         return np.full(len(self.given), math.nan)
 
@@ -386,7 +386,7 @@ def structure_named(name: str) -> Structure:
 
 
 def recognised(model: TransferFunction) -> TransferFunction:
-    """Return a model with the name of the first structure that it is of; as it is: of none.
+    """Return a model with the name of the first structure that it has; unchanged if of none.
 
     :param model: any.
     """

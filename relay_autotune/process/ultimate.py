@@ -76,7 +76,7 @@ def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
 
 
 def unstable_at_small_gain(model: TransferFunction) -> int:
-    """Return how many closed-loop poles lie in the right half plane as the gain leaves zero.
+    """Return the number of closed-loop poles in the right half plane as the gain leaves zero.
 
     :param model: the process.
     """

@@ -62,7 +62,8 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     """Return the stretches of a record in which the process is excited, in order.
 
     A stretch includes the rest before and after it, which shows the operating point and the noise.
-    Each rest is at most as long as the experiment itself, of steps and pulses ten times as long.
+    Each rest is at most as long as the experiment itself, or ten times as long for steps and
+    pulses.
     A saturated measurement or a break ends an experiment.
 
     :param record: a record of any origin.
@@ -151,7 +152,7 @@ def _switching_parts(
     found = [_relay(record, changes, *runs) for runs in zip(relay, around, strict=True)]
     follows = sum(b - a for (a, b), part in zip(relay, found, strict=True) if part[2] == "relay")
     if 2 * follows < changes.times.size:
-        # A sequence by the clock does now and then, by chance, what a relay would do.
+        # Parts of a timed sequence look like a relay by chance.
         found = [(begin, end, "pulses", reason) for begin, end, _, reason in found]
     taken = {k for run in around for k in range(*run)}
     settled = _settled(record, last, changes)
@@ -172,7 +173,7 @@ def _switching_parts(
 def _merged(
     changes: _Changes, found: Sequence[tuple[float, float, str, str]]
 ) -> list[tuple[float, float, str, str]]:
-    """Make one of parts without a relay between which the process does not rest for long."""
+    """Join parts without a relay if the process does not rest for long between them."""
     merged: list[tuple[float, float, str, str]] = []
     for part in found:
         last = merged[-1] if merged else None
@@ -357,7 +358,7 @@ def _with_rest(
     stretches = []
     noise = roughness(record.measurement[first : last + 1])
     for k, (begin, end, kind, reason) in enumerate(found):
-        # Rest tells the noise and the offset. Beside a controller, its command follows the noise.
+        # Rest shows noise and offset. It is short under a controller, which follows the noise.
         length = max(end - begin, 0.0) * (_REST if kind in ("steps", "pulses") else 1.0)
         earliest = found[k - 1][1] if k else float(record.time[first])
         latest = found[k + 1][0] if k + 1 < len(found) else float(record.time[last])

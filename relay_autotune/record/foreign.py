@@ -18,7 +18,7 @@ _LEVEL_TOLERANCE = 1e-6
 # room for the levels before and after the experiment and a few manual steps.
 _MAX_LEVELS = 12
 
-# With fewer switches, the first one is no less part of the oscillation than the others.
+# Least number of switches that shows whether the first one belongs to the oscillation.
 _ENOUGH_TO_TELL = 5
 
 # A stay at a level shorter than this fraction of the usual stay is noise at a switch.
@@ -201,7 +201,7 @@ def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | N
 
 
 def _drop_the_way_there(y: FloatArray, up: list[int], down: list[int]) -> None:
-    """Leave out a first switch where the process was nowhere near the oscillation yet.
+    """Leave out a first switch where the process was still outside of the oscillation.
 
     A heater that is switched on from cold begins a stay, but not at the relay's lower level.
     """

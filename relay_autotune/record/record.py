@@ -20,7 +20,7 @@ from relay_autotune.errors import RecordError
 from relay_autotune.quantities import told
 
 FloatArray = NDArray[np.float64]
-# Slopes that differ by less than this part of the steepest one are equal.
+# Difference of equal slopes, relative to the steepest one.
 _STRAIGHT = 1e-12
 IntArray = NDArray[np.int64]
 # Largest value of a quantity; squares of values up to this can be added without overflow.
@@ -54,7 +54,7 @@ def one_record(given: object, caller: str) -> Record:
 def asked_once(
     question: Callable[Concatenate[Record, _P], _T],
 ) -> Callable[Concatenate[Record, _P], _T]:
-    """Let a record remember the answer to a question, since it cannot change.
+    """Let a record, which cannot change, remember the answer to a question.
 
     :param question: a function of a record, and of arguments that can be compared.
     """
@@ -71,7 +71,7 @@ def asked_once(
 
 
 def roughness(y: FloatArray) -> float:
-    """Estimate white noise from second differences, of which a smooth signal has little [y].
+    """Estimate white noise from second differences, which are small in a smooth signal [y].
 
     :param y: samples, shape (n,).
     """
@@ -281,9 +281,9 @@ def _as_column(name: str, value: object, length: int | None) -> FloatArray:
 
 @dataclass(frozen=True)
 class Unthinned:
-    """What a record was before its samples were averaged in blocks.
+    """Properties of a record before its samples were averaged in blocks.
 
-    :param samples: how many it had.
+    :param samples: number of samples.
     :param interval: median time between them [s].
     :param noise: standard deviation of the noise of each [y].
     :param remark: what was done, a sentence.
@@ -329,7 +329,7 @@ class Record:
     :param continuous_command: True: the command moved along straight lines between its instants,
         as from an analogue controller; False: it was held.
     :param unthinned: what it was before it was thinned; None: it was not.
-    :ivar answers: what was asked of the record before, see :func:`asked_once`.
+    :ivar answers: answers that the record remembers, see :func:`asked_once`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
         goes backwards, or the noise is negative.
     """
@@ -396,7 +396,7 @@ class Record:
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy is asked anew.
+        # A copy begins without answers.
         return {**self.__dict__, "answers": {}}
 
     def __len__(self) -> int:
@@ -427,7 +427,7 @@ class Record:
 
     @property
     def noise(self) -> float:
-        """The noise measured before the test, else what second differences show of it [y]."""
+        """The noise measured before the test, or else estimated from second differences [y]."""
         return self.noise_std if math.isfinite(self.noise_std) else _roughness(self)
 
     def part(self, low: int, high: int) -> Record:

@@ -1,11 +1,11 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Make a long record short: average it in blocks, as far as its response is slow to them.
+"""Average a long record in blocks that are short beside its response.
 
-A model of a few parameters is told by some thousand samples; a million of them cost time and
-memory for digits that nobody can use. The mean over a block keeps what each of its samples knew:
-white noise of standard deviation sigma becomes one of sigma/sqrt(k) in the mean of k.
+Some thousand samples determine a model of a few parameters; a million of them cost time and
+memory for useless digits. The mean over a block keeps the information of its samples: white noise
+of standard deviation sigma becomes one of sigma/sqrt(k) in the mean of k.
 """
 
 from __future__ import annotations
@@ -24,18 +24,17 @@ from relay_autotune.record.record import (
     roughness,
 )
 
-# Samples of a record that is left as it is; blocks that a longer one is brought to.
+# Largest number of samples of a record that is not thinned, and of blocks of a longer one.
 LEFT_ALONE = 10_000
 BLOCKS = 5_000
-# A command that changes more often than this is averaged, too: each change costs what a sample
-# costs.
+# Largest number of changes of a command that is not averaged: each costs as much as a sample.
 _MOST_CHANGES = BLOCKS // 4
-# From block to block the measurement may move this share of its range, beyond its noise: a
-# response of one lag is then seen by 20 blocks in its time constant.
+# Largest move of the measurement from block to block, beyond its noise, as a share of its range:
+# a lag then has 20 blocks in its time constant.
 _MOST_MOVE = 0.05
 # A difference of two means beyond this number of its standard deviations is not noise.
 _NOISE = 6.0
-# Share before the first change, in the part that is used where blocks do not do.
+# Share before the command's first change, where only a part of the record is used.
 _BEFORE = 0.1
 
 
@@ -93,7 +92,7 @@ def _changes(record: Record) -> IntArray:
 
 
 def _slow_enough(y: FloatArray, wanted: int, *, white: bool) -> int:
-    """Return the largest block, up to the one that is wanted, to which the response is slow.
+    """Return the largest block, up to the wanted size, that is short beside the response.
 
     :param y: the measurement [y], shape (n,).
     :param wanted: samples in a block.
