@@ -182,7 +182,7 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     else:
         columns = width()
         lines = gains_lines(gains, width=columns, forms=further_forms(gains, options.form))
-        print("\n".join([*process_lines(task.model, columns), *lines]))
+        print("\n".join([*process_lines(task, columns), *lines]))
     return DONE
 
 
@@ -198,7 +198,7 @@ def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> i
         columns = width()
         lines = side_by_side(gains, recommended, options.form, inside, columns)
         lines += refusal_lines(refused, columns)
-        print("\n".join([*process_lines(task.model, columns), *lines]))
+        print("\n".join([*process_lines(task, columns), *lines]))
     if not gains:
         say(PROGRAM, "no rule gives gains for this model")
         return NOTHING_FOUND

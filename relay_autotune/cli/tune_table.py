@@ -15,8 +15,7 @@ from relay_autotune.text import digits, process_text
 from relay_autotune.tuning.forms import series_form
 
 if TYPE_CHECKING:
-    from relay_autotune.process.transfer_function import TransferFunction
-    from relay_autotune.tuning import Gains, Performance
+    from relay_autotune.tuning import DesignTask, Gains, Performance
     from relay_autotune.tuning.compensators import Compensator
 
 _HEADINGS = ("kc", "ti", "td", "Ms", "Mt", "GM", "PM", "IAE")
@@ -29,13 +28,17 @@ _UNITS = {
 _UNITS_JUDGED = ("", "", "", "deg", "y s/u")
 
 
-def process_lines(model: TransferFunction, width: int) -> list[str]:
-    """Return the process that is tuned for.
+def process_lines(task: DesignTask, width: int) -> list[str]:
+    """Return the process that is tuned for, and the law, if one was named.
 
-    :param model: the process.
+    :param task: what is designed.
     :param width: columns that a line may have.
     """
-    return [*labelled("process", f"{process_text(model)}   ({model.structure})", width), ""]
+    model, options = task.model, task.options
+    lines = labelled("process", f"{process_text(model)}   ({model.structure})", width)
+    if options.law:
+        lines += labelled("law", f"{options.law} every {options.sample_period:g} s", width)
+    return [*lines, ""]
 
 
 def further_forms(gains: Gains, form: str) -> list[tuple[str, str]]:

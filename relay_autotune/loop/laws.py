@@ -249,6 +249,13 @@ class Law:
     line: str = "{name}: {value}"
     remark: str = "#"
 
+    def lag(self, period: float) -> float:
+        """Return the dead time that stands for hold and delay in a continuous loop [s].
+
+        :param period: of the samples [s].
+        """
+        return (0.5 + self.delay) * period
+
     def best(self, wanted: Controller, period: float) -> Controller:
         """Return the nearest controller that this law can run.
 

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.closed_loop import ClosedLoop, simulate_closed_loop
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import BLUE, INK, MUTED, SKY, VERMILLION, finish, in_steps, legend
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 _SAMPLES = 500
+# A law that takes more samples for the figure is shown as a continuous controller.
+_MOST_SAMPLES = 8000
 # Number of models within the uncertainty that are simulated.
 _SHOWN = 10
 
@@ -37,9 +41,9 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
     model = in_loop(case, case.model.model)
     half = step_duration(case.best_gains, model)
-    run = _run(case.best_gains, model, half)
+    run = simulated(case.best_gains, model, half)
     for other in case.models_around[:: max(1, len(case.models_around) // _SHOWN)]:
-        around = _run(case.best_gains, in_loop(case, other), half)
+        around = simulated(case.best_gains, in_loop(case, other), half)
         if around is not None:
             above.plot(
                 around.time, around.measurement, color=SKY, lw=1.0, alpha=0.8,
@@ -78,7 +82,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     assert case.model is not None
     model = in_loop(case, case.model.model)
     half = step_duration(case.best_gains, model)
-    best = _run(case.best_gains, model, half)
+    best = simulated(case.best_gains, model, half)
     others = distinct_gains(case)[1:]
     columns = _columns(len(others), narrow=narrow)
     rows = -(-len(others) // columns)
@@ -87,7 +91,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
         if k >= len(others):
             axes.remove()
             continue
-        run = _run(others[k], model, half)
+        run = simulated(others[k], model, half)
         if best is not None:
             axes.plot(best.time, best.measurement, color=VERMILLION, lw=1.1, ls=(0, (4, 1.5)))
         if run is not None:
@@ -170,8 +174,21 @@ def shown_load(gains: Gains, model: TransferFunction) -> float:
 
 
 @functools.lru_cache(maxsize=64)
-def _run(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop | None:
+def simulated(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop | None:
+    """Return a step of the set-point and then one of the load; None: the gains cannot run.
+
+    :param gains: with the law that they are for, if one was named.
+    :param model: the process, with the dead time that the loop adds to it.
+    :param half: time of the step of the load, and until the end after it [s].
+    """
     load = shown_load(gains, model)
+    law, period = LAWS.get(gains.law), gains.law_period
+    if law is not None and 2.0 * half < _MOST_SAMPLES * period:
+        held = replace(model, dead_time=max(model.dead_time - law.lag(period), 0.0))
+        return simulate_closed_loop(
+            law.at(gains, period).running(), held, period=period, duration=2.0 * half,
+            setpoint=1.0, load=load, load_time=half,
+        )  # fmt: skip
     fine = min(half / _SAMPLES, max(gains.tf, model.dead_time) / 5.0 or math.inf)
     try:
         return simulate_closed_loop(

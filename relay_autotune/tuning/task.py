@@ -12,7 +12,7 @@ from functools import cached_property
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, Performance
-from relay_autotune.loop.laws import LAWS, Law, SampledLaw
+from relay_autotune.loop.laws import LAWS, OWN_LAW, Law, SampledLaw
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity
@@ -130,8 +130,8 @@ class DesignOptions:
 
         A sample that is held for a period lags by half of it on average.
         """
-        held = 0.5 if self.law == "" else 0.5 + LAWS[self.law].delay
-        return held * self.sample_period + self.loop_delay
+        held = LAWS[self.law or OWN_LAW].lag(self.sample_period)
+        return held + self.loop_delay
 
     @property
     def runs(self) -> Law | None:

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -13,11 +15,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.cli import export, replay
-from relay_autotune.cli.export import Target, number, pid_controller, plain
+from relay_autotune.cli import export, replay, tune
+from relay_autotune.cli.export import Target, exported, number, pid_controller, plain
 from relay_autotune.errors import SelectionError
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import Controller, Gains, Performance
+from relay_autotune.tuning import Controller, DesignOptions, Gains, Performance
+from relay_autotune.tuning import tune as tune_model
 
 PERFORMANCE = Performance(
     ms=1.4,
@@ -163,3 +167,57 @@ def test_replay_exports_the_gains_of_a_recording(capsys):
         assert "one bag alone" in capsys.readouterr().err
     assert replay.main(["--ms", "9", bag]) == 2
     assert "--ms is 9, expected from 1.2 to 4" in capsys.readouterr().err
+
+
+OVEN = ("--gain", "1.65", "--time-constants", "20", "--dead-time", "10", "--sample-period", "0.5")
+
+
+def settings_of(text: str) -> dict[str, str]:
+    """Read lines of `name: value`, `name = value` and the like."""
+    found = re.findall(
+        r"^(?:const auto |#define |param set )?(\w+)(?:: | :?= |,| )([^;\n]+)", text, re.M
+    )
+    return {name: value for name, value in found if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("name", [n for n in LAWS if n != "pid_controller"])
+def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
+    assert tune.main([*OVEN, "--pid", "--rule", "imc", "--export", name]) == 0
+    text = capsys.readouterr().out
+    law = LAWS[name]
+    assert all(line.startswith(law.remark) for line in text.splitlines()[:5])
+    assert f"Designed for {name} every 0.5 s." in text
+    found = settings_of("\n".join(text.splitlines()[5:]))
+    assert list(found) == [each.name for each in law.settings]
+    gains = tune_model(
+        TransferFunction.fopdt(1.65, 20.0, 10.0),
+        "imc",
+        options=DesignOptions(controller="pid", sample_period=0.5, law=name),
+    )
+    for each in law.settings:
+        value = each.of(law.at(gains, 0.5))
+        told = found[each.name]
+        assert told == value if isinstance(value, str) else float(told) == pytest.approx(value)
+
+
+def test_gains_for_one_law_are_not_exported_for_another(capsys):
+    asked = [*OVEN, "--rule", "imc", "--law", "simple_pid"]
+    assert tune.main([*asked, "--export", "klipper_heater"]) == 2
+    assert "the gains are for simple_pid: give --law klipper_heater" in capsys.readouterr().err
+    assert tune.main([*asked, "--export", "simple_pid", "--command-max", "1"]) == 2
+    assert "has no place for clamps" in capsys.readouterr().err
+    assert tune.main([*asked, "--export", "yaml"]) == 0
+    plain_law = exported(gains(1.0, 5.0), "yaml", Target())
+    assert "law" not in plain_law
+    with pytest.raises(SelectionError, match="give --law esphome_pid"):
+        exported(gains(1.0, 5.0), "esphome_pid", Target())
+
+
+def test_a_document_tells_the_law_and_without_one_nothing(capsys):
+    tune.main([*OVEN, "--rule", "imc", "--law", "oscat_ft_pid", "--json"])
+    (told,) = json.loads(capsys.readouterr().out)["gains"]
+    assert (told["law"], told["law_period"]) == ("oscat_ft_pid", 0.5)
+    tune.main([*OVEN, "--rule", "imc", "--json"])
+    (told,) = json.loads(capsys.readouterr().out)["gains"]
+    assert "law" not in told
+    assert "law_period" not in told

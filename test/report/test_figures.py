@@ -13,14 +13,16 @@ from analysed import SETTINGS, completed
 from matplotlib.path import Path
 from report_cases import fruitless
 
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.report import draw
 from relay_autotune.report.case import case_of, in_loop
 from relay_autotune.report.experiment import rate_of, switches_of
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.frequency import swept_area
-from relay_autotune.report.loops import distinct_gains
+from relay_autotune.report.loops import distinct_gains, simulated
 from relay_autotune.report.style import in_steps, inline, save, thinned
+from relay_autotune.tuning import DesignOptions, tune
 
 
 def levels(names: str) -> Record:
@@ -36,6 +38,20 @@ def test_a_kick_is_no_switch_and_neither_is_the_end() -> None:
     np.testing.assert_array_equal(found.kicks, [2.0, 5.0])
     np.testing.assert_array_equal(found.switches, [8.0, 10.0])
     np.testing.assert_array_equal(found.released, [4.0, 11.0])
+
+
+def test_a_closed_loop_with_a_law_shows_that_law_sample_by_sample() -> None:
+    model = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    options = DesignOptions(law="klipper_heater", sample_period=2.0, controller="pi")
+    gains = tune(model, options=options)
+    # Half a period for the hold, and one until the power follows.
+    run = simulated(gains, replace(model, dead_time=13.0), 200.0)
+    assert run is not None
+    assert run.time[1] == 2.0
+    p, i = gains.p, gains.i * 2.0
+    np.testing.assert_allclose(run.command[:4], [0.0, p + i, p + 2.0 * i, p + 3.0 * i])
+    # The command of 2 s arrives at 12 s.
+    assert np.flatnonzero(run.measurement)[0] == 7
 
 
 def test_thinning_keeps_every_extreme_of_a_long_signal() -> None:
