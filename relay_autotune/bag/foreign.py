@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from relay_autotune.bag.fields import split_name
-from relay_autotune.bag.joints import Choice, named_pair
+from relay_autotune.bag.joints import Choice, has_joints, named_pair
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
 from relay_autotune.bag.signals import Signal, join
 from relay_autotune.bag.topics import Topics
@@ -51,7 +52,11 @@ def experiments_of_pair(
         measurement, command, why = named_pair(
             topics, Choice(joint, measurement, command, joint_order)
         )
-        first = [f"using --measurement {measurement} --command {command}: {why}"]
+        flags = " ".join(
+            f"--{role} {shlex.quote(name)}"
+            for role, name in (("measurement", measurement), ("command", command))
+        )
+        first = [f"using {flags}: {why}"]
     pair, notes = _pair(topics, measurement, command)
     notes = [*first, *notes]
     names = (pair.measurement.name, pair.command.name)
@@ -166,4 +171,5 @@ def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[Pair, list[str]]:
         f"{topics.path} holds no recorded experiment and no pair of topics that looks like "
         f"measurement and command; it has {topics.listing(looks)}; name two "
         f"with --measurement TOPIC[:FIELD] --command TOPIC[:FIELD]"
+        + ("; or name a joint with --joint" if has_joints(topics) else "")
     )

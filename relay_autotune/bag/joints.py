@@ -31,6 +31,9 @@ from relay_autotune.escape import visible
 # A definition without a list or a field of names has no joints; a robot's bag has hundreds of
 # types, and to parse all of them takes seconds.
 _NAMING = re.compile(rb"\bstring\b[^\n]{0,40}\b(?:" + "|".join(NAME_LISTS).encode() + rb")\b")
+_STATES = {
+    "JointState", "MultiDOFStateStamped", "DynamicJointState", "JointTrajectoryControllerState"
+}  # fmt: skip
 _ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
 
 # What fields are there for, by their names, in topics that do not say it.
@@ -86,6 +89,11 @@ class _Candidate:
         wanted = wanted if wanted.startswith("/") else f"/{wanted}"
         own = {self.name, f"/{self.name}", _bare(self.name), self.topic}
         return wanted in own or _bare(wanted) in own
+
+
+def has_joints(topics: Topics) -> bool:
+    """Tell by its types whether a bag has the states of joints."""
+    return any(kind.rpartition("/")[2] in _STATES for kind in topics.types().values())
 
 
 def named_pair(topics: Topics, choice: Choice) -> tuple[str, str, str]:

@@ -17,6 +17,7 @@ from relay_autotune.errors import SelectionError
 JOINTS = ["left_wheel", "right_wheel", "arm"]
 STATES, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
 CONTROLLER = "control_msgs/msg/MultiDOFStateStamped"
+TRAJECTORY = "control_msgs/msg/JointTrajectoryControllerState"
 DYNAMIC, COMMAND = "control_msgs/msg/DynamicJointState", "control_msgs/msg/MultiDOFCommand"
 
 
@@ -52,8 +53,9 @@ def test_the_state_of_a_controller_has_both(tmp_path: Path, both: Robot) -> None
     for joint in ("left_wheel", "right_wheel"):
         found = read(path, joint)
         same(found, both, joint)
-        assert f"/pid/controller_state:dof_states[name={joint}].feedback" in found.notes[0]
-        assert f"--command /pid/controller_state:dof_states[name={joint}].output" in found.notes[0]
+        state = f"/pid/controller_state:dof_states[name={joint}]"
+        names = f"--measurement '{state}.feedback' --command '{state}.output'"
+        assert f"using {names}: both name {joint}" in found.notes[0]
 
 
 @pytest.mark.parametrize("kind", ["joint_states", "dynamic"])
@@ -66,7 +68,7 @@ def test_states_and_commands_of_a_group(tmp_path: Path, robot: Robot, kind: str)
     path = write_robot(tmp_path / "bag.mcap", robot.samples, **topics)  # type: ignore[arg-type]
     found = read(path, "right_wheel")
     same(found, robot, "right_wheel")
-    assert "--command /group/commands:data[1]: " in found.notes[0]
+    assert "--command '/group/commands:data[1]': " in found.notes[0]
     assert "moves most, and data[1] alone changes" in found.notes[0]
     # Another joint rests: it is not taken for what the command moves.
     with pytest.raises(
@@ -83,7 +85,22 @@ def test_commands_that_name_their_joints(tmp_path: Path, both: Robot) -> None:
     for joint in ("left_wheel", "right_wheel"):
         found = read(path, joint)
         same(found, both, joint)
-        assert f"--command /group/commands:values[{joint}]: both name {joint}" in found.notes[0]
+        assert f"--command '/group/commands:values[{joint}]': both name {joint}" in found.notes[0]
+
+
+def test_the_state_of_a_trajectory_controller(tmp_path: Path, both: Robot) -> None:
+    path = write_robot(
+        tmp_path / "bag.mcap", both.samples, arm__controller_state=(TRAJECTORY, both.trajectory),
+        joint_states=(STATES, both.joint_state),
+    )  # fmt: skip
+    for joint in ("left_wheel", "right_wheel"):
+        found = read(path, joint)
+        same(found, both, joint)
+        assert f"/arm/controller_state:feedback.velocities[{joint}]" in found.notes[0]
+        assert f"/arm/controller_state:output.effort[{joint}]" in found.notes[0]
+    # Without a joint there is no pair, and the refusal says what to type.
+    with pytest.raises(SelectionError, match="or name a joint with --joint"):
+        read_experiments(path)
 
 
 def test_several_commands_need_the_order_of_the_joints(tmp_path: Path, both: Robot) -> None:

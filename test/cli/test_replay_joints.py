@@ -50,7 +50,7 @@ def test_a_joint_of_a_bag_becomes_a_file_for_its_controller(
     assert replay.main([*asked, "--export", "pid_controller", "--accept-doubtful"]) == 0
     printed = capsys.readouterr()
     assert "right:" in printed.out
-    assert "--command /group/commands:data[1]" in printed.err
+    assert "--command '/group/commands:data[1]'" in printed.err
 
 
 @pytest.mark.parametrize(

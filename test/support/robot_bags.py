@@ -28,6 +28,13 @@ DEFINITIONS = {
     "control_msgs/SingleDOFState[] dof_states\n",
     "control_msgs/msg/MultiDOFCommand": "string[] dof_names\nfloat64[] values\n"
     "float64[] values_dot\n",
+    "control_msgs/msg/JointTrajectoryControllerState": "std_msgs/Header header\n"
+    "string[] joint_names\n"
+    + "".join(
+        f"trajectory_msgs/JointTrajectoryPoint {field}\n"
+        for field in ("reference", "feedback", "error", "output")
+    )
+    + "string[] multi_dof_joint_names\nfloat64 speed_scaling_factor\n",
     "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values\n",
     "control_msgs/msg/DynamicJointState": "std_msgs/Header header\nstring[] joint_names\n"
     "control_msgs/InterfaceValue[] interface_values\n",
@@ -108,6 +115,19 @@ class Robot:
             for name in self.mixed()
         ]  # fmt: skip
         return ros("control_msgs/msg/MultiDOFStateStamped", self.header(k), states)
+
+    def trajectory(self, k: int) -> Any:
+        order, none = self.mixed(), doubles([])
+        span = ros("builtin_interfaces/msg/Duration", 0, 0)
+        velocity = doubles([self.velocity[name][k] for name in order])
+        effort = doubles([self.command[name][k] for name in order])
+        point = "trajectory_msgs/msg/JointTrajectoryPoint"
+        wanted = ros(point, none, doubles([0.0] * len(order)), none, none, span)
+        return ros(
+            "control_msgs/msg/JointTrajectoryControllerState", self.header(k), order,
+            wanted, ros(point, none, velocity, none, none, span), wanted,
+            ros(point, none, none, none, effort, span), [], 1.0,
+        )  # fmt: skip
 
     def named_commands(self, k: int) -> Any:
         order = self.mixed()
