@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers out of many serialized messages at once.
+"""Numbers read from many serialized messages at once.
 
 The layout is that of plain CDR (OMG formal/02-06-51, 15.3): each number is aligned to its own
 size, counted from behind the four bytes of the encapsulation; a string or a sequence is preceded
@@ -257,7 +257,7 @@ class _Cursor:
     def _advance(self, size: Place) -> None:
         self._place = self._place + size
         if not isinstance(self._place, int):
-            # A place far outside must not overflow; what is there is no longer looked at.
+            # A place far outside must not overflow; nothing is read there any more.
             self.good &= self._place <= self._room
             self._place = np.where(self.good, self._place, 0)
 

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The content of a chunk: expanded within limits, checked, and of a cut one what there is."""
+"""The content of a chunk, expanded within limits and checked; of a cut chunk, what is there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def chunk_content(body: bytes, *, whole: bool, largest: int) -> bytes | memoryvi
     """Return the records inside of a chunk.
 
     :param body: the chunk's record without opcode and length, or as much as the file has of it.
-    :param whole: whether that is all of it; else what can be had is returned.
+    :param whole: whether that is all of it; if not, the part that can be read is returned.
     :param largest: size that the content may have [bytes].
     :raises DamageError: if nothing of it can be used.
     """
@@ -45,7 +45,7 @@ def chunk_content(body: bytes, *, whole: bool, largest: int) -> bytes | memoryvi
 
 
 def _expand(data: memoryview, compression: str, size: int, *, whole: bool) -> bytes | memoryview:
-    """Decompress a chunk; of one that is cut, as much as there is.
+    """Decompress a chunk, or the part of a cut one.
 
     :param size: declared size; at most one byte more than that is taken.
     """
@@ -63,7 +63,7 @@ def _whole_zstd(data: memoryview, size: int) -> bytes:
     if size == 0:
         return b""
     try:
-        # Where the frame says how much it holds, zstd takes that much memory at once.
+        # zstd allocates at once the size that the frame declares.
         if zstandard.frame_content_size(data) not in (-1, size):
             raise DamageError("a chunk and its compressed content differ in their size")
         content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)

@@ -4,8 +4,8 @@
 """Messages that were compressed one by one, as rosbag2 does it with compression_mode MESSAGE.
 
 Each serialized message is then a frame of zstd that declares its size (rosbag2_compression_zstd,
-ZstdCompressor::compress_serialized_bag_message). They are told by their first bytes, with which no
-message in CDR begins: the metadata.yaml that says so is missing where a recorder was killed.
+ZstdCompressor::compress_serialized_bag_message). They are recognised by their first bytes, with
+which no message in CDR begins: where a recorder was killed, there is no metadata.yaml.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Expander:
             return bytes(frame)
         zstandard = self._zstandard
         try:
-            # It takes as much memory as the frame says at once.
+            # zstd allocates at once the size that the frame declares.
             size = zstandard.frame_content_size(frame)
             if size < 0:
                 raise DamageError("it does not declare its size")

@@ -4,7 +4,7 @@
 """Logs of other tools: text with columns of time, measurement and command, as tools write it.
 
 Columns are separated by commas, semicolons or tabs; with the last two a decimal comma may be
-used. What is not plain from the file is guessed, and each guess is a note.
+used. What the file does not tell is guessed, and each guess is a note.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.escape import visible
 from relay_autotune.record.record import FloatArray, IntArray
 
-# Times from here on are taken as seconds since 1970; no experiment lasts that long.
+# Least time that is taken as seconds since 1970: no experiment lasts that long.
 EPOCH = 1.0e8
 
-# Beyond, a time is no date in seconds, but in milliseconds, microseconds or nanoseconds.
+# Largest date in each unit, and the unit [ns]: a larger one is in the next unit.
 _DATES = (
     (9e9, 1e9, "seconds"),
     (9e12, 1e6, "milliseconds"),
@@ -57,7 +57,7 @@ _RESTART = 10
 
 @dataclass(frozen=True)
 class Log:
-    """What was read of a file.
+    """The columns read from a file.
 
     :param measurement: the samples.
     :param command: what was commanded.
@@ -80,8 +80,8 @@ def read_csv(
     """Return measurement and command of a CSV file.
 
     Times are rounded to a nanosecond, as those of a bag are, so that a file and the bag made
-    of it give the same numbers. Rows are put into the order of their time; of rows at the same
-    time the later in the file is the later.
+    of it give the same numbers. Rows are put into the order of their time; rows at the same time
+    keep the order of the file.
 
     :param path: the file; its first line names the columns, else they are called 1, 2, 3.
     :param measurement: name of the column of the measurement, with or without its unit; may be
@@ -89,7 +89,7 @@ def read_csv(
     :param command: name of the column of the command.
     :param time: name of the column of the time; default: the first.
     :raises SelectionError: if a column is not named, or not there.
-    :raises BagError: if the file cannot be read, or holds something else than numbers.
+    :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
     try:
         with open_regular(path) as file:
@@ -128,7 +128,7 @@ def read_csv(
 class _Table:
     """The rows of a file: their separator, their header, their numbers.
 
-    :param path: how messages call it.
+    :param path: its name in messages.
     :param file: the file, from its beginning.
     """
 
@@ -294,7 +294,7 @@ class _Table:
 
 
 def _lines(path: Path, text: TextIO) -> Iterator[str]:
-    """Yield the lines of a text, none of which may fill the memory."""
+    """Yield the lines of a text, and refuse one that is too long."""
     while line := text.readline(LONGEST_LINE + 1):
         if len(line) > LONGEST_LINE:
             raise BagError(
@@ -304,10 +304,10 @@ def _lines(path: Path, text: TextIO) -> Iterator[str]:
 
 
 def _separator(first: str) -> str:
-    """Return what separates the columns: that which makes the most lines of three and more."""
+    """Return the separator with which most lines have three columns or more."""
     lines = [line for line in first.splitlines()[:50] if line.strip()]
     found = {mark: sum(line.count(mark) >= 2 for line in lines) for mark in (";", "\t", ",")}
-    # With decimal commas there are commas, too; who writes semicolons means them.
+    # Semicolons and tabs come first: beside them a comma may be the decimal point.
     enough = max(1, math.ceil(0.8 * len(lines)))
     return next((mark for mark in (";", "\t") if found[mark] >= enough), ",")
 

@@ -40,8 +40,8 @@ _SETTINGS: dict[str, Any] = {
     "reverse_acting": False,
 }
 
-# What a field means that an older definition did not have. Whoever adds a field to one of these
-# messages adds its default here, and old bags keep replaying.
+# Defaults of the fields that an older definition lacks. A field that is added to one of these
+# messages needs its default here, so that old bags can still be replayed.
 DEFAULTS: dict[str, dict[str, Any]] = {
     EXPERIMENT: {
         "header": _HEADER,
@@ -124,7 +124,7 @@ def decoded_message(root: Struct, data: bytes) -> Any:
 
 
 class _Budget:
-    """Counts what takes memory of its own."""
+    """Limits the number of structures and elements, each of which takes memory."""
 
     def __init__(self) -> None:
         self._left = MOST_ELEMENTS

@@ -33,7 +33,7 @@ _FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z
 
 @dataclass(frozen=True)
 class Definition:
-    """What a bag says of a message type.
+    """The definition of a message type in a bag.
 
     :param text: the ros2msg definition, followed by those it depends on, each after a line of
         80 ``=`` and ``MSG: package/msg/Type``.
@@ -71,7 +71,7 @@ def find_definition(type_name: str, prefixes: Sequence[Path] | None = None) -> D
 
 
 def _installed(type_name: str, suffix: str, prefixes: Sequence[Path]) -> Iterator[str]:
-    """Yield what the files of a type hold, nearest overlay first."""
+    """Yield the content of a type's files, nearest overlay first."""
     parts = type_name.split("/")
     if len(parts) != 3 or not all(re.fullmatch(r"\w+", part) for part in parts):
         raise BagError(

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The experiments that relay_node left in a bag: whole ones, and one that was cut short."""
+"""The experiments of relay_node in a bag: whole ones, and one that was cut short."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def recorded_experiments(topics: Topics) -> tuple[list[Record], list[str]]:
     do, under whatever name.
 
     :param topics: the bag.
-    :raises BagError: if there are some, but none that is of use.
+    :raises BagError: if there are some, but none can be used.
     """
     records: dict[str, Record] = {}
     refused: list[str] = []

@@ -36,10 +36,10 @@ _OWN_NAME = "name"
 
 _STEP = re.compile(r"\.?([A-Za-z]\w*)|\[(\d{1,9})\]|\[(?:([A-Za-z]\w*)=)?([^\[\]]+)\]")
 
-# Fields that are no quantity of a process.
+# Fields that are not a quantity of a process.
 _HEADER = ("header", "stamp")
 
-# Fields or names that a message of an error lists at most.
+# Largest number of fields or names that an error lists.
 _LISTED = 12
 
 

@@ -11,7 +11,7 @@ from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Struct, Type
 from relay_autotune.errors import FieldError, SelectionError
 
-# The field that a message of several numbers is there for.
+# The field that a message of several numbers is about.
 _MEANT = {
     "sensor_msgs/msg/Temperature": "temperature",
     "sensor_msgs/msg/FluidPressure": "fluid_pressure",
@@ -55,7 +55,7 @@ def named_field(root: Struct, field: str, topic: str) -> Path:
 
 
 def only_field(root: Struct) -> str | None:
-    """Return the number that a message is there for; None if it may be any of several."""
+    """Return the number that a message is about; None if it may be any of several."""
     if root.name in _MEANT:
         return _MEANT[root.name]
     found = first_numbers(root, 2)
@@ -63,7 +63,7 @@ def only_field(root: Struct) -> str | None:
 
 
 def may_be_single(channel: Channel) -> bool:
-    """Tell by a look at its definition whether a topic's messages may be there for one number.
+    """Return whether a topic's messages may be about one number, by a look at the definition.
 
     A robot's bag holds hundreds of types; to parse all of them takes seconds.
     """

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Experiments in the recordings of others, which do not say where they are."""
+"""Experiments in the recordings of other programs, which do not mark them."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.excitation import find_experiments
 from relay_autotune.record.record import Record
 
-# Fewer are not taken apart.
+# Least number of samples of a record that is split into experiments.
 _FEWEST_SAMPLES = 12
 
-# Beyond this, two topics' lags to the recorder differ by their clocks, not by the transport.
+# Difference of two topics' lags to the recorder beyond which their clocks differ [ns].
 _CLOCK_DIFFERENCE_NS = 100_000_000
 
 
@@ -90,13 +90,13 @@ def take_apart(record: Record, *, whole: bool = False) -> tuple[list[Record], li
     stretches = find_experiments(record)
     if not stretches:
         if np.ptp(record.measurement) == 0.0 or np.ptp(record.command) == 0.0:
-            # Why nothing can be told from it is said where that is tried.
+            # The identification then tells why nothing can be learned from it.
             return [record], []
         raise BagError(
             "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
-            "a controller's command follows the measurement, and read as an answer to it would "
-            "give a wrong model; record an experiment, or name a part to be used all the same "
-            "with --start and --end"
+            "a controller's command only follows the noise of the measurement, which would give "
+            "a wrong model; record an experiment, or name a part to be used all the same with "
+            "--start and --end"
         )
     records = [record.part(stretch.first, stretch.last + 1) for stretch in stretches]
     if len(stretches) == 1 and len(records[0]) == len(record):

@@ -36,7 +36,7 @@ _STATES = {
 }  # fmt: skip
 _ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
 
-# What fields are there for, by their names, in topics that do not say it.
+# The role of fields, by their names, in topics whose names do not tell it.
 _NEITHER = {"reference", "error", "error_dot", "desired", "values_dot", "feedback_dot"}
 _MEASURED = {"feedback", "position", "positions", "velocity", "velocities"}
 _COMMANDED = {"position", "positions", "velocity", "velocities", "effort", "values", "data"}
@@ -47,7 +47,7 @@ _INTERFACES = ("position", "velocity", "effort")
 
 # Joint states come from several nodes: the first messages need not have all joints.
 _LOOKED_AT = 50
-# Joints that an error lists at most.
+# Largest number of joints that an error lists.
 _LISTED = 20
 
 
@@ -56,8 +56,8 @@ class Choice:
     """Where measurement and command of a joint are.
 
     :param joint: its name.
-    :param measurement: ``TOPIC[:FIELD]`` of the measurement as the user gave it, the element left
-        out or not; None: found.
+    :param measurement: ``TOPIC[:FIELD]`` of the measurement as the user gave it, with or without
+        the element; None: found.
     :param command: likewise of the command.
     :param order: the joints in the order of commands that do not name them; (): not known.
     """
@@ -97,10 +97,10 @@ def has_joints(topics: Topics) -> bool:
 
 
 def named_pair(topics: Topics, choice: Choice) -> tuple[str, str, str]:
-    """Return ``TOPIC:FIELD`` of a joint's measurement and command, and why it is these.
+    """Return ``TOPIC:FIELD`` of a joint's measurement and command, and the reason.
 
     :param topics: the bag.
-    :param choice: the joint, and what was said about it.
+    :param choice: the joint, and what the user chose.
     :raises SelectionError: if they are not there, or not the only ones.
     """
     found, joints = _candidates(topics, choice)
@@ -191,7 +191,7 @@ def _has(steps: Sequence[Step], message: object) -> bool:
 
 
 def _role(topic: str, steps: Sequence[Step]) -> str:
-    """Return what a number is there for, "" where it is neither measurement nor command."""
+    """Return the role of a number, "" where it is neither measurement nor command."""
     fields = [step for step in steps if isinstance(step, str)]
     chosen = [step.chosen for step in steps if isinstance(step, Element)]
     last = chosen[-1] if len(chosen) > 1 else fields[-1]
@@ -230,7 +230,7 @@ def _elements(topics: Topics, topic: str, choice: Choice) -> list[_Candidate]:
 def _of_role(found: Sequence[_Candidate], role: str, wanted: str | None) -> list[_Candidate]:
     if wanted is None:
         return [c for c in found if c.role == role]
-    # What a user names counts, whatever its name says.
+    # The user's choice counts, whatever role its name tells.
     exact = [c for c in found if c.name.lstrip("/") == wanted.lstrip("/")]
     fits = exact or [c for c in found if c.fits(wanted)]
     topic, _, path = wanted.partition(":")
@@ -318,7 +318,7 @@ def _unclear(
     listed = "".join(
         f"\n  --{role} {shlex.quote(name)}"
         for role, found in several
-        # Without the element it serves several joints.
+        # Without the element, so that it can be used for several joints.
         for name in sorted({_bare(c.name) if c.steps else c.name for c in found})
     )
     hint = ""

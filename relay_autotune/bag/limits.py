@@ -1,21 +1,20 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a file may ask for at most, whatever it declares."""
+"""Limits of what is read of a file, whatever it declares."""
 
 from __future__ import annotations
 
 # Bytes of a chunk, or of one message outside of chunks; --max-chunk changes it.
 LARGEST_CHUNK = 256 << 20
 
-# Bytes that zstd may hold back while it expands a stream: what its strongest level asks for.
+# Bytes that zstd may hold back while it expands a stream: its strongest level needs them.
 LARGEST_WINDOW = 128 << 20
 
-# All that is compressed in a file, or the file as a whole, may expand to this many times its size,
-# or to a gigabyte.
+# Largest expanded size of a file: a multiple of its own size, or a gigabyte if that is more.
 MOST_EXPANSION = 1000
 UNSUSPICIOUS = 1 << 30
-# ... and leaves this much of the disk free.
+# Bytes of the disk that stay free.
 FREE_DISK = 256 << 20
 
 # Bytes of the definition of a message type: the largest of the common interfaces has 20 kB.
@@ -41,11 +40,11 @@ LARGEST_SUMMARY = 256 << 20
 # Messages of a topic for which memory is set aside because the file says that it has them.
 MOST_EXPECTED = 1 << 27
 
-# Records of a file that declare something, and what is said to be amiss in one file.
+# Records of a file that declare something, and notes on what is wrong in a file.
 MOST_DECLARATIONS = 50_000
 MOST_NOTES = 20
 
-# No quantity of a process is beyond it, in whatever unit; its square is still a number.
+# Largest value of a quantity of a process, in any unit; its square does not overflow.
 LARGEST_VALUE = 1e100
 
 # Bytes of a text with columns, and characters of a line in it.

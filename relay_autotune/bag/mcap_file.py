@@ -33,11 +33,11 @@ from relay_autotune.bag.mcap_summary import layout_by_summary
 from relay_autotune.bag.source import Source
 from relay_autotune.record.record import IntArray
 
-# Two records cannot begin nearer to each other than this.
+# Least distance between the beginnings of two records [bytes].
 _SMALLEST_RECORD = 9
 
-# Segments are put together up to this size: an array operation on few messages takes as long as
-# one on a thousand.
+# Size up to which segments are joined [bytes]: an array operation on few messages takes as long
+# as one on a thousand.
 _BATCH = 256 << 10
 
 _NOWHERE: IntArray = np.empty(0, dtype=np.int64)
@@ -88,7 +88,7 @@ class McapFile:
         self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._source.close()
 
     @property
@@ -114,7 +114,7 @@ class McapFile:
         trusted = counts is not None and index.lists(wanted, counts)
         chosen = index.holding(wanted if trusted else None)
         self._source.announce((segment.start, segment.index_end) for segment in chosen)
-        # Only the chunks that are read are looked at before: on a disk each look takes its time.
+        # Only the chunks that will be read are checked: on a disk each check takes time.
         if all(is_chunk_there(self._source, segment) for segment in chosen):
             return chosen
         self._layout = scan(self._source, self._largest)
@@ -150,7 +150,7 @@ class McapFile:
         self._compare(counts)
 
     def _compare(self, counts: dict[int, int]) -> None:
-        """Say where the file has more or fewer messages of a channel than its statistics say."""
+        """Note where the file has more or fewer messages of a channel than its statistics say."""
         declared = self._layout.declared.message_counts
         for contradiction in self._layout.declared.contradictions:
             self._note(f"{self.path.name} contradicts itself: {contradiction}; the first counts")
@@ -195,7 +195,7 @@ class McapFile:
             batch.append(_Piece(segment, content, indexed_offsets(indexes)))
             size += len(content)
             if size >= _BATCH:
-                # Not held while the next one is read: a chunk may be large.
+                # Released before the next one is read: a chunk may be large.
                 yield batch
                 batch, size = [], 0
         if batch:
@@ -227,7 +227,7 @@ class McapFile:
         return [(len(content), {c: messages_at(content, at) for c, at in found.places.items()})]
 
     def _check(self, content: Content, found: Sorted) -> None:
-        """Say what in some records cannot be used, or contradicts what is known."""
+        """Note what in some records cannot be used, or contradicts what is known."""
         name = self.path.name
         try:
             self._layout.declared.take_all(content, found.others)
@@ -246,7 +246,7 @@ class McapFile:
     def _check_index(
         self, piece: _Piece, found: Sorted, wanted: frozenset[int], begin: int, stop: int
     ) -> None:
-        """Say if the message indexes of a chunk do not list what it holds."""
+        """Note if the message indexes of a chunk do not list what it holds."""
         if piece.segment.index_end <= piece.segment.end:
             return
         for channel in wanted:
@@ -270,5 +270,5 @@ class McapFile:
         if note in self.notes or len(self.notes) > MOST_NOTES:
             return
         if len(self.notes) == MOST_NOTES:
-            note = f"{self.path.name} has more that is amiss, which is not listed"
+            note = f"{self.path.name} has more faults, which are not listed"
         self.notes.append(note)

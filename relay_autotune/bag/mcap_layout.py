@@ -78,7 +78,7 @@ class ChunkIndex:
         ]
 
     def lists(self, channels: frozenset[int], counts: dict[int, int]) -> bool:
-        """Return whether it leads to as many messages as the file says that there are.
+        """Return whether it lists as many messages as the statistics of the file.
 
         :param channels: the ids of those that are wanted.
         :param counts: number of messages of each channel, by the statistics.
@@ -94,9 +94,9 @@ class Layout:
     """What a file holds, and where.
 
     :param declared: channels and metadata.
-    :param notes: what was found amiss, each a sentence.
+    :param notes: faults of the file, each a sentence.
     :param segments: in the order of the file, where it was gone through.
-    :param index: the index at its end, whose places are yet to be looked at; None: it was gone
+    :param index: the index at its end, whose places are not checked yet; None: it was gone
         through.
     """
 
@@ -134,13 +134,13 @@ def segment_content(source: Source, segment: Segment, largest: int) -> Content:
 
 
 def is_chunk_there(source: Source, segment: Segment) -> bool:
-    """Return whether a chunk of the index begins where that says."""
+    """Return whether a chunk begins where the index says."""
     head = source.read(segment.start, segment.start + RECORD.size)
     return head == RECORD.pack(CHUNK, segment.end - segment.start - RECORD.size)
 
 
 def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
-    """Return what to say of a segment that cannot be used."""
+    """Return the note on a segment that cannot be used."""
     return (
         f"{source.path.name} is damaged at byte {segment.start}: {damage}; "
         f"what lay there is left out"

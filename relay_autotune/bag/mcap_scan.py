@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The layout of an MCAP file by going through it from its front, as far as it makes sense."""
+"""The layout of an MCAP file, by going through it from its front as far as it makes sense."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from relay_autotune.bag.mcap_records import (
 from relay_autotune.bag.source import MAGIC, Source, file_records, record_body
 from relay_autotune.record.record import IntArray
 
-# Records outside of chunks are read in pieces of this size.
+# Size of the pieces in which records outside of chunks are read [bytes].
 _PIECE = 4 << 20
 
 # Records that declare or hold messages; others are of no use inside of a chunk.

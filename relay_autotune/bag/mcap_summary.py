@@ -166,7 +166,7 @@ def _demand(*conditions: NDArray[np.bool_], otherwise: str) -> None:
 
 
 def _check_between(source: Source, chunks: ChunkIndex, data_end: int, layout: Layout) -> None:
-    """See that the index knows of all data, and read the metadata between the chunks."""
+    """Check that the index lists all data, and read the metadata between the chunks."""
     begins = np.append(len(MAGIC), chunks.index_end)
     ends = np.append(chunks.start, data_end)
     for gap in np.flatnonzero(begins < ends).tolist():

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a recording of ours calls the things in it."""
+"""Names in the recordings of relay_node."""
 
 from __future__ import annotations
 

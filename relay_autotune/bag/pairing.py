@@ -21,10 +21,10 @@ _WORDS = {
     "pressure speed velocity position angle rpm height",
 }
 
-# A signal with no more levels than this steps between them.
+# Largest number of levels of a signal that steps between them.
 _MOST_LEVELS = 12
 
-# Fewer samples than these cannot show a response.
+# Least number of samples that can show a response.
 _FEWEST_SAMPLES = 10
 
 
@@ -33,7 +33,7 @@ class Character:
     """What a signal looks like.
 
     :param kind: ``empty``, ``constant``, ``two-level``, ``steps`` or ``varies``.
-    :param text: the same for people.
+    :param text: the same as text.
     """
 
     kind: str
@@ -70,7 +70,7 @@ def role_by_name(name: str) -> str | None:
     """Return what a topic's name says: set-point, command, measurement, or None."""
     last = name.rstrip("/").rsplit("/", 1)[-1].lower()
     if last == "controller_command":
-        # What a controller wants is not what the process got.
+        # What a controller wants is not what the process gets.
         return "set-point"
     words = set(re.split(r"[^a-z]+", last))
     for role, known in _WORDS.items():
@@ -82,11 +82,11 @@ def role_by_name(name: str) -> str | None:
 def plausible_pairs(signals: Sequence[Signal], given: str | None = None) -> list[Pair]:
     """Return the pairs that look like measurement and command of one loop, likeliest kind only.
 
-    A pair named for its roles outdoes one that is not; a pair within one namespace outdoes one
-    across two.
+    A pair whose names tell its roles comes before one whose names do not; then a pair within one
+    namespace comes before one across two.
 
     :param signals: the recording's numeric signals.
-    :param given: name of one that was chosen already, whatever it looks like.
+    :param given: name of a signal that the user chose; it may look like anything.
     """
     looks = {signal.name: characterise(signal) for signal in signals}
     found = []

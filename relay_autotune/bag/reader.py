@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The experiments in a recording, whoever made it."""
+"""The experiments in a recording of any program."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from relay_autotune.record.record import Record
 if TYPE_CHECKING:
     from relay_autotune.bag.sqlite_file import SqliteFile
 
-# A file compressed as a whole, as rosbag2 and the zstd command name it.
 _STORED = (".mcap", ".db3")
+# A file compressed as a whole, as rosbag2 and the zstd command name it.
 _WHOLE = tuple([kind, end] for kind in _STORED for end in (".zstd", ".zst"))
 
 
@@ -47,7 +47,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Selection:
-    """What of a recording is wanted.
+    """The part of a recording that is wanted.
 
     :param measurement: topic or column of the measurement; None: found.
     :param command: topic or column of the command; None: found.
@@ -91,7 +91,7 @@ def read_experiments(
     :param path: a rosbag2 directory, an MCAP or ``.db3`` file, or a CSV file (by its ending); or
         several of the first three that are one timeline.
     :param selection: what is wanted of it; default: everything.
-    :param progress: told of how far a bag has been read.
+    :param progress: called with the progress of reading a bag.
     :raises SelectionError: if the selection does not fit, or more than one pair does.
     :raises BagError: if the recording cannot be read, or holds nothing to identify from.
     """
@@ -118,7 +118,7 @@ def read_experiments(
             try:
                 records, notes = _of_topics(topics, wanted)
             except BagError as error:
-                # What was found amiss may be why.
+                # The faults of the files may be the reason.
                 amiss = [note for note in topics.notes if note not in str(error)]
                 if not amiss:
                     raise
@@ -128,9 +128,9 @@ def read_experiments(
 
 
 def may_be_recording(path: Path) -> bool:
-    """Return whether a path is to be read, as its name or its first bytes say.
+    """Return whether a path is to be read, by its name or its first bytes.
 
-    What is missing, damaged or of ROS 1 is: reading it says what is wrong with it.
+    A path that is missing, damaged or of ROS 1 is, too: reading it tells what is wrong.
 
     :param path: a file or a folder, such as one of many that a pattern of the shell gave.
     """

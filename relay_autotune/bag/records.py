@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The records in a recording, for programs that want nothing else of it."""
+"""The records in a recording, for programs that need nothing else of it."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Number:
 
     @property
     def size(self) -> int:
-        """What it takes, and what it is aligned to [bytes]."""
+        """Its size, which is also its alignment [bytes]."""
         return int(self.form[1:])
 
 
@@ -90,7 +90,7 @@ _IDL_HEADING = re.compile(r"^={80}\nIDL: .*\n", re.MULTILINE)
 # The files that one includes are all there; the parser knows no directives.
 _IDL_DIRECTIVE = re.compile(r"^\s*#.*$", re.MULTILINE)
 
-# What a definition need not bring along.
+# Types that a definition may leave out.
 _KNOWN = {
     "builtin_interfaces/msg/Time": _TIME,
     "builtin_interfaces/msg/Duration": Struct("builtin_interfaces/msg/Duration", _STAMP),
@@ -201,7 +201,7 @@ class _Tree:
 def numeric_paths(root: Type, without: tuple[str, ...] = ()) -> Iterator[str]:
     """Yield the paths of a type's numbers; one element stands for those of an array.
 
-    A type of a kilobyte can hold more of them than can be gone through: take some.
+    A type of a kilobyte can hold more paths than can be listed: take only some.
 
     :param root: the type.
     :param without: names of its own fields that are left out.

@@ -106,7 +106,7 @@ def window(record: Record, start: float | None, end: float | None) -> Record:
 def _check(signal: Signal, role: str) -> None:
     if len(signal) == 0:
         raise BagError(f"the {role} {signal.name} holds no value")
-    # What is not a number compares as False.
+    # NaN compares as False.
     wrong = np.flatnonzero(~(np.abs(signal.values) <= LARGEST_VALUE))
     if wrong.size:
         where = (signal.time_ns[wrong[0]] - signal.time_ns[0]) / 1e9

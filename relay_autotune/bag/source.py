@@ -40,7 +40,7 @@ _OTHERS = (
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading, and nothing else: a pipe or a device may never end.
+    """Open a regular file for reading: a pipe or a device may never end.
 
     :param path: the file.
     :raises BagError: if it is missing, unreadable, or no regular file.
@@ -63,7 +63,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def known_start(head: bytes) -> bool:
-    """Return whether a file that begins so is a recording of some kind, also one for others.
+    """Return whether a file that begins with these bytes is a recording of some kind.
 
     :param head: its first bytes, 16 or more.
     """
@@ -102,11 +102,11 @@ class Source:
         return self._file.fileno()
 
     def look_again(self) -> None:
-        """Take the size that the file has now; it may have grown or shrunk."""
+        """Update the size of the file, which may have grown or shrunk."""
         self.size = os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
     def read(self, start: int, stop: int) -> bytes:
@@ -153,7 +153,7 @@ class Source:
             return
         for start, end in ranges:
             length = min(end - start, _ANNOUNCED)
-            # A file system that takes no advice reads as well without.
+            # A file system that takes no advice can be read all the same.
             with contextlib.suppress(OSError):
                 os.posix_fadvise(self._file.fileno(), start, length, os.POSIX_FADV_WILLNEED)
 
@@ -177,7 +177,7 @@ class Source:
             )
 
     def _expand(self) -> None:
-        """Put what a file that is compressed as a whole holds into a temporary file."""
+        """Expand a file that is compressed as a whole into a temporary file."""
         zstandard = expanding_package("zstandard")
         compressed = os.fstat(self._file.fileno()).st_size
         most = max(UNSUSPICIOUS, MOST_EXPANSION * compressed)
@@ -241,7 +241,7 @@ def file_records(source: Source, position: int, stop: int) -> Iterator[tuple[int
 
 
 def record_body(source: Source, begin: int, end: int) -> bytes:
-    """Return what a record that declares something holds.
+    """Return the content of a record that declares something.
 
     :raises DamageError: if it is larger than such records are.
     """

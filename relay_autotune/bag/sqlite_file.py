@@ -29,7 +29,7 @@ _BATCH = 4 << 20
 class SqliteFile:
     """A ``.db3`` file of rosbag2 open for reading; it offers what ``McapFile`` does.
 
-    Definitions of types are in it since Iron; of an older one, those of the installed packages
+    It holds definitions of types since Iron; for an older one, those of the installed packages
     count.
 
     :param path: the file; it may be compressed as a whole with zstd.
@@ -67,7 +67,7 @@ class SqliteFile:
         self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with suppress(AttributeError):
             self._database.close()
         self._source.close()

@@ -26,7 +26,7 @@ class Column(Generic[T]):
     It grows in place: joining pieces would for a moment take the memory twice.
 
     :param kind: type of the values.
-    :param expected: how many are expected; memory is taken only for those that come.
+    :param expected: expected number of values; memory is taken only for those that come.
     """
 
     def __init__(self, kind: DTypeLike, expected: int = 0) -> None:
@@ -55,7 +55,7 @@ CLOCKS = ("publish", "log", "header")
 
 @dataclass(frozen=True)
 class TimedSignal:
-    """The values of a topic, and what is to be known of its clock.
+    """The values of a topic, and the lag of its clock.
 
     :param signal: the values by the time of the chosen clock, or, where that is not known, by
         the time at which they were recorded.

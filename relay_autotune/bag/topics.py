@@ -29,7 +29,7 @@ from relay_autotune.record.record import FloatArray, IntArray
 if TYPE_CHECKING:
     from relay_autotune.bag.sqlite_file import SqliteFile
 
-# Told of how far a file has been read: bytes done, bytes in all.
+# Called with the progress of reading: bytes done, bytes in all.
 Progress = Callable[[int, int], None]
 
 
@@ -59,7 +59,7 @@ class Topics:
     :param path: the bag, as it was given.
     :param files: its files in the order in which they were written.
     :param clock: which time of a message counts, one of ``CLOCKS``.
-    :param progress: told of how far the files have been read.
+    :param progress: called with the progress of reading the files.
     """
 
     path: FilePath
@@ -72,7 +72,7 @@ class Topics:
 
     @property
     def notes(self) -> list[str]:
-        """What was found amiss in the files so far."""
+        """Faults found in the files so far."""
         return [note for file in self.files for note in file.notes]
 
     def types(self) -> dict[str, str]:
@@ -140,7 +140,7 @@ class Topics:
         return found
 
     def single_numbers(self) -> list[str]:
-        """Return the topics whose messages are there for one number."""
+        """Return the topics whose messages are about one number."""
         found: dict[str, bool] = {}
         for file in self.files:
             for channel in file.channels.values():
@@ -197,7 +197,7 @@ class Topics:
         """Return the values of topics.
 
         :param names: the topics, each with a field where its type has several numbers; default:
-            all topics whose messages are there for one number.
+            all topics whose messages are about one number.
         :raises SelectionError: if there is no such number.
         :raises BagError: if no message of a topic fits its definition.
         """
@@ -211,7 +211,7 @@ class Topics:
         readers = self._readers(names)
         again = [name for name, reader in readers.items() if not reader.in_order]
         if again:
-            # Only where the times are not in order are the recorder's needed beside them.
+            # The recorder's times are needed only where these are not in order.
             readers |= self._readers(again, both=True)
         return {name: readers[name].signal() for name in names}
 

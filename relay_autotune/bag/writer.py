@@ -28,7 +28,7 @@ from relay_autotune.errors import BagError
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-# What is written but not flushed is held in memory, and lost if the process is killed.
+# Largest size of what is not flushed [bytes]: it is lost if the process is killed.
 _LARGEST_BUFFER = 1 << 20
 
 _FLOAT64_CDR = struct.Struct("<4sd")
@@ -96,7 +96,7 @@ class BagWriter:
 
     Made for one thread. The directory is complete from the start: metadata.yaml is there, and
     what was flushed can be read although no footer follows. After an error of the file system
-    the bag keeps what was flushed before; every later `write` or `flush` says the same error.
+    the bag keeps what was flushed before; every later `write` or `flush` raises the same error.
 
     :param path: the directory to make; must not exist.
     :param topics: the topics to record.

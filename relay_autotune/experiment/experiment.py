@@ -63,9 +63,9 @@ class RelayExperiment:
     :param policy: how the process is left at the end.
     :param until_converged: False: cycles that agree do not end it, but :meth:`conclude` or
         max_cycles does.
-    :param from_small: True: an amplitude that is given begins at a quarter of that for a cycle,
-        and the experiment fails where the measurement swings no wider at the whole of it: the
-        actuator is then at its ends. It has no effect on an amplitude that finds itself.
+    :param from_small: True: a given amplitude begins at a quarter for a cycle, and the experiment
+        fails if the measurement swings no wider at the full amplitude: the actuator is then at
+        its ends. It has no effect where the experiment finds the amplitude.
     :raises ParameterError: if a parameter is out of range, or some contradict each other.
     """
 

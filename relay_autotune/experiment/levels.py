@@ -24,7 +24,7 @@ _MOST_GROWTH = 4.0
 # Reserve on a target, since the swing is not exactly proportional to the amplitude.
 _TO_SPARE = 1.2
 
-# First part of a given amplitude that may be beyond the actuator's ends.
+# First share of a given amplitude, if its levels may lie beyond the actuator's ends.
 _SMALL = 0.25
 
 # Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
@@ -42,7 +42,7 @@ class Levels:
 
     :param parameters: the user's parameters, valid for the baseline.
     :param baseline: command of the operating point [u].
-    :param from_small: True: a given amplitude is not put on at once.
+    :param from_small: True: a given amplitude is not applied at once.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Levels:
         self._set()
 
     def begin_small(self) -> None:
-        """Put on the first part of a given amplitude, whatever the kick needed."""
+        """Apply the first share of a given amplitude, whatever the kick needed."""
         self._wanted = _SMALL * self._parameters.amplitude
         self._set()
 

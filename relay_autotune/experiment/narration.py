@@ -1,10 +1,9 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an experiment waits for and what it sees, in words, state by state.
+"""Sentences on what an experiment waits for and what it sees, state by state.
 
-Each function takes the facts of one state and returns one sentence without a full stop. Time is
-counted from the begin of what is told, in seconds.
+Each function takes the facts of one state and returns one sentence without a full stop.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from relay_autotune.text import duration
 
 # Cycles that a tune usually takes beyond those that must agree.
 _USUAL_EXTRA = 2
-# How far the periods of two cycles are told to differ at least, as a fraction.
+# Least difference of the periods of two cycles that is told, as a fraction.
 _DIFFER = 0.001
 
 

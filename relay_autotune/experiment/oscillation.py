@@ -42,7 +42,7 @@ _MOST_SHIFTS, _SHIFT = 2, 0.7
 # needs it at every turn does not oscillate.
 MOST_BORNE = 4
 _FOLLOWS = 2
-# A cycle this many times as long as the one before is no sign of a load yet.
+# Ratio of a cycle to the one before beyond which it is no sign of a load yet.
 _ALONE = 4.0
 
 # Part of the patience that applies after the first whole cycle.
@@ -158,8 +158,8 @@ class Oscillation:
         relay = self._relay
         if relay.update(t, y):
             self.switches += 1
-            # Only what the process did by itself says how long it takes: else each stay that the
-            # levels are shifted in would grant the next one a longer limit.
+            # Only a stay without a shift of the levels counts: else each shift would lengthen the
+            # limit of the next stay.
             was_shifted = self._shifts > 0
             self._answers = self._turns.add(
                 t,
@@ -329,7 +329,7 @@ class Oscillation:
             self._end(
                 Outcome.FAILED,
                 f"the oscillation grows faster and faster, after {count_cycles(self.cycles)}: an "
-                f"unstable process of which the relay cannot get hold; give a larger amplitude",
+                f"unstable process that the relay cannot hold; give a larger amplitude",
             )
         elif noise := self._only_noise(TELL):
             self._end(Outcome.FAILED, noise)

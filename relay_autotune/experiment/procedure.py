@@ -54,17 +54,17 @@ KICK_SETTLINGS = 50.0
 
 # Least number of samples for a line and a standard deviation, also with settle_time.
 _LEAST_SETTLING_SAMPLES = 5
-# A part that its own rules did not end fails at this many times its limit.
+# Multiple of its limit at which a part fails that its own rules did not end.
 _BEYOND = 2.0
-# An interval of the probe has at least this many samples.
+# Least number of samples in an interval of the probe.
 _PROBE_SAMPLES = 2
 # An amplitude that is not given begins to grow after this part of the settling, or a number of
 # samples. Each size lasts as long as all smaller ones together, so that a long dead time does not
 # make the amplitude much too large.
 _GROWTH_SETTLINGS = 0.25
 _GROWTH_SAMPLES = 20
-# Factor by which a given amplitude has longer to begin small, since it is to stay small until
-# the response to it is known.
+# Factor of that time for a given amplitude that begins small, which stays small until its
+# response is known.
 _PATIENT = 10.0
 
 

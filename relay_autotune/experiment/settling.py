@@ -20,7 +20,7 @@ NOISE_SAMPLES = 50
 # Without noise, a transient is over when no more than this part of it is left.
 _REMAINDER = 0.01
 
-# How far ahead the end of the settling is told, as a multiple of the time so far.
+# Latest end of the settling that is told, as a multiple of the time so far.
 _FURTHEST = 20.0
 
 # Rounding of a constant: differences below this many units in the last place are no signal.
