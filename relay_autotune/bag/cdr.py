@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.decode import decoded_message
-from relay_autotune.bag.field_path import Element, Step, reading
+from relay_autotune.bag.field_path import Element, Step, reading, written
 from relay_autotune.bag.limits import MOST_STEPS
 from relay_autotune.bag.locate import Content, every_byte
 from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type
@@ -94,7 +94,8 @@ class Path:
         def refuse(unclear: Mask) -> None:
             if bool(unclear.any()):
                 k = int(np.flatnonzero(unclear)[0])
-                raise FieldError(self.why(bytes(content[int(begin[k]) : int(end[k])])))
+                why = self.why(bytes(content[int(begin[k]) : int(end[k])]))
+                raise FieldError(why or f"{written(self.steps)}: the names are not clear")
 
         good = np.ones(begin.size, dtype=np.bool_)
         way: list[str | Place] = []
@@ -198,6 +199,7 @@ class _Cursor:
 
     def _is_named(self, item: Type, field: str, name: str) -> Mask:
         """Pass an element; return in which messages it has the name."""
+        self._note_passed()
         if isinstance(item, Text):
             return self._is_text(name.encode())
         assert isinstance(item, Struct)
@@ -269,13 +271,16 @@ class _Cursor:
             return int(known[0])
         return lengths
 
-    def _skip(self, kind: Type) -> None:
+    def _note_passed(self) -> None:
         self._passed += 1
         if self._passed > MOST_STEPS:
             raise BagError(
                 f"the field that is wanted lies behind more than {MOST_STEPS} others, "
                 f"too far into a message to be read"
             )
+
+    def _skip(self, kind: Type) -> None:
+        self._note_passed()
         if isinstance(kind, Number):
             self._align(kind.size)
             self._advance(kind.size)

@@ -16,7 +16,7 @@ from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import message_type
 from relay_autotune.bag.topics import Topics
-from relay_autotune.errors import FieldError, SelectionError
+from relay_autotune.errors import BagError, FieldError, SelectionError
 
 # Fields as those of sensor_msgs/JointState, control_msgs/MultiDOFCommand, MultiDOFStateStamped,
 # DynamicJointState and JointTrajectoryControllerState.
@@ -259,3 +259,28 @@ def test_a_bag_whose_names_are_not_clear_is_refused(tmp_path, field, sentence):
     path = bag_of_joints(tmp_path / "bag.mcap", orders)
     with pytest.raises(SelectionError, match=sentence):
         signal_of(path, f"/joint_states:{field}")
+
+
+def test_a_message_that_claims_millions_of_names_is_given_up_soon():
+    kind = Kind("Joints")
+    message = joints(kind, ["left"], [0.0])
+    data = bytearray(kind.store.serialize_cdr(message, kind.name))
+    # The number of names follows "base" and its zero, aligned.
+    assert data[16:20] == b"\x01\0\0\0"
+    data[16:20] = (2**31).to_bytes(4, "little")
+    content = bytes(data) + bytes(1_000_000)
+    ends = np.array([len(content)])
+    with pytest.raises(BagError, match="too far into a message"):
+        kind.path("position[left]").read(content, np.array([0]), ends)
+
+
+def test_names_beside_texts_of_unknown_length_are_refused_in_words():
+    text = "float64[] values\nstring[] name\nwstring remark\n"
+    root = message_type(Channel(1, "/t", "x_msgs/msg/Wide", "cdr", "ros2msg", text.encode(), {}))
+    # Two values, two names that are the same; the remark cannot be decoded.
+    values = (2).to_bytes(4, "little") + bytes(4) + np.array([1.0, 2.0]).tobytes()
+    name = (2).to_bytes(4, "little") + b"a\0\0\0"
+    data = b"\0\1\0\0" + values + (2).to_bytes(4, "little") + name * 2 + bytes(8)
+    path = Path(root, steps_of(root, "values[a]", "/t"))
+    with pytest.raises(FieldError, match=r"values\[a\]: the names are not clear"):
+        path.read(data, np.array([0]), np.array([len(data)]))
