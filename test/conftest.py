@@ -1,9 +1,42 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Make property tests repeatable, and deaf to how busy the machine is."""
+"""Make property tests repeatable, and deaf to how busy the machine is.
 
+Tests that need a browser are left out where there is none, and a line at the end says so.
+"""
+
+import pytest
 from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
+
+_LEFT_OUT = pytest.StashKey[int]()
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--require-chromium", action="store_true", help="fail where there is no Chromium"
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    of_browsers = [item for item in items if item.get_closest_marker("browser")]
+    if not of_browsers:
+        return
+    # imported here: the environment with the oldest libraries has no server, nor these tests
+    import chromium
+
+    if chromium.found():
+        return
+    if config.getoption("--require-chromium"):
+        raise pytest.UsageError("no Chromium found: apt install chromium")
+    for item in of_browsers:
+        item.add_marker(pytest.mark.skip(reason="no Chromium found"))
+    config.stash[_LEFT_OUT] = len(of_browsers)
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    if config.stash.get(_LEFT_OUT, 0):
+        terminalreporter.write_line("no Chromium found: the browser tests did not run")

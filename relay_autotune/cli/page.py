@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 _LOOPBACK = "127.0.0.1"
 
 
-def add_web(parser: argparse.ArgumentParser) -> None:
+def add_web(
+    parser: argparse.ArgumentParser,
+    what: str = "also serve a page to shape the gains, until Ctrl-C",
+) -> None:
     """Add the options of the page.
 
     :param parser: of the command.
+    :param what: the page does.
     """
     group = parser.add_argument_group("a page in the browser")
-    group.add_argument(
-        "--web", action="store_true", help="also serve a page to shape the gains, until Ctrl-C"
-    )
+    group.add_argument("--web", action="store_true", help=what)
     group.add_argument(
         "--web-address", default=_LOOPBACK, metavar="HOST[:PORT]",
         help="where it is served (%(default)s, any free port); other than on this machine's own "

@@ -40,6 +40,7 @@ from relay_autotune.cli.new_loop import (
     own_namespace,
     with_flags,
 )
+from relay_autotune.cli.page import add_web, check_web
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (
     NARROWEST,
@@ -77,6 +78,11 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(own)
     if options.amplitude < 0.0 or options.wait < 0.0:
         parser.error("--amplitude and --wait are at least 0")
+    if options.web and (options.dry_run or options.json or options.report or options.export):
+        parser.error(
+            "--web has check, result, report and exports on its page: leave out --dry-run, "
+            "--json, --report and --export"
+        )
     options.typed = given
     if options.measurement and options.command:
         # At once, since what follows takes a second to load.
@@ -129,6 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_new_loop(parser)
+    add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
     return parser
 
 
@@ -148,6 +155,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         from relay_autotune.cli.report import check_output
 
         check_output(PROGRAM, options.report)
+    if options.web:
+        check_web(options)
     new = is_new_loop(options)
     try:
         namespace = own_namespace(options) if new else options.namespace
@@ -176,7 +185,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
                 needs_identifier=not (options.dry_run or options.record_only),
                 leave=leave,
             )
-        if new and not options.dry_run and not _is_agreed(client, options, deadline):
+        asks_here = not (options.dry_run or options.web)
+        if new and asks_here and not _is_agreed(client, options, deadline):
             return NOTHING_FOUND
         heed(signal.SIGINT)
         # Until here nothing has started. Ctrl-Z may stop this command; the tune then continues.
@@ -186,6 +196,10 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         if interrupted:
             raise KeyboardInterrupt
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
+        if options.web:
+            from relay_autotune.cli.tune_page import TunePage
+
+            return TunePage(PROGRAM, client, options, shown, _follow).run(interrupted)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
@@ -237,11 +251,11 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
     return agrees("Start the tune?", yes=options.yes)
 
 
-def _follow(client: TuneClient, shown: Shown, interrupted: list[int]) -> None:
+def _follow(client: TuneClient, shown: Shown, interrupted: list[int], tick: float = _TICK) -> None:
     """Show the feedback until the result is there, and cancel when asked to."""
     asked = 0
     while not client.done():
-        client.spin(_TICK)
+        client.spin(tick)
         for feedback in client.news():
             shown.take(feedback)
         shown.tick()

@@ -13,18 +13,29 @@ from typing import Any
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import qos_profile_sensor_data
 
-from relay_autotune.errors import LoopError
+from relay_autotune.errors import FieldError, LoopError
 from relay_autotune.exchange.messages import record_from_message, without_impossible
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.command_message import CommandMessage
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
-from relay_autotune_msgs.msg import RelayExperiment
+from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 # Silence after which relay_node counts as lost during a tune [s], in addition to the middleware's
 # liveliness lease.
 _GONE = 1.0
+# Topics of relay_node that may have the type of measurement and command.
+_OTHER_ENDS = (
+    "controller_command",
+    "command_feedback",
+    "other_commands",
+    "setpoint",
+    "hold_request",
+)
 # States of an ended goal; the safe command was sent before.
 _ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 # Parts of the refusals that nodes give after their start, until discovery is complete.
@@ -199,6 +210,88 @@ class TuneClient(LoopClient):
         if found is None:
             raise LoopError(f"the samples of {wanted} have not come within {patience:g} s")
         return record_from_message(found)
+
+    def rest(self, seconds: float) -> None:
+        """Handle messages for a time.
+
+        :param seconds: the time [s].
+        """
+        self._wait(lambda: False, time.monotonic() + seconds)
+
+    def watch_measurement(self, take: Callable[[float], None]) -> None:
+        """Hear each measurement that relay_node hears.
+
+        :param take: called with it [y].
+        :raises LoopError: if its topic cannot be told from others.
+        """
+        values = self.values(self.name, ["measurement_type", "measurement_field"])
+        reader = reader_of(*values.values())
+
+        def hear(message: Any) -> None:
+            with suppress(FieldError):
+                take(reader.value(message))
+
+        name = self._topic_of("measurement", reader.type_name, published=False)
+        # Best effort, so that nobody waits for this client.
+        self._node.create_subscription(reader.kind, name, hear, qos_profile_sensor_data)
+
+    def command_watch(
+        self, take: Callable[[float], None], settings: Callable[[Any], None]
+    ) -> Callable[[], Callable[[], None]]:
+        """Return what begins to hear the commands of a tune; it returns what ends it.
+
+        It is to be called once the tune has begun: relay_node refuses a start where nobody hears
+        its commands, and this client would count as somebody.
+
+        :param take: called with each command [u].
+        :param settings: called with the `RelaySettings` of each cycle.
+        :raises LoopError: if the topic cannot be told from others.
+        """
+        kind, field = self.values(self.name, ["command_type", "command_field"]).values()
+        commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)
+        name = self._topic_of("command", commands.type_name, published=True)
+
+        def hear(message: Any) -> None:
+            with suppress(FieldError):
+                take(commands.value(message))
+
+        def begin() -> Callable[[], None]:
+            ears = [
+                self._node.create_subscription(commands.kind, name, hear, qos_profile_sensor_data),
+                self._node.create_subscription(
+                    RelayCycle,
+                    self._resolved("relay_cycle"),
+                    lambda cycle: settings(cycle.settings),
+                    qos_profile_sensor_data,
+                ),
+            ]
+
+            def end() -> None:
+                for ear in ears:
+                    self._node.destroy_subscription(ear)
+
+            return end
+
+        return begin
+
+    def _topic_of(self, topic: str, type_name: str, *, published: bool) -> str:
+        """Return the name that a topic of relay_node has, which may be remapped."""
+        space, _, name = self.name.rpartition("/")
+        ends = (
+            self._node.get_publisher_names_and_types_by_node
+            if published
+            else self._node.get_subscriber_names_and_types_by_node
+        )(name, space or "/")
+        others = {self._resolved(other) for other in _OTHER_ENDS}
+        found = [end for end, types in ends if type_name in types and end not in others]
+        own = self._resolved(topic)
+        if own in found or len(found) == 1:
+            return own if own in found else found[0]
+        told = ", ".join(found) or "none"
+        raise LoopError(
+            f"the {topic} cannot be shown: {self.name} has {told} of {type_name} for it, expected "
+            f"one; give this command the same -r {topic}:=TOPIC"
+        )
 
     def identifier_values(self, patience: float) -> dict[str, Any] | None:
         """Return the parameters of the identifier_node by name; None: it did not answer.

@@ -9,10 +9,13 @@ import asyncio
 import json
 import mimetypes
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
+from threading import Thread
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -31,20 +34,25 @@ from relay_autotune.tuning import RULES
 from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.address import Address
+from relay_autotune.web.live import WISHES, Live
 from relay_autotune.web.shape import Asked, Subject, asked_of
 from relay_autotune.web.worker import Worker
 
 Export = Callable[[Gains, str, str], str]
 
-_STATIC = ("page.html", "page.css", "page.js", "plot.js")
+_STATIC = ("page.html", "page.css", "page.js", "plot.js", "live.js")
 # No script, style or connection but those of this server, and no page around ours.
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _LARGEST_QUESTION = 1 << 16
+# How long open pages may take to hear of the end [s].
+_ENDS_WITHIN = 5.0
 # Interval of what is told without being asked [s].
 _EVERY = 0.5
+# Interval of samples [s]; the eye sees no more, and relay_node needs the processor.
+_LIVE_EVERY = 0.04
 # Answers that are kept beside those of the slider's positions.
 _MOST_KEPT = 2000
 
@@ -56,6 +64,7 @@ class Page:
     :param exports: the kinds of files that gains can be written into.
     :param export: returns gains as such a file, with its kind and what makes them doubtful.
     :param address: where it is served.
+    :param live: the loop that is watched; None: the page is of what there is.
     """
 
     def __init__(
@@ -64,30 +73,41 @@ class Page:
         exports: Sequence[str],
         export: Export,
         address: Address,
+        live: Live | None = None,
     ) -> None:
-        self.subjects = tuple(subjects)
+        self.subjects: list[Subject] = []
         self.exports = tuple(exports)
         self.export = export
         self.address = address
+        self.live = live
         self.worker = Worker()
         """Computes what is asked; what the page shows first, at once."""
         self._known: dict[tuple[int, Asked], str] = {}
-        self._foreseen = False
-        self.open: set[WebSocketHandler] = set()
+        self._foreseen: set[int] = set()
+        self.open: set[_Socket] = set()
         """Connections of the pages that are open."""
-        for number, subject in enumerate(self.subjects):
-            if subject.shaping is not None:
-                self.worker.later(partial(self._answer, number, subject.first))
+        for subject in subjects:
+            self.add(subject)
 
-    def foresee(self) -> None:
-        """Compute in between what the slider can ask for, once a page is open."""
-        if self._foreseen:
+    def add(self, subject: Subject) -> None:
+        """Show another model; what the page shows of it first is computed at once.
+
+        :param subject: the model.
+        """
+        self.subjects.append(subject)
+        if subject.shaping is not None:
+            self.worker.later(partial(self._answer, len(self.subjects) - 1, subject.first))
+
+    def foresee(self, number: int) -> None:
+        """Compute in between what the slider can ask for, once somebody has asked.
+
+        :param number: of the model.
+        """
+        if number in self._foreseen or self.subjects[number].shaping is None:
             return
-        self._foreseen = True
-        for number, subject in enumerate(self.subjects):
-            if subject.shaping is not None:
-                for asked in subject.positions():
-                    self.worker.later(partial(self._answer, number, asked))
+        self._foreseen.add(number)
+        for asked in self.subjects[number].positions():
+            self.worker.later(partial(self._answer, number, asked))
 
     async def answer(self, number: int, asked: Asked) -> str:
         """Return the answer to what a page asks, as JSON.
@@ -95,6 +115,7 @@ class Page:
         :param number: of the model.
         :param asked: what is asked for.
         """
+        self.foresee(number)
         known = self._known.get((number, asked))
         if known is not None:
             return known
@@ -119,6 +140,16 @@ class Page:
         """Return what a page shows whatever is asked, as JSON."""
         subjects = [wire.of_subject(subject) for subject in self.subjects]
         return wire.to_text({"subjects": subjects, "exports": list(self.exports)})
+
+    def tell_news(self) -> None:
+        """Tell all open pages what is new of the loop that is watched."""
+        if self.live is None:
+            return
+        news = self.live.news()
+        if news is not None:
+            text = wire.to_text(news)
+            for socket in list(self.open):
+                socket.tell(text)
 
 
 class _Guarded(RequestHandler):
@@ -253,12 +284,28 @@ class _Socket(_Guarded, WebSocketHandler):
     def open(self, *_: str, **__: str) -> None:
         """Tell the page everything, and from then on what is new."""
         self.set_nodelay(True)
-        self._told: list[int] = [-1] * len(self.page.subjects)
+        self._told: dict[int, int] = {}
+        self._shown = 0
+        if self.page.live is not None:
+            # What is new until now is part of everything.
+            self.page.tell_news()
+            self.tell(wire.to_text(self.page.live.everything()))
         self.page.open.add(self)
-        self.page.foresee()
-        self.write_message(self.page.everything())
+        self._tell_subjects()
         self._news = PeriodicCallback(self._tell_news, 1000.0 * _EVERY)
         self._news.start()
+
+    def tell(self, text: str) -> None:
+        """Send a message; a page that has just gone misses it.
+
+        :param text: JSON.
+        """
+        with suppress(WebSocketClosedError):
+            self.write_message(text)
+
+    def _tell_subjects(self) -> None:
+        self._shown = len(self.page.subjects)
+        self.tell(self.page.everything())
 
     def on_close(self) -> None:
         """Stop telling."""
@@ -270,6 +317,9 @@ class _Socket(_Guarded, WebSocketHandler):
         begun = time.perf_counter()
         try:
             question = json.loads(message)
+            if self.page.live is not None and "do" in question:
+                self._wish(self.page.live, question["do"])
+                return
             number, count = question["of"], question["n"]
             if not (isinstance(number, int) and 0 <= number < len(self.page.subjects)):
                 raise TuningError("there is no such experiment")
@@ -281,17 +331,21 @@ class _Socket(_Guarded, WebSocketHandler):
         took = 1000.0 * (time.perf_counter() - begun)
         head = wire.to_text({"of": number, "n": count if isinstance(count, int) else 0,
                              "took": round(took, 3)})  # fmt: skip
-        try:
-            await self.write_message(f'{head[:-1]},"answer":{answer}}}')
-        except WebSocketClosedError:
-            return
+        self.tell(f'{head[:-1]},"answer":{answer}}}')
+
+    def _wish(self, live: Live, what: object) -> None:
+        if what not in WISHES:
+            raise TuningError("there is no such wish")
+        live.wish(str(what))
 
     def _tell_news(self) -> None:
+        if self._shown != len(self.page.subjects):
+            self._tell_subjects()
         for number, subject in enumerate(self.page.subjects):
             known = wire.of_trade_off(subject)
-            if len(known) != self._told[number]:
+            if len(known) != self._told.get(number):
                 self._told[number] = len(known)
-                self.write_message(wire.to_text({"of": number, "trade_off": known}))
+                self.tell(wire.to_text({"of": number, "trade_off": known}))
 
 
 def _one_line(error: Exception) -> str:
@@ -336,9 +390,13 @@ async def serve(page: Page, tell: Callable[[str], None]) -> None:
     server = HTTPServer(application(page), max_body_size=_LARGEST_QUESTION)
     server.add_sockets(sockets)
     tell(address.url(sockets[0].getsockname()[1]))
+    news = PeriodicCallback(page.tell_news, 1000.0 * _LIVE_EVERY)
+    news.start()
     try:
         await asyncio.Event().wait()
     finally:
+        page.tell_news()
+        news.stop()
         page.worker.close()
         server.stop()
         for socket in list(page.open):
@@ -357,3 +415,32 @@ def run(page: Page, tell: Callable[[str], None]) -> None:
         asyncio.run(serve(page, tell))
     except KeyboardInterrupt:
         return
+
+
+@contextmanager
+def in_background(page: Page) -> Iterator[str]:
+    """Serve a page from a thread, and yield what to open.
+
+    :param page: what is shown.
+    :raises SelectionError: if the address cannot be used.
+    """
+    loop = asyncio.new_event_loop()
+    address: Future[str] = Future()
+
+    async def until_cancelled() -> None:
+        try:
+            await serve(page, address.set_result)
+        except asyncio.CancelledError:
+            return
+        except SelectionError as error:
+            address.set_exception(error)
+
+    task = loop.create_task(until_cancelled())
+    # It ends with the process also where this block is left by a second Ctrl-C.
+    thread = Thread(target=loop.run_until_complete, args=(task,), name="server", daemon=True)
+    thread.start()
+    try:
+        yield address.result()
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join(_ENDS_WITHIN)

@@ -36,12 +36,18 @@ _DIGITS = 4
 
 
 def to_text(document: dict[str, Any]) -> str:
-    """Return a document as JSON without any number that JSON does not know."""
+    """Return a document as JSON without any number that JSON does not know.
+
+    :param document: of plain values.
+    """
     return json.dumps(document, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
 
 
-def _short(values: FloatArray) -> list[float | None]:
-    """Return numbers with few digits; None stands for one that is not finite."""
+def short(values: FloatArray) -> list[float | None]:
+    """Return numbers with few digits; None stands for one that is not finite.
+
+    :param values: shape (n,).
+    """
     finite = np.isfinite(values)
     largest = float(np.abs(values[finite]).max(initial=0.0))
     decimals = _DIGITS - math.floor(math.log10(largest)) if largest > 0.0 else 0
@@ -68,9 +74,7 @@ def of_subject(subject: Subject) -> dict[str, Any]:
         if model is None
         else [_estimate(e) for e in (*model.estimates, *model.ultimate)],
         "record": _record(case),
-        "rules": [
-            {"rule": g.rule, "ms": _short(np.array([g.ms, g.iae_load]))} for g in case.gains
-        ],
+        "rules": [{"rule": g.rule, "ms": short(np.array([g.ms, g.iae_load]))} for g in case.gains],
         "may_shape": subject.shaping is not None,
         "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
         "first": of_asked(subject.first),
@@ -116,21 +120,21 @@ def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
         "effects": _effects(subject, shaped),
         "beside": [[r.name, r.present, r.new, r.meaning] for r in beside_present(case)],
-        "at": _short(np.array([gains.ms, gains.iae_load])),
+        "at": short(np.array([gains.ms, gains.iae_load])),
         "b": gains.b,
         "ms": gains.ms,
         "steps": {
-            "time": _short(steps.time),
-            "measurement": _short(steps.measurement),
-            "command": _short(steps.command),
-            "low": _short(steps.low),
-            "high": _short(steps.high),
+            "time": short(steps.time),
+            "measurement": short(steps.measurement),
+            "command": short(steps.command),
+            "low": short(steps.low),
+            "high": short(steps.high),
             "load_time": steps.load_time,
         },
         "nyquist": {
-            "re": _short(shaped.curve.loop.real),
-            "im": _short(shaped.curve.loop.imag),
-            "band": [_short(part.ravel()) for part in shaped.curve.band],
+            "re": short(shaped.curve.loop.real),
+            "im": short(shaped.curve.loop.imag),
+            "band": [short(part.ravel()) for part in shaped.curve.band],
         },
         "command": visible(case.command),
     }
@@ -139,7 +143,7 @@ def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
 def of_trade_off(subject: Subject) -> list[list[Any]]:
     """Return Ms and IAE of the controllers that are known so far, each with its kind."""
     return [
-        ["pid" if gains.td > 0.0 else "pi", *_short(np.array([gains.ms, gains.iae_load]))]
+        ["pid" if gains.td > 0.0 else "pi", *short(np.array([gains.ms, gains.iae_load]))]
         for _, gains in subject.trade_off()
     ]
 
@@ -192,12 +196,12 @@ def _record(case: Case) -> dict[str, Any] | None:
     time, measurement = thinned(record.time, record.measurement)
     held, command = in_steps(record.time, record.command)
     found = {
-        "time": _short(time),
-        "measurement": _short(measurement),
-        "command": [_short(part) for part in thinned(held, command)],
+        "time": short(time),
+        "measurement": short(measurement),
+        "command": [short(part) for part in thinned(held, command)],
         "model": None,
     }
     model = case.model
     if model is not None and model.fitted.size == len(record):
-        found["model"] = [_short(part) for part in thinned(record.time, model.fitted)]
+        found["model"] = [short(part) for part in thinned(record.time, model.fitted)]
     return found

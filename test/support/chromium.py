@@ -72,7 +72,7 @@ class Chromium:
         self._process.wait(_ANSWERS_WITHIN)
 
     def tab(self, url: str = "") -> Tab:
-        """Open a tab.
+        """Open a window of its own, since one behind another draws nothing.
 
         :param url: what it shows.
         """
@@ -80,7 +80,7 @@ class Chromium:
             browser = json.load(answer)["webSocketDebuggerUrl"]
         made = Tab(self._loop, browser)
         self._tabs.append(made)
-        target = made.call("Target.createTarget", url="about:blank")["targetId"]
+        target = made.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
         made.connect(re.sub(r"/devtools/.*", f"/devtools/page/{target}", browser))
         if url:
             made.go(url)
@@ -103,15 +103,18 @@ class Tab:
 
     def connect(self, url: str) -> None:
         """Talk to another target from now on."""
-        self._connection.close()
+        self.close()
         self._connection = self._run(lambda: websocket_connect(url, max_message_size=1 << 28))
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
     def close(self) -> None:
         """End the connection."""
-        self._connection.close()
-        self._run(lambda: asyncio.sleep(0))
+
+        async def closed() -> None:
+            self._connection.close()
+
+        self._run(closed)
 
     def _run(self, begin: Callable[[], Any]) -> Any:
         async def awaited() -> Any:
@@ -155,15 +158,13 @@ class Tab:
         """Return the text of an element as it is shown."""
         return str(self.eval(f"document.querySelector({json.dumps(selector)})?.innerText ?? ''"))
 
-    def wait(self, expression: str, seconds: float = 60.0) -> Any:
-        """Return the value of an expression once it is true.
+    def wait(self, expression: str, seconds: float = 60.0) -> None:
+        """Wait until an expression is true.
 
         :param expression: JavaScript.
         :param seconds: longest wait.
         """
-        return self.until(
-            lambda: self.eval(f"document.body && ({expression})"), expression, seconds
-        )
+        self.until(lambda: self.eval(f"!!(document.body && ({expression}))"), expression, seconds)
 
     def until(self, holds: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
         """Return a value once it is true."""

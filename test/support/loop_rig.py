@@ -132,8 +132,11 @@ class Rig:
             parameters.setdefault("record_directory", str(self.records))
         return self._launch(executable, [_path(executable)], arguments, parameters, output)
 
-    def start_command(self, executable: str, *words: str, output: int) -> Process:
-        """Start an installed command with its own words in a terminal."""
+    def start_command(self, executable: str, *words: str, output: int | None = None) -> Process:
+        """Start an installed command with its own words.
+
+        :param output: a terminal for it; None: its log.
+        """
         return self._begin(executable, [_path(executable), *words], output)
 
     def start_python(self, name: str, code: str, **parameters: Any) -> Process:

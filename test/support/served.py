@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from tornado.websocket import websocket_connect
 
@@ -20,7 +21,8 @@ from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.report.case import case_of
 from relay_autotune.web.address import Address
-from relay_autotune.web.server import Page, serve
+from relay_autotune.web.live import Live
+from relay_autotune.web.server import Page, in_background
 from relay_autotune.web.shape import Asked, Subject
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -47,12 +49,17 @@ def hostile(subject: Subject) -> Subject:
 
 @contextmanager
 def served(
-    subjects: list[Subject], address: Address | None = None, *, ahead: bool = False
+    subjects: list[Subject],
+    address: Address | None = None,
+    *,
+    ahead: bool = False,
+    live: Live | None = None,
 ) -> Iterator[str]:
     """Serve a page, and yield what to open.
 
     :param subjects: what it shows.
     :param address: where it is served.
+    :param live: the loop that is watched.
     :param ahead: whether what the slider may ask for is computed in between.
     """
     page = Page(
@@ -60,31 +67,12 @@ def served(
         ("yaml",),
         lambda gains, how, doubt: f"{how} {gains.kc:.6g} {doubt}\n",
         address or Address(),
+        live,
     )
     if not ahead:
-        page.foresee = lambda: None  # type: ignore[method-assign]
-    loop, told, urls = asyncio.new_event_loop(), threading.Event(), []
-
-    def tell(url: str) -> None:
-        urls.append(url)
-        told.set()
-
-    async def until_cancelled() -> None:
-        try:
-            await serve(page, tell)
-        except asyncio.CancelledError:
-            return
-
-    task = loop.create_task(until_cancelled())
-    thread = threading.Thread(target=loop.run_until_complete, args=(task,))
-    thread.start()
-    try:
-        assert told.wait(30.0)
-        yield urls[0]
-    finally:
-        loop.call_soon_threadsafe(task.cancel)
-        thread.join()
-        loop.close()
+        page.foresee = lambda number: None  # type: ignore[method-assign]
+    with in_background(page) as url:
+        yield url
 
 
 def conversation(url: str, *questions: object, headers: dict[str, str] | None = None) -> list:
@@ -116,3 +104,54 @@ def conversation(url: str, *questions: object, headers: dict[str, str] | None = 
         return heard
 
     return asyncio.run(talk())
+
+
+class OpenPage:
+    """A page that is open in a browser, as the server sees it, in a thread of its own.
+
+    :param url: of the page.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._address = url.replace("http:", "ws:", 1) + "socket"
+        self.told: dict[str, Any] = {}
+        """What it was told last of the loop."""
+        self.samples: dict[str, list[float]] = {"measurement": [], "command": []}
+        self.subjects: list[dict[str, Any]] = []
+        self.ended = threading.Event()
+        self._loop = asyncio.new_event_loop()
+        self._opened = threading.Event()
+        threading.Thread(target=self._run, daemon=True).start()
+        assert self._opened.wait(30.0)
+
+    def _run(self) -> None:
+        self._loop.run_until_complete(self._listen())
+
+    async def _listen(self) -> None:
+        self._socket = await websocket_connect(self._address)
+        self._opened.set()
+        while (text := await self._socket.read_message()) is not None:
+            message = json.loads(text)
+            self.told = message.get("live", self.told)
+            self.subjects = message.get("subjects", self.subjects)
+            for name, (_, values) in message.get("samples", {}).items():
+                self.samples[name] += values
+        self.ended.set()
+
+    @property
+    def phase(self) -> str:
+        """What the page says is going on."""
+        return str(self.told.get("phase", ""))
+
+    def do(self, wish: str) -> None:
+        """Wish something."""
+
+        def send() -> None:
+            self._socket.write_message(json.dumps({"do": wish}))
+
+        self._loop.call_soon_threadsafe(send)
+
+    def close(self) -> None:
+        """Close the browser."""
+        self._loop.call_soon_threadsafe(self._socket.close)
+        assert self.ended.wait(30.0)

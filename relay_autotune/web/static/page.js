@@ -4,6 +4,7 @@
 // The page: it asks for gains as the controls say, and shows what is answered. All text from the
 // server is set as text, never as markup.
 
+import { Live } from "./live.js";
 import { Plot } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
@@ -289,12 +290,29 @@ async function download(path, file, more) {
   }
 }
 
+let live = null; // made when the server has a loop to watch
+
 function take(message) {
+  if (message.live || message.samples) {
+    live ??= new Live((what) => socket.send(JSON.stringify({ do: what })), agreed);
+    live.take(message);
+    return;
+  }
+  if (message.subjects && !message.subjects.length) {
+    $("name").textContent = live ? live.told.node : "";
+    document.title = `${$("name").textContent} - relay_autotune`;
+    $("data").hidden = true;
+    $("shape").hidden = true;
+    return;
+  }
   if (message.subjects) {
+    $("data").hidden = false;
+    const added = live && subjects.length && message.subjects.length > subjects.length;
     subjects = message.subjects;
     exports_ = message.exports;
-    const of = Number(new URLSearchParams(location.hash.slice(1)).get("of"));
-    choose(of >= 0 && of < subjects.length ? of : 0);
+    // After a tune its own result is shown, else what the address says.
+    const of = Number(new URLSearchParams(location.hash.slice(1)).get("of") ?? -1);
+    choose(of >= 0 && of < subjects.length && !added ? of : added ? subjects.length - 1 : 0);
     return;
   }
   if (message.trade_off) {

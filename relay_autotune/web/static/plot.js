@@ -70,6 +70,7 @@ export class Plot {
     const bands = what.bands || [];
     const marks = what.marks || [];
     let xs = what.xs || range([...curves.map((c) => c.x), marks.map((m) => m.x)]);
+    if (!(xs[1] > xs[0])) xs = [xs[0] - 0.5, xs[0] + 0.5];
     const ys = what.ys || range(
       [...curves.map((c) => c.y), ...bands.map((b) => b.low), ...bands.map((b) => b.high),
         marks.map((m) => m.y)]);

@@ -1,0 +1,275 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""tune_loop --web: tunes are started, watched and ended on a page, as often as one likes."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say
+from relay_autotune.cli.design_arguments import EXPORTS
+from relay_autotune.cli.export import Target, exported
+from relay_autotune.cli.layout import WIDEST
+from relay_autotune.cli.tune_report import analysed_as_there, defaults, flags_of
+from relay_autotune.cli.tune_view import (
+    STATES,
+    Paint,
+    check_lines,
+    estimate,
+    oscillation,
+    result_lines,
+)
+from relay_autotune.errors import LoopError, RelayAutotuneError
+from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.loop.gains import Gains
+from relay_autotune.nodes.tune_client import TuneClient
+from relay_autotune.report.case import case_of
+from relay_autotune.text import process_text
+from relay_autotune.verdict import Verdict
+from relay_autotune.web.address import address_of
+from relay_autotune.web.live import CHECK, START, Live
+from relay_autotune.web.server import Page, in_background
+from relay_autotune.web.shape import Asked, Subject
+
+# How long messages are handled before wishes are looked at [s].
+_TICK = 0.05
+# How long to wait for what the analysis needs from the nodes [s].
+_PATIENCE = 5.0
+_TONES = {"completed": "good", "aborted": "bad", "failed": "bad"}
+
+Follow = Callable[[TuneClient, Any, list[int], float], None]
+
+
+class _OnPage:
+    """The progress of a tune on the page, and in the terminal as without one.
+
+    :param live: what pages see.
+    :param shown: the terminal.
+    :param ends: gets a number when the tune is to end.
+    :param interrupted: signals that have come.
+    :param begun: called at the first feedback.
+    """
+
+    def __init__(
+        self,
+        live: Live,
+        shown: Any,
+        ends: list[int],
+        interrupted: list[int],
+        begun: Callable[[], None],
+    ) -> None:
+        self._live = live
+        self._shown = shown
+        self._ends = ends
+        self._interrupted = interrupted
+        self._heeded = len(interrupted)
+        self._begun: Callable[[], None] | None = begun
+
+    def take(self, feedback: Any) -> None:
+        """Show a feedback."""
+        if self._begun is not None:
+            self._begun()
+            self._begun = None
+        told, state = self._live.told, STATES[feedback.state]
+        changed: dict[str, Any] = {
+            "state": state,
+            "tone": _TONES.get(state, ""),
+            "status": feedback.status,
+            "progress": feedback.progress,
+            "elapsed": feedback.elapsed,
+            "remaining": feedback.remaining,
+        }
+        if feedback.cycle > len(told.cycles):
+            words = (f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback))
+            changed["cycles"] = (*told.cycles, ", ".join(filter(None, words)))
+        if feedback.transfer_function.experiment_id:
+            model = transfer_function_from_message(feedback.transfer_function)
+            changed["process"] = process_text(model)
+        self._live.tell(**changed)
+        self._shown.take(feedback)
+
+    def tick(self) -> None:
+        """Heed what was wished or signalled since the last call."""
+        # SIGHUP, as a wish that is repeated does not leave the tune alone.
+        if self._live.abort.is_set() and not self._ends:
+            self._ends.append(signal.SIGHUP)
+        self._ends += self._interrupted[self._heeded :]
+        self._heeded = len(self._interrupted)
+        self._shown.tick()
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
+        self._live.tell(status=text, tone="warn")
+        self._shown.say(text)
+
+
+class TunePage:
+    """The page of one loop.
+
+    :param program: name of the command.
+    :param client: of the loop's relay_node.
+    :param options: as the command line gives them.
+    :param shown: the terminal.
+    :param follow: shows a tune until it has ended.
+    """
+
+    def __init__(
+        self,
+        program: str,
+        client: TuneClient,
+        options: argparse.Namespace,
+        shown: Any,
+        follow: Follow,
+    ) -> None:
+        self._program = program
+        self._client = client
+        self._options = options
+        self._shown = shown
+        self._follow = follow
+        self._live = Live(client.name)
+        self._begin_command: Callable[[], Callable[[], None]] | None = None
+
+        def written(gains: Gains, how: str, doubt: str) -> str:
+            return exported(gains, how, Target(), doubt=doubt)
+
+        address = address_of(options.web_address)
+        self._page = Page((), EXPORTS, written, address, self._live)
+
+    def run(self, interrupted: list[int]) -> int:
+        """Serve the page, and do what is wished there, until a signal comes.
+
+        :param interrupted: signals that have come.
+        :return: the exit status that the last tune deserves.
+        :raises LoopError: if relay_node is lost during a tune.
+        """
+        status = DONE
+        with in_background(self._page) as url:
+            self._show_signals()
+            say(
+                self._program,
+                f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is "
+                "started there",
+            )
+            try:
+                while not interrupted:
+                    self._client.rest(_TICK)
+                    wish = self._live.next_wish()
+                    if wish == CHECK:
+                        self._check()
+                    elif wish == START:
+                        status = self._tune(interrupted)
+            except LoopError as error:
+                self._live.tell(phase="lost", tone="bad", status=str(error))
+                raise
+        return status
+
+    def _show_signals(self) -> None:
+        live = self._live
+        try:
+            self._client.watch_measurement(lambda value: live.sample("measurement", value))
+            self._begin_command = self._client.command_watch(
+                lambda value: live.sample("command", value),
+                lambda s: live.tell(setpoint=s.setpoint, hysteresis=s.hysteresis),
+            )
+        except RelayAutotuneError as error:
+            live.tell(status=str(error), tone="warn")
+
+    def _check(self) -> None:
+        """Ask whether a tune could start, and how."""
+        self._live.tell(phase="checking", status="looking at the loop", tone="")
+        self._client.ask(self._options.amplitude, dry_run=True)
+        while not self._client.done():
+            self._client.spin(_TICK)
+        result, accepted = self._client.result, self._client.succeeded
+        self._live.forget_wishes()
+        self._live.tell(
+            phase="idle",
+            status="a tune can start" if accepted else f"refused: {result.reason}",
+            tone="good" if accepted else "bad",
+            checks=tuple(check_lines(list(result.checks), WIDEST)),
+            checked=self._live.told.checked + 1,
+            accepted=accepted,
+        )
+
+    def _tune(self, interrupted: list[int]) -> int:
+        """Tune until the result is there."""
+        client, live = self._client, self._live
+        live.forget_wishes()
+        live.tell(
+            phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
+            elapsed=0.0, cycles=(), process="", result=(),
+        )  # fmt: skip
+        endings: list[Callable[[], None]] = []
+
+        def begun() -> None:
+            if self._begin_command is not None:
+                endings.append(self._begin_command())
+
+        ends: list[int] = []
+        try:
+            client.ask(self._options.amplitude, dry_run=False)
+            shown = _OnPage(live, self._shown, ends, interrupted, begun)
+            self._follow(client, shown, ends, _TICK)
+            self._shown.clear()
+        finally:
+            for end in endings:
+                end()
+        result = client.result
+        for refused in sorted(client.refused):
+            say(self._program, refused)
+        if not result.experiment.experiment_id:
+            live.tell(phase="idle", status=f"refused: {result.reason}", tone="bad")
+            return NOTHING_FOUND
+        lines = result_lines(result, client.cancelled, Paint())
+        print("\n".join(lines), flush=True)
+        live.tell(
+            phase="analysing",
+            status="model and gains are computed once more, to shape them",
+            result=tuple(lines),
+        )
+        if result.transfer_function.experiment_id:
+            self._add_subject(result)
+        done = client.succeeded and bool(result.gains.experiment_id)
+        live.forget_wishes()
+        live.tell(
+            phase="idle",
+            tone="good" if done else "bad",
+            status="the tune is complete" if done else f"no gains: {result.reason}",
+        )
+        if not done:
+            return NOTHING_FOUND
+        return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
+
+    def _add_subject(self, result: Any) -> None:
+        """Show the model of the tune, and let its gains be shaped."""
+        try:
+            record = self._client.record(_PATIENCE)
+            values = self._client.identifier_values(_PATIENCE) or defaults()
+            found = analysed_as_there(record, values)
+        except RelayAutotuneError as error:
+            say(self._program, f"the gains cannot be shaped: {error}")
+            return
+        bag = result.bag
+
+        def command(asked: Asked) -> str:
+            if not bag:
+                return ""
+            wanted = {name: v for name, v in vars(asked).items() if v is not None}
+            return f"replay {shlex.quote(bag)} {flags_of({**values, **wanted})}".rstrip()
+
+        weight = values["setpoint_weight"]
+        first = Asked(
+            values["rule"],
+            values["controller"],
+            values["ms"],
+            weight if weight == weight else None,
+        )
+        case = case_of(found, bag or self._client.name)
+        subject = Subject(replace(case, command=command(first)), found.shaping, first, command)
+        self._page.add(subject)

@@ -1,0 +1,188 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A tune as pages see it while it runs: samples as they come, its state in words, what is wished.
+
+One thread tells what happens, another serves the pages. What is told is kept, so that a page that
+is opened late or loaded again shows all. Without any page nothing waits and nothing changes.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from relay_autotune.report.style import in_steps, thinned
+from relay_autotune.web.wire import short
+
+# Samples of each signal that are kept for a page that is opened late.
+_KEPT = 50_000
+CHECK, START, ABORT = "check", "start", "abort"
+WISHES = (CHECK, START, ABORT)
+
+
+@dataclass(frozen=True)
+class Told:
+    """What is known of the tune besides its samples.
+
+    :param node: full name of the relay_node.
+    :param phase: "idle", "checking", "tuning" or "analysing".
+    :param state: what the experiment does, a word.
+    :param status: what it waits for and what it sees, a sentence.
+    :param tone: "", "good", "warn" or "bad".
+    :param progress: 0 to 1.
+    :param elapsed: since the start [s].
+    :param remaining: expected until the end [s]; NaN: not estimated.
+    :param cycles: a line for each whole cycle, with the estimates after it.
+    :param process: the newest model, as text.
+    :param setpoint: about which the relay switches [y]; NaN: not known yet.
+    :param hysteresis: half the width of its band [y].
+    :param checks: lines of the last check.
+    :param checked: number of checks so far.
+    :param accepted: whether a tune could start, as far as the last check knows.
+    :param result: lines of the last result.
+    """
+
+    node: str
+    phase: str = "idle"
+    state: str = ""
+    status: str = ""
+    tone: str = ""
+    progress: float = 0.0
+    elapsed: float = 0.0
+    remaining: float = math.nan
+    cycles: tuple[str, ...] = ()
+    process: str = ""
+    setpoint: float = math.nan
+    hysteresis: float = math.nan
+    checks: tuple[str, ...] = ()
+    checked: int = 0
+    accepted: bool = False
+    result: tuple[str, ...] = ()
+
+
+@dataclass
+class _Signal:
+    """The samples of one signal."""
+
+    kept: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    new: list[tuple[float, float]] = field(default_factory=list)
+
+
+class Live:
+    """What pages see of the tunes of one loop, and what they wish.
+
+    :param node: full name of the relay_node.
+    """
+
+    def __init__(self, node: str) -> None:
+        self._lock = threading.Lock()
+        self._told = Told(node)
+        self._is_new = True
+        self._signals = {"measurement": _Signal(), "command": _Signal()}
+        self._begun = time.monotonic()
+        self._wishes: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.abort = threading.Event()
+        """Whether a page wishes that the tune ends."""
+
+    @property
+    def told(self) -> Told:
+        """What is known now."""
+        with self._lock:
+            return self._told
+
+    def tell(self, **changed: Any) -> None:
+        """Change what is known.
+
+        :param changed: fields of `Told`.
+        """
+        with self._lock:
+            self._told = replace(self._told, **changed)
+            self._is_new = True
+
+    def sample(self, signal: str, value: float) -> None:
+        """Take a sample of now.
+
+        :param signal: "measurement" or "command".
+        :param value: y or u.
+        """
+        if not math.isfinite(value):
+            return
+        at = (round(time.monotonic() - self._begun, 4), value)
+        with self._lock:
+            self._signals[signal].kept.append(at)
+            self._signals[signal].new.append(at)
+
+    def wish(self, what: str) -> None:
+        """Take a wish of a page.
+
+        :param what: one of `WISHES`; during a tune only its end can be wished.
+        """
+        if what == ABORT:
+            self.abort.set()
+        elif self.told.phase == "idle":
+            self._wishes.put(what)
+
+    def next_wish(self) -> str:
+        """Return the next wish; empty: there is none."""
+        try:
+            return self._wishes.get_nowait()
+        except queue.Empty:
+            return ""
+
+    def forget_wishes(self) -> None:
+        """Drop what was wished before a tune began or ended, such as by a second click."""
+        while self.next_wish():
+            pass
+        self.abort.clear()
+
+    def everything(self) -> dict[str, Any]:
+        """Return what a page shows that has just been opened."""
+        with self._lock:
+            told = _document(self._told)
+            kept = {name: list(signal.kept) for name, signal in self._signals.items()}
+        time_, measurement = (np.array(part) for part in _columns(kept["measurement"]))
+        held, command = (np.array(part) for part in _columns(kept["command"]))
+        if command.size > 1:
+            held, command = in_steps(held, command)
+        found = {
+            "measurement": [short(part) for part in thinned(time_, measurement)],
+            "command": [short(part) for part in thinned(held, command)],
+        }
+        return {"live": told, "samples": found, "all": True}
+
+    def news(self) -> dict[str, Any] | None:
+        """Return what pages have not been told yet; None: nothing."""
+        with self._lock:
+            news: dict[str, Any] = {}
+            if self._is_new:
+                news["live"] = _document(self._told)
+                self._is_new = False
+            samples = {}
+            for name, signal in self._signals.items():
+                if signal.new:
+                    samples[name] = [list(part) for part in zip(*signal.new, strict=True)]
+                    signal.new.clear()
+        if samples:
+            news["samples"] = samples
+        return news or None
+
+
+def _columns(samples: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [t for t, _ in samples], [value for _, value in samples]
+
+
+def _document(told: Told) -> dict[str, Any]:
+    """Return what is known as JSON has it: None stands for a number that is not known."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in asdict(told).items()
+    }

@@ -1,0 +1,127 @@
+// Copyright 2026 the developers of relay_autotune
+// SPDX-License-Identifier: Apache-2.0
+
+// The loop as it runs: samples as they come, what the tune does in words, and what can be wished.
+
+import { Plot } from "./plot.js";
+
+const $ = (id) => document.getElementById(id);
+// More points than this are not drawn; every second of the older ones is dropped then.
+const MOST = 3000;
+const TONES = { settling: "warn", kick: "warn", relay: "warn", completed: "good", aborted: "bad", failed: "bad" };
+
+function texts(host, name, lines) {
+  if (host.children.length === lines.length) return;
+  host.replaceChildren(...lines.map((line) => {
+    const made = document.createElement(name);
+    made.textContent = line;
+    return made;
+  }));
+}
+
+export class Live {
+  // send: sends a wish; agreed: asks a question and resolves to the answer
+  constructor(send, agreed) {
+    this.send = send;
+    this.agreed = agreed;
+    this.told = null;
+    this.asking = 0; // number of the check after which the start is to be confirmed; 0: none
+    this.drawn = false;
+    this.signals = { measurement: [[], []], command: [[], []] };
+    this.plots = {
+      measurement: new Plot($("plot-live-measurement"), { label: "Measurement as it comes", y: "measurement [y]" }),
+      command: new Plot($("plot-live-command"), { label: "Command as it comes", x: "time [s]", y: "command [u]" }),
+    };
+    $("check").addEventListener("click", () => send("check"));
+    $("start").addEventListener("click", () => { this.asking = this.told.checked + 1; send("check"); });
+    $("abort").addEventListener("click", () => send("abort"));
+  }
+
+  // message: {live: what is known, samples: the newest, all: they replace those before}
+  take(message) {
+    if (message.live) this.show(message.live);
+    for (const [name, [times, values]] of Object.entries(message.samples || {})) {
+      const [t, v] = message.all ? [[], []] : this.signals[name];
+      for (let k = 0; k < times.length; k += 1) {
+        // A command holds until the next one.
+        if (name === "command" && !message.all && v.length && v[v.length - 1] !== values[k]) {
+          t.push(times[k]);
+          v.push(v[v.length - 1]);
+        }
+        t.push(times[k]);
+        v.push(values[k]);
+      }
+      this.signals[name] = t.length < MOST ? [t, v] : this.thinned(t, v);
+    }
+    if (this.drawn || !message.samples) return;
+    this.drawn = true;
+    // Not by frames, which a window behind others never gets.
+    setTimeout(() => {
+      const begun = performance.now();
+      this.draw();
+      // A slow machine, which may be the one that tunes, draws less often.
+      setTimeout(() => { this.drawn = false; }, Math.max(50, 4 * (performance.now() - begun)));
+    }, 0);
+  }
+
+  thinned(t, v) {
+    const half = t.length >> 1;
+    const keep = (_, k) => k >= half || k % 2 === 0;
+    return [t.filter(keep), v.filter(keep)];
+  }
+
+  draw() {
+    const [t, y] = this.signals.measurement;
+    const [tu, u] = this.signals.command;
+    const ends = [t, tu].filter((each) => each.length);
+    if (!ends.length) return;
+    const xs = [Math.min(...ends.map((e) => e[0])), Math.max(...ends.map((e) => e[e.length - 1]))];
+    const lines = [];
+    const { setpoint, hysteresis } = this.told || {};
+    if (setpoint !== null && setpoint !== undefined) {
+      lines.push({ y: setpoint, kind: "setpoint" });
+      if (hysteresis > 0) lines.push({ y: setpoint + hysteresis, kind: "band-edge" }, { y: setpoint - hysteresis, kind: "band-edge" });
+    }
+    const last = (values) => (values.length ? values[values.length - 1].toPrecision(4) : "none");
+    this.plots.measurement.draw({ xs, curves: [{ x: t, y, kind: "measured", name: "measurement" }], lines, said: `now ${last(y)} y` });
+    this.plots.command.draw({ xs, curves: [{ x: tu, y: u, kind: "command", name: "command" }], said: `now ${last(u)} u` });
+    document.body.dataset.measured = t.length ? t[t.length - 1] : "";
+  }
+
+  show(told) {
+    const before = this.told;
+    this.told = told;
+    $("live").hidden = false;
+    $("live-bar").hidden = false;
+    $("live-title").textContent = told.node;
+    const running = told.phase === "tuning";
+    const state = running ? told.state || "asked" : told.phase;
+    if ($("live-state").textContent !== state) $("live-state").textContent = state;
+    $("live-state").className = `chip ${told.tone || TONES[told.state] || ""}`;
+    $("live-status").textContent = told.status;
+    $("abort").disabled = !running;
+    $("check").disabled = $("start").disabled = told.phase !== "idle";
+    $("progress").value = told.progress || 0;
+    const left = told.remaining > 0 ? `, about ${told.remaining.toFixed(0)} s left` : "";
+    $("live-times").textContent = running ? `${told.elapsed.toFixed(0)} s so far${left}` : "";
+    if (before && before.cycles.length > told.cycles.length) $("live-cycles").replaceChildren();
+    texts($("live-cycles"), "li", told.cycles);
+    $("live-process").textContent = told.process;
+    $("checks-box").hidden = !told.checks.length;
+    if (!told.accepted && told.checks.length && !(before && before.checks.length)) $("checks-box").open = true;
+    $("live-checks").textContent = told.checks.join("\n");
+    $("result-box").hidden = !told.result.length;
+    $("live-result").textContent = told.result.join("\n");
+    document.body.dataset.phase = told.phase;
+    if (this.asking && told.checked >= this.asking) {
+      this.asking = 0;
+      if (told.accepted) this.ask(told.checks);
+    }
+  }
+
+  async ask(checks) {
+    const levels = checks.find((line) => line.includes("levels")) || "";
+    const what = `The relay will move the command of ${this.told.node} until the tune has ended. ${levels.replace(/\s+/g, " ")}`;
+    if (await this.agreed(what, "Start the tune")) this.send("start");
+  }
+}

@@ -1,0 +1,135 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""tune_loop --web over real DDS: tunes are started, watched and ended on a page."""
+
+from __future__ import annotations
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from chromium import Chromium
+from loop_rig import RELIABLE, Process, Rig
+from served import OpenPage
+from std_msgs.msg import Float64
+
+NAMED = ("-r", "__ns:=/tank")
+PLANT = {
+    "structure": "fopdt",
+    "gain": 2.0,
+    "dead_time": 0.1,
+    "operating_point": [5.0, 1.0],
+    "noise_std": 0.005,
+    "sample_period": 0.02,
+}
+RELAY = {"amplitude": 0.5, "baseline": 1.0, "settle_time": 0.4, "measurement_timeout": 10.0}
+
+
+def page_of(rig: Rig, *words: str) -> tuple[Process, str]:
+    """Start the command, and return it with the address that it prints."""
+    command = rig.start_command(
+        "tune_loop", "--namespace", "/tank", "--web", "--wait", "60", *words
+    )
+    found = rig.until(lambda: re.search(r"the page is at (\S+)", command.log), "the address")
+    return command, found[1]
+
+
+def accepted(rig: Rig, page: OpenPage) -> None:
+    """Check until a tune could start; right after the start nodes have not found each other."""
+
+    def checked() -> bool:
+        if page.phase == "idle" and not page.told["accepted"]:
+            page.do("check")
+        return bool(page.told.get("accepted"))
+
+    rig.until(checked, "a check that accepts")
+    rig.until(lambda: page.phase == "idle", "the end of the check")
+
+
+def test_a_tune_is_ended_on_any_page_in_each_state_and_a_closed_one_changes_nothing(
+    rig: Rig,
+) -> None:
+    commands = rig.listen("tank/command", Float64, RELIABLE)
+    rig.start("plant_node", *NAMED, time_constants=[50.0], **PLANT)
+    rig.relay(*NAMED, **RELAY)
+    command, url = page_of(rig, "--record-only")
+    first, second = OpenPage(url), OpenPage(url)
+    accepted(rig, first)
+    first.do("start")
+    rig.until(lambda: any(m.data != 1.0 for m in commands), "a step")
+    first.close()
+    seen = second.told["elapsed"]
+    rig.until(lambda: second.told["elapsed"] > seen + 1.0, "a tune that goes on")
+    late = OpenPage(url)
+    rig.until(lambda: late.told and 1.65 in late.samples["command"], "all that was before")
+    assert late.told["status"]
+    assert late.told["node"] == "/tank/relay_node"
+    late.do("abort")
+    rig.until(lambda: second.phase == "idle", "the end")
+    rig.until(lambda: commands[-1].data == 1.0, "the safe command")
+    assert second.told["result"][0].strip().startswith("tune")
+    assert "cancelled" in second.told["result"][0]
+    assert second.subjects == []
+    # in the midst of settling
+    late.do("start")
+    rig.until(lambda: late.phase == "tuning" and late.told["state"] == "settling", "settling")
+    second.do("abort")
+    rig.until(lambda: late.phase == "idle", "the second end")
+    assert commands[-1].data == 1.0
+    # Ctrl-C in the terminal ends the tune, then the command
+    late.do("start")
+    rig.until(lambda: commands[-1].data != 1.0, "a step")
+    command.signal(signal.SIGINT)
+    assert command.wait() == 1
+    rig.until(lambda: commands[-1].data == 1.0, "the safe command again")
+    assert late.ended.wait(30.0)
+    assert "Traceback" not in command.log
+
+
+def test_an_open_page_does_not_count_as_somebody_who_hears_the_command(rig: Rig) -> None:
+    rig.relay(*NAMED, **RELAY)
+    sensor = rig.node.create_publisher(Float64, "tank/measurement", RELIABLE)
+    rig.node.create_timer(0.02, lambda: sensor.publish(Float64(data=5.0)))
+    command, url = page_of(rig, "--record-only")
+    page = OpenPage(url)
+    rig.until(lambda: 5.0 in page.samples["measurement"], "a measurement on the page")
+    page.do("start")
+    rig.until(lambda: "no command would arrive" in page.told.get("status", ""), "the refusal")
+    assert page.phase == "idle"
+    assert page.samples["command"] == []
+    command.signal(signal.SIGINT)
+    assert command.wait() == 1
+
+
+@pytest.mark.browser
+def test_a_whole_tune_by_clicks(rig: Rig, tmp_path: Path) -> None:
+    plant = PLANT | {"dead_time": 1.0, "sample_period": 0.1, "mode": "lockstep", "seed": 3}
+    rig.start("plant_node", *NAMED, time_constants=[2.0], **plant)
+    rig.relay(*NAMED, amplitude=0.5, baseline=1.0, sample_period=0.1)
+    rig.start("identifier_node", *NAMED)
+    command, url = page_of(rig)
+    accepted(rig, OpenPage(url))
+    with Chromium(tmp_path / "profile") as browser:
+        tab, other = browser.tab(url), browser.tab(url)
+        tab.wait("document.body.dataset.phase === 'idle'")
+        tab.click("#start")
+        tab.wait("document.querySelector('#question').open")
+        assert "relay between 0.65 and 1.65" in tab.text("#question-text")
+        tab.click("#question-yes")
+        complete = "document.querySelector('#live-status').innerText === 'the tune is complete'"
+        other.wait(complete, 120.0)
+        tab.call("Page.reload")
+        for each in (tab, other):
+            each.wait(f"{complete} && document.querySelector('#gains').innerText.startsWith('kc')")
+            each.wait("document.querySelector('#plot-live-measurement .curve')")
+            assert each.text("#verdict") == "gains ready to use"
+            assert each.eval("document.querySelectorAll('#live-cycles li').length") > 0
+            assert each.said == []
+        kc = re.search(r"kc (\S+)", tab.text("#gains"))[1]
+        assert kc in tab.eval("document.querySelector('#live-result').textContent")
+        assert tab.text("#command").startswith("replay ")
+        assert str(rig.records) in tab.text("#command")
+    command.signal(signal.SIGINT)
+    assert command.wait() == 0

@@ -1,0 +1,203 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What pages are told of a running loop, and what they can wish."""
+
+import asyncio
+import json
+import math
+import time
+
+import pytest
+from chromium import Chromium
+from served import HOSTILE, analysed, served, subject_of
+from tornado.websocket import websocket_connect
+
+from relay_autotune.web import live as live_module
+from relay_autotune.web.live import Live
+
+
+def talk(url, work):
+    """Open a socket, run a coroutine with it, and return what it returns."""
+
+    async def talked():
+        socket = await websocket_connect(url.replace("http:", "ws:") + "socket")
+        try:
+            return await work(socket)
+        finally:
+            socket.close()
+
+    return asyncio.run(asyncio.wait_for(talked(), 60.0))
+
+
+async def heard(socket, holds):
+    """Return the first message for which something holds."""
+    while True:
+        message = json.loads(await socket.read_message())
+        if holds(message):
+            return message
+
+
+def test_a_page_that_is_opened_late_is_told_all_and_then_what_is_new():
+    live = Live("/tank/relay_node")
+    live.tell(phase="tuning", status="at the high level")
+    for k in range(5):
+        live.sample("measurement", float(k))
+    live.sample("command", 2.0)
+    live.sample("command", math.nan)
+
+    async def listen(socket):
+        first = await heard(socket, lambda m: m.get("all"))
+        live.sample("measurement", 7.0)
+        live.tell(status="at the low level")
+        seen = [await heard(socket, lambda m: "samples" in m or "live" in m)]
+        while len(seen) < 2 and not {"samples", "live"} <= set(seen[0]):
+            seen.append(await heard(socket, lambda m: "samples" in m or "live" in m))
+        return first, {key: value for message in seen for key, value in message.items()}
+
+    with served([], live=live) as url:
+        first, news = talk(url, listen)
+        again, _ = talk(url, listen)
+    assert first["live"]["node"] == "/tank/relay_node"
+    assert first["live"]["status"] == "at the high level"
+    assert first["live"]["remaining"] is None
+    assert first["samples"]["measurement"][1] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert first["samples"]["command"][1] == [2.0]
+    assert news["samples"]["measurement"][1] == [7.0]
+    assert news["live"]["status"] == "at the low level"
+    assert again["samples"]["measurement"][1] == [0.0, 1.0, 2.0, 3.0, 4.0, 7.0]
+
+
+def test_five_pages_are_told_the_same():
+    live = Live("/relay_node")
+
+    async def all_of_them(url):
+        sockets = [
+            await websocket_connect(url.replace("http:", "ws:") + "socket") for _ in range(5)
+        ]
+        for socket in sockets:
+            await heard(socket, lambda m: m.get("all"))
+        live.sample("measurement", 3.5)
+        found = [await heard(s, lambda m: "samples" in m) for s in sockets]
+        for socket in sockets:
+            socket.close()
+        return found
+
+    with served([], live=live) as url:
+        found = asyncio.run(asyncio.wait_for(all_of_them(url), 60.0))
+    assert [m["samples"]["measurement"][1] for m in found] == [[3.5]] * 5
+
+
+def test_only_what_is_possible_can_be_wished():
+    live = Live("/relay_node")
+    live.wish("start")
+    assert live.next_wish() == "start"
+    live.tell(phase="tuning")
+    live.wish("start")
+    assert live.next_wish() == ""
+    assert not live.abort.is_set()
+    live.wish("abort")
+    assert live.abort.is_set()
+    live.forget_wishes()
+    assert not live.abort.is_set()
+
+
+@pytest.mark.parametrize("wish", ["reboot", 7, None, ["start"], {"start": 1}])
+def test_an_impossible_wish_ends_the_connection(wish):
+    live = Live("/relay_node")
+
+    async def ask(socket):
+        await heard(socket, lambda m: "subjects" in m)
+        await socket.write_message(json.dumps({"do": wish}))
+        while await socket.read_message() is not None:
+            continue
+
+    with served([], live=live) as url:
+        talk(url, ask)
+    assert live.next_wish() == ""
+
+
+def test_a_page_without_a_loop_takes_no_wishes():
+    async def ask(socket):
+        await heard(socket, lambda m: "subjects" in m)
+        await socket.write_message(json.dumps({"do": "start"}))
+        while (message := await socket.read_message()) is not None:
+            assert "live" not in message
+
+    with served([]) as url:
+        talk(url, ask)
+
+
+def test_what_is_kept_is_bounded(monkeypatch):
+    monkeypatch.setattr(live_module, "_KEPT", 100)
+    live = Live("/relay_node")
+    for k in range(1000):
+        live.sample("measurement", float(k))
+    kept = live.everything()["samples"]["measurement"][1]
+    assert (len(kept), kept[0], kept[-1]) == (100, 900.0, 999.0)
+    assert len(live.news()["samples"]["measurement"][0]) <= 1000
+    assert live.news() is None
+
+
+def test_nobody_who_looks_does_not_make_what_is_new_grow(monkeypatch):
+    live = Live("/relay_node")
+    with served([], live=live):
+        for k in range(200):
+            live.sample("measurement", float(k))
+        deadline = time.monotonic() + 30.0
+        while live._signals["measurement"].new:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+@pytest.mark.browser
+def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
+    live = Live(HOSTILE)
+    live.tell(status=HOSTILE, checks=(HOSTILE,), cycles=(HOSTILE,), result=(HOSTILE,))
+    with served([], live=live) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab(url)
+        tab.wait("document.body.dataset.phase === 'idle'")
+        assert tab.text("#live-title") == HOSTILE
+        assert tab.text("#live-status") == HOSTILE
+        assert tab.eval("document.querySelectorAll('img, main script').length") == 0
+        assert tab.eval("document.title") == f"{HOSTILE} - relay_autotune"
+        assert tab.said == []
+
+
+@pytest.mark.browser
+def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tmp_path):
+    live = Live("/relay_node")
+    live.tell(phase="tuning", state="relay", setpoint=40.0, hysteresis=0.1)
+    live.sample("measurement", 40.0)
+    with served([], live=live) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab()
+        tab.size(390, 700)
+        tab.go(url)
+        tab.wait("!document.querySelector('#abort').disabled")
+        tab.eval("scrollTo(0, document.body.scrollHeight)")
+        assert 0 <= tab.eval("document.querySelector('#abort').getBoundingClientRect().top") < 700
+        assert tab.eval("document.documentElement.scrollWidth") <= 390
+        assert tab.eval("document.querySelector('#start').disabled")
+        live.sample("measurement", 41.0)
+        tab.wait("document.querySelectorAll('#plot-live-measurement .line').length === 3")
+        tab.click("#abort")
+        tab.until(live.abort.is_set, "the wish")
+        live.tell(phase="idle", accepted=False)
+        tab.wait("document.querySelector('#abort').disabled")
+        assert tab.said == []
+
+
+def test_a_model_that_is_added_is_told_to_open_pages():
+    from relay_autotune.web.address import Address
+    from relay_autotune.web.server import Page, in_background
+
+    page = Page((), (), lambda *_: "", Address(), Live("/relay_node"))
+
+    async def listen(socket):
+        assert (await heard(socket, lambda m: "subjects" in m))["subjects"] == []
+        page.add(subject_of(analysed(), "the bag"))
+        found = await heard(socket, lambda m: m.get("subjects"))
+        return found["subjects"][0]["name"]
+
+    with in_background(page) as url:
+        assert talk(url, listen) == "the bag"
