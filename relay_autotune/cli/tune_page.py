@@ -13,8 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say
-from relay_autotune.cli.design_arguments import EXPORTS
-from relay_autotune.cli.export import Target, exported
+from relay_autotune.cli.export import Target, exported, exports_of
 from relay_autotune.cli.layout import WIDEST
 from relay_autotune.cli.tune_report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.tune_view import (
@@ -139,7 +138,7 @@ class TunePage:
             return exported(gains, how, Target(), doubt=doubt)
 
         address = address_of(options.web_address)
-        self._page = Page((), EXPORTS, written, address, self._live)
+        self._page = Page((), exports_of(""), written, address, self._live)
 
     def run(self, interrupted: list[int]) -> int:
         """Serve the page, and do what is wished there, until a signal comes.
@@ -272,4 +271,5 @@ class TunePage:
         )
         case = case_of(found, bag or self._client.name)
         subject = Subject(replace(case, command=command(first)), found.shaping, first, command)
+        self._page.exports = exports_of(values["law"])
         self._page.add(subject)
