@@ -117,6 +117,8 @@ def laws_table(what: str) -> str:
         },
         "equations": {"in each sample": lambda law: f"`{law.equation}`"},
         "properties": {
+            "form": lambda law: law.form,
+            "integrates": lambda law: law.integral.words,
             "derivative of": lambda law: law.slope.value,
             "filter": lambda law: law.smoothing.words,
             "weight b": lambda law: " or ".join(f"{w:g}" for w in law.weights) or "0 to 1",

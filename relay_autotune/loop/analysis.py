@@ -10,9 +10,9 @@ import math
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.control_law import ControlLaw
 from relay_autotune.loop.gains import Performance
-from relay_autotune.loop.margins import frequencies, margins, sensitivity_peaks
+from relay_autotune.loop.margins import Margins, frequencies, margins, sensitivity_peaks
 from relay_autotune.loop.noise import noise_gain
-from relay_autotune.loop.responses import step_figures
+from relay_autotune.loop.responses import StepFigures, step_figures
 from relay_autotune.loop.stability import closed_loop_unstable_poles
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -43,21 +43,19 @@ def analyse_loop(
     terms = controller.characteristic(model)
     found = margins(lambda s: controller(s) * model(s), frequencies(*terms), _at_rest(terms))
     figures = step_figures(controller, model, found.ms_frequency)
-    return Performance(
-        ms=found.ms,
-        mt=found.mt,
-        gain_margin=found.gain_margin,
-        phase_margin=found.phase_margin,
-        delay_margin=found.delay_margin,
-        gain_margin_low=found.gain_margin_low,
-        iae_load=figures.iae_load,
-        iae_setpoint=figures.iae_setpoint,
-        overshoot=figures.overshoot,
-        settling_time=figures.settling_time,
-        effort_setpoint=figures.effort_setpoint,
-        effort_load=figures.effort_load,
-        noise_gain=noise_gain(controller, model, sample_period),
-    )
+    noise = noise_gain(controller, model, sample_period)
+    return performance_of(found, figures, noise)
+
+
+def performance_of(found: Margins, figures: StepFigures, noise: float) -> Performance:
+    """Join what was found of a loop.
+
+    :param found: its margins.
+    :param figures: of its responses.
+    :param noise: gain from noise to command [u/y].
+    """
+    known = {name: value for name, value in vars(found).items() if name != "ms_frequency"}
+    return Performance(**known, **vars(figures), noise_gain=noise)
 
 
 def ms_on(controller: ControlLaw, model: TransferFunction) -> float:

@@ -93,6 +93,15 @@ class Integral(enum.Enum):
     TRAPEZOID = 0.0
     AFTER = -1.0
 
+    @property
+    def words(self) -> str:
+        """For people."""
+        return {
+            Integral.BEFORE: "before the output (backward)",
+            Integral.TRAPEZOID: "before the output (trapezoid)",
+            Integral.AFTER: "after the output (forward)",
+        }[self]
+
     def over(self, period: float) -> Rational:
         """Return the integral of a unit signal, ``h (z + 1)/(z - 1)/2 + lead h/2``.
 
@@ -226,6 +235,7 @@ class Law:
     :param settings: its parameters.
     :param weights: set-point weights that it can have; (): any from 0 to 1.
     :param delay: samples until a command takes effect.
+    :param form: of its gains, parallel (p, i, d) or ideal (gain and times).
     :param command: unit and scale of the command.
     :param only_positive: True if it has no gains for a process of negative gain.
     :param needs_integral: True if it does not run without integral action.
@@ -243,6 +253,7 @@ class Law:
     settings: tuple[Setting, ...]
     weights: tuple[float, ...] = (1.0,)
     delay: int = 0
+    form: str = "parallel"
     command: str = "any"
     only_positive: bool = False
     needs_integral: bool = False
@@ -457,6 +468,7 @@ _ROWS = (
         "back-calculation with sqrt(ti td), without derivative ti",
         tuple(_field(name) for name in ("kc", "ti", "td", "tf", "b")),
         weights=(),
+        form="ideal",
     ),
     _BACK_CALCULATION,
     replace(
@@ -632,6 +644,7 @@ _ROWS = (
             Setting("TD", lambda law: law.gains.td),
             Setting("CYCLE", lambda law: f"T#{1000.0 * law.period:.10g}ms"),
         ),
+        form="ideal",
         needs_integral=True,
         line="{name} := {value};",
         remark="//",
@@ -649,6 +662,7 @@ _ROWS = (
             Setting("TN", lambda law: law.gains.ti),
             Setting("TV", lambda law: law.gains.td),
         ),
+        form="ideal",
         line="{name} := {value};",
         remark="//",
     ),

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import performance_of
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.loop.laws import SampledLaw
 from relay_autotune.loop.margins import Margins, margins, peaks
@@ -265,13 +266,4 @@ def analyse_sampled(law: SampledLaw, model: TransferFunction) -> Performance:
         )
     found = loop.margins()
     figures = loop.figures(found.ms_frequency)
-    return Performance(
-        ms=found.ms,
-        mt=found.mt,
-        gain_margin=found.gain_margin,
-        phase_margin=found.phase_margin,
-        delay_margin=found.delay_margin,
-        gain_margin_low=found.gain_margin_low,
-        noise_gain=loop.noise_gain(),
-        **vars(figures),
-    )
+    return performance_of(found, figures, loop.noise_gain())

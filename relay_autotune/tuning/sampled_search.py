@@ -231,20 +231,10 @@ class SampledSearch(Search):
         loop = SampledLoop(self.law.at(controller, self.period), self.held)
         return peaks(loop, loop.grid)
 
-    def _limits(
-        self,
-        bounds: Bounds,
-        kp: FloatArray,
-        td: FloatArray,
-        tf: FloatArray,
-        least: FloatArray | float = 0.0,
-    ) -> tuple[FloatArray, FloatArray]:
-        upper, lower = super()._limits(bounds, kp, td, tf, least)
+    def _ceiling(self, kp: FloatArray) -> FloatArray | float:
+        # kp has to remain positive.
         lead = self.law.integral.value
-        if lead > 0.0:
-            # kp has to remain positive.
-            upper = np.minimum(upper, _SHARE * 2.0 * kp / (lead * self.period))
-        return upper, lower
+        return _SHARE * 2.0 * kp / (lead * self.period) if lead > 0.0 else math.inf
 
     def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
         smoothing, h = self.law.smoothing, self.period

@@ -125,6 +125,11 @@ class Search:
         exact = controller.loop(self.model)
         return peaks(exact, frequencies(exact))
 
+    def _ceiling(self, kp: FloatArray) -> FloatArray | float:
+        """Return the integral gains that each proportional gain allows by itself, shape (k,)."""
+        del kp
+        return math.inf
+
     def _span(self, td: float) -> tuple[float, float] | None:
         """Return the range of proportional gains to look at for a derivative time [s]."""
         return stable_gains(self.model, self.responses.grid, td, td / self.filter_ratio)
@@ -382,7 +387,7 @@ class Search:
         upper, lower = self._limits(
             bounds, kp[usable], td[usable], tf[usable], 1.0 / (share * iae)
         )
-        chosen = upper * share
+        chosen = np.minimum(upper, self._ceiling(kp[usable])) * share
         # Beyond, the integral action alone would close the loop where no frequency was looked at.
         chosen[np.isfinite(chosen) & (chosen > self._beyond)] = -math.inf
         ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)

@@ -18,6 +18,9 @@ from rclpy.parameter import Parameter
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification.known import Known
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS
+from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.executor import Executor
 from relay_autotune.nodes.identifier import IdentifierNode
@@ -102,6 +105,25 @@ def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
     assert not refused.successful
     assert "not zero" in refused.reason
     assert {entry.name for entry in KNOWN} <= {entry.name for entry in PARAMETERS}
+
+
+def test_gains_are_for_the_law_of_the_parameter(
+    node: IdentifierNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(node._models, "publish", lambda message: None)
+    monkeypatch.setattr(node._gains, "publish", told.append)
+    refused = node.set_parameters([Parameter("law", value="pid")])[0]
+    assert not refused.successful
+    assert "klipper_heater" in refused.reason
+    chosen = {"law": "control_toolbox_legacy", "sample_period": 0.8}
+    node.set_parameters([Parameter(name, value=value) for name, value in chosen.items()])
+    node._on_experiment(experiment(0.0))
+    work_off(node)
+    (gains,) = told
+    assert "for control_toolbox_legacy every 0.8 s" in gains.reason
+    law = LAWS["control_toolbox_legacy"].at(Controller(gains.kc, gains.ti, gains.td), 0.8)
+    assert SampledLoop(law, PROCESS).ms() == pytest.approx(gains.ms, rel=1e-3)
 
 
 def test_progress_is_answered_with_what_is_sought(
