@@ -17,7 +17,6 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.methods.thyagarajan2003 import (
     dead_time_ratio,
     equal_lags,
-    first_guess,
     first_half,
     flat_fopdt,
     fopdt,
@@ -104,13 +103,6 @@ def test_without_noise_the_process_of_tables_6_and_7_comes_back(name, inputs, ex
     found = fopdt(exact["P"], exact["a"], inputs["D"], 1.0)
     # At D/tau = 10 the amplitude has all but reached K h, and says little of tau.
     assert found == pytest.approx((inputs["K"], inputs["tau"], inputs["D"]), rel=1e-9)
-
-
-def test_a_first_guess_is_near():
-    # eq 12 with the frequency of the limit cycle instead of the ultimate one
-    tau, dead_time = 20.0, 10.0
-    cycle = exact_limit_cycle(TransferFunction.fopdt(1.0, tau, dead_time), RelaySettings(0, 0, 1))
-    assert first_guess(2.0 * math.pi / cycle.period, dead_time) == pytest.approx(tau, rel=0.3)
 
 
 RELAYS = [RelaySettings(0.0, 0.0, 2.0, 0.0, share) for share in (0.0, 0.02, 0.3)]

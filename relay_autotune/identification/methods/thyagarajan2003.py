@@ -181,15 +181,6 @@ def _reach(period: float, amplitude: float, time_to_peak: float, level: float) -
     return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
 
 
-def first_guess(frequency: float, dead_time: float) -> float:
-    """Return tau = tan(pi - D w_u)/w_u (eq 12) [s]; the solver here needs no guess.
-
-    :param frequency: w_u [rad/s].
-    :param dead_time: D [s].
-    """
-    return math.tan(math.pi - dead_time * frequency) / frequency
-
-
 def rise_time_constant(rise: float, rise_half: float) -> float:
     """Return tau from the rise to the peak and to half of it (eq 20) [s].
 
