@@ -549,7 +549,7 @@ _ROWS = (
             *_parallel("kp ki kd"),
             Setting(
                 "derivative_averaging_samples",
-                lambda law: str(averaged_over(law.gains.tf, law.period)),
+                lambda law: str(averaged_over(law.gains.tf, law.period)) if law.gains.td else None,
             ),
             Setting("output_averaging_samples", "1"),
         ),
@@ -566,7 +566,10 @@ _ROWS = (
         "the integral keeps its value while u is limited; small changes of u may be left out",
         (
             *_parallel("pid_Kp pid_Ki pid_Kd", 255.0),
-            Setting("smooth_time", lambda law: max(law.gains.tf, law.period)),
+            Setting(
+                "smooth_time",
+                lambda law: max(law.gains.tf, law.period) if law.gains.td else None,
+            ),
         ),
         delay=1,
         command="power of the heater, 0 to 1; the gains are in parts of 255",
@@ -583,7 +586,12 @@ _ROWS = (
         "Ki h I stays between 0 and the largest output",
         (
             *_parallel("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", 255.0),
-            Setting("PID_K1", lambda law: 1.0 - law.period / max(law.gains.tf, law.period)),
+            Setting(
+                "PID_K1",
+                lambda law: (
+                    1.0 - law.period / max(law.gains.tf, law.period) if law.gains.td else None
+                ),
+            ),
         ),
         command="power of the heater, 0 to 1; the output is 0 to 255",
         only_positive=True,
