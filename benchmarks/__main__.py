@@ -28,7 +28,7 @@ GROUPS = {
         *("accuracy", "target_spread", "structure_choice", "coverage", "coloured_noise"),
         *("unmodelled", "ah_batch", "confident"),
     ),
-    "design": ("design_known", "design_identified"),
+    "design": ("design_known", "design_identified", "laws"),
     "time": (
         *(
             "fit_time",

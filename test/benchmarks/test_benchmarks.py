@@ -45,6 +45,7 @@ QUICK = {
     "coverage": ("--quick",),
     "ah_batch": ("--quick",),
     "design_known": ("--quick",),
+    "laws": ("--quick",),
     "design_identified": ("--quick",),
     "design_time": ("--quick",),
     "bag_reading": ("--quick",),
