@@ -37,7 +37,7 @@ from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
-from relay_autotune.nodes.remote_loop import RemoteLoop
+from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
 from relay_autotune.nodes.results import ResultCheck
 from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
@@ -108,10 +108,13 @@ class ControllerNode(ServedNode):
         )
         self._remote: RemoteLoop | None = None
         self._place: OwnGains | RemoteGains = OwnGains(self._use)
+        self._reported, setpoints = reported_by(values)
         if values["apply_to"]:
             mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
             self._place = RemoteGains(self, values["apply_to"], mapping)
-            self._remote = RemoteLoop(self, self._place, self._setpoint, self._verifier.interrupt)
+            self._remote = RemoteLoop(
+                self, self._place, self._setpoint, setpoints, self._verifier.interrupt
+            )
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
         self._repeater: Repeater | None = None
@@ -139,7 +142,8 @@ class ControllerNode(ServedNode):
         )
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
-        self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
+        if self._reported is None:
+            self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
         self.create_subscription(Bool, "hold_request", self._on_hold, quality.RESULT)
         self.create_subscription(
             RelayExperiment, "relay_experiment", self._on_experiment, quality.RESULT
@@ -198,6 +202,15 @@ class ControllerNode(ServedNode):
         else:
             at = (info["source_timestamp"] or time.time_ns()) * 1e-9
         self._take(at, value)
+        if self._reported is not None and self._remote is not None:
+            # It answers this measurement; the one before was in force until now.
+            try:
+                self._remote.hear_command(self._reported(message))
+            except FieldError as error:
+                self.get_logger().error(
+                    f"the command of {self._place.name} cannot be read: {error}",
+                    throttle_duration_sec=5.0,
+                )
 
     def _on_silence(self, value: float, ago: float) -> None:
         """Take the last measurement again: a silent sensor means that it has not changed."""

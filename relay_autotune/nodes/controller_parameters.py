@@ -9,6 +9,7 @@ import math
 
 from relay_autotune.control.controller import LARGEST_GAIN, LARGEST_VALUE, LONGEST_TIME
 from relay_autotune.nodes.live_types import FLOAT64
+from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.quantities import Quantity
 
 GAINS = (
@@ -138,6 +139,15 @@ FIXED = (
         "That node's parameter for each gain, separated by commas, such as "
         "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d.",
     ),
+    Quantity(
+        "controller_command_field",
+        "",
+        "",
+        "With apply_to, where that node commands the actuator itself: path of its command in the "
+        "messages of the measurement; command_type and all below are then those of setpoint. "
+        "Empty: it comes on command, and setpoint is a Float64.",
+    ),
+    *MESSAGE_PARAMETERS,
     Quantity(
         "record_directory",
         "~/.ros/relay_autotune",

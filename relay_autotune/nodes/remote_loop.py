@@ -7,20 +7,48 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
-from std_msgs.msg import Float64
 
 from relay_autotune.control.controller import is_usable
+from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.command_message import CommandMessage
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.remote_gains import RemoteGains
+from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.nodes.verifier import NotVerifiable
 
 # A controller without a command for this time counts as silent [s].
 _SILENCE = 2.0
+
+
+def reported_by(
+    values: Mapping[str, Any],
+) -> tuple[Callable[[Any], float] | None, CommandMessage]:
+    """Return what reads the other node's command from the measurement's messages, and set-points.
+
+    :param values: the parameters of controller_node.
+    :return: the reader, None: these messages do not have it; what writes a set-point.
+    :raises ParameterError: if they cannot have it, or nothing is done with a parameter.
+    """
+    field, target = values["controller_command_field"], values["apply_to"]
+    if field and target:
+        message = (values[each.name] for each in MESSAGE_PARAMETERS)
+        read = reader_of(values["measurement_type"], field, "controller_command_field").value
+        return read, CommandMessage(*message)
+    said = [each.name for each in MESSAGE_PARAMETERS if values[each.name] != each.default]
+    if field or said:
+        raise ParameterError(
+            f"{'controller_command_field' if field else said[0]} is given, which is for apply_to "
+            f"together with controller_command_field: the set-point of another node in a message "
+            f"of its own"
+        )
+    return None, CommandMessage()
 
 
 class RemoteLoop:
@@ -29,11 +57,17 @@ class RemoteLoop:
     :param node: this node.
     :param gains: the other node's parameters.
     :param setpoint: its set-point until one is received [y]; NaN: not known.
+    :param setpoints: writes a set-point into its message.
     :param disturbed: called with the reason when another node moves the set-point.
     """
 
     def __init__(
-        self, node: Node, gains: RemoteGains, setpoint: float, disturbed: Callable[[str], None]
+        self,
+        node: Node,
+        gains: RemoteGains,
+        setpoint: float,
+        setpoints: CommandMessage,
+        disturbed: Callable[[str], None],
     ) -> None:
         self.command = math.nan
         """The last command received [u]; NaN before the first."""
@@ -41,18 +75,19 @@ class RemoteLoop:
         self._heard_at = 0.0
         self.setpoint = setpoint
         """The set-point in force [y]; NaN: not known."""
+        self._setpoints = setpoints
         self._disturbed = disturbed
         self._offset = 0.0
         # Own set-points that have not come back yet over the topic, where others may publish, too.
         self._on_the_way: list[float] = []
         self._publisher = node.create_publisher(
-            Float64,
+            setpoints.kind,
             "setpoint",
             quality.COMMAND,
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
         )
         node.create_subscription(
-            Float64,
+            setpoints.kind,
             "setpoint",
             self._on_setpoint,
             quality.COMMAND,
@@ -99,8 +134,8 @@ class RemoteLoop:
             return
         self._offset = offset
         value = self.setpoint + offset
-        self._on_the_way.append(value)
-        self._publisher.publish(Float64(data=value))
+        self._on_the_way.append(self._setpoints.on_wire(value))
+        self._publisher.publish(self._setpoints.written(value))
 
     def wait_for_setpoint(self, timeout: Duration) -> None:
         """Wait until the last set-point has arrived.
@@ -109,14 +144,19 @@ class RemoteLoop:
         """
         self._publisher.wait_for_all_acked(timeout)
 
-    def _on_setpoint(self, message: Float64) -> None:
-        if message.data in self._on_the_way:
-            self._on_the_way.remove(message.data)
+    def _on_setpoint(self, message: Any) -> None:
+        try:
+            value = self._setpoints.value(message)
+        except FieldError as error:
+            self._disturbed(f"another node set a set-point that cannot be read: {error}")
             return
-        if not is_usable(message.data):
+        if value in self._on_the_way:
+            self._on_the_way.remove(value)
             return
-        changed = message.data != self.setpoint + self._offset
+        if not is_usable(value):
+            return
+        changed = value != self.setpoint + self._offset
         # The new set-point is in force already, so there is no step to take back.
-        self.setpoint, self._offset = message.data, 0.0
+        self.setpoint, self._offset = value, 0.0
         if changed:
-            self._disturbed(f"another node set the set-point to {message.data:g}")
+            self._disturbed(f"another node set the set-point to {value:g}")

@@ -12,7 +12,13 @@ from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAME
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.quantities import Quantity
 
-__all__ = ["EXPERIMENT_PARAMETERS", "FIXED_PARAMETERS", "NODE_PARAMETERS", "TUNE_PARAMETERS"]
+__all__ = [
+    "EXPERIMENT_PARAMETERS",
+    "FIXED_PARAMETERS",
+    "MESSAGE_PARAMETERS",
+    "NODE_PARAMETERS",
+    "TUNE_PARAMETERS",
+]
 
 NODE_PARAMETERS = (
     Quantity(
@@ -126,6 +132,23 @@ NODE_PARAMETERS = (
         "Folder in which each experiment gets a folder of its own.",
     ),
 )
+MESSAGE_PARAMETERS = (
+    Quantity("command_type", FLOAT64, "", "Message type of the command."),
+    Quantity(
+        "command_field",
+        "data",
+        "",
+        "Path of the command in it, such as linear.x or data[1]; data of an array is its only "
+        "element, as a forward_command_controller of ros2_control for one joint wants it.",
+    ),
+    Quantity(
+        "command_message",
+        "",
+        "",
+        "What stands in the other elements of each command, as ros2 topic pub takes it, such as "
+        "'{data: [0.0, 1.5]}'; empty: zeros.",
+    ),
+)
 FIXED_PARAMETERS = (
     Quantity(
         "initial_command",
@@ -177,21 +200,7 @@ FIXED_PARAMETERS = (
         "command in the messages of the measurement; command_type and all below are then those of "
         "setpoint. Empty: it comes on controller_command and is passed on.",
     ),
-    Quantity("command_type", FLOAT64, "", "Message type of the command."),
-    Quantity(
-        "command_field",
-        "data",
-        "",
-        "Path of the command in it, such as linear.x or data[1]; data of an array is its only "
-        "element, as a forward_command_controller of ros2_control for one joint wants it.",
-    ),
-    Quantity(
-        "command_message",
-        "",
-        "",
-        "What stands in the other elements of each command, as ros2 topic pub takes it, such as "
-        "'{data: [0.0, 1.5]}'; empty: zeros.",
-    ),
+    *MESSAGE_PARAMETERS,
     Quantity(
         "command_others",
         "command_message",

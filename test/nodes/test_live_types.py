@@ -18,6 +18,8 @@ from relay_autotune.bag.definitions import find_definition
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import message_type
 from relay_autotune.errors import FieldError, ParameterError
+from relay_autotune.nodes import remote_loop
+from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.live_types import reader_of, struct_of
 from relay_autotune.nodes.setpoint_session import reported_by
 
@@ -117,3 +119,19 @@ def test_a_controller_that_cannot_report_its_command_is_refused(
     assert read(JointState(name=["arm", "left"], effort=[1.0, 2.0])) == 2.0
     with pytest.raises(ParameterError, match=sentence):
         reported_by(values | given)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"controller_command_field": "effort[left]"}, "controller_command_field is given, which"),
+        ({"command_field": "linear.x"}, "command_field is given, which is for apply_to together"),
+    ],
+)
+def test_parameters_of_another_nodes_set_point_need_that_node(
+    given: dict[str, str], sentence: str
+) -> None:
+    defaults = {each.name: each.default for each in CONTROLLER_PARAMETERS}
+    assert remote_loop.reported_by(defaults)[0] is None
+    with pytest.raises(ParameterError, match=sentence):
+        remote_loop.reported_by(defaults | given)

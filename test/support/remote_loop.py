@@ -13,6 +13,7 @@ from typing import Any
 
 from loop_rig import LATCHED, RELIABLE, Rig
 from rclpy.action import ActionClient
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
@@ -55,13 +56,61 @@ node.create_subscription(Float64, "setpoint", on_setpoint, 10)
 node.create_subscription(Float64, "measurement", on_measurement, 10)
 rclpy.spin(node)
 """
+# The same loop in one node that tells feedback and command in one message, as ros2_control does.
+REPORTING = """
+import math, random
+from collections import deque
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = Node("pid_controller")
+for name, value in (("p", 0.3), ("i", 1.0), ("d", 0.0)):
+    node.declare_parameter(f"gains.heater.{name}", value)
+states = node.create_publisher(JointState, "measurement", 10)
+integral, wanted, away, count = 1.0, 5.0, 0.0, 0
+on_the_way = deque([1.0] * 5)
+def gain(name):
+    return node.get_parameter(f"gains.heater.{name}").value
+def on_setpoint(message):
+    global wanted
+    wanted = message.velocity[list(message.name).index("left")]
+def step():
+    global integral, away, count
+    count += 1
+    away += (2.0 * (on_the_way.popleft() - 1.0) - away) * -math.expm1(-PERIOD / 0.3)
+    y = 5.0 + away + random.gauss(0.0, 0.002)
+    before, integral = integral, integral + gain("i") * PERIOD * (wanted - y)
+    on_the_way.append(gain("p") * (wanted - y) + before)
+    names = random.sample(["left", "right", "arm"], 3)
+    state = JointState(name=names)
+    state.velocity = [y if name == "left" else -1.0 for name in names]
+    state.effort = [on_the_way[-1] if name == "left" else -2.0 for name in names]
+    ns = 10**18 + round(1e9 * PERIOD * count)
+    state.header.stamp.sec, state.header.stamp.nanosec = divmod(ns, 10**9)
+    states.publish(state)
+node.create_subscription(JointState, "setpoint", on_setpoint, 10)
+node.create_timer(PERIOD, step)
+rclpy.spin(node)
+"""
+REPORTED = {
+    "measurement_type": "sensor_msgs/msg/JointState",
+    "measurement_field": "velocity[left]",
+    "controller_command_field": "effort[left]",
+    "command_type": "sensor_msgs/msg/JointState",
+    "command_field": "velocity[left]",
+    "command_message": "'{name: [arm, left], velocity: [0.25, 0.0]}'",
+    "initial_setpoint": 5.0,
+}
 
 
 class Loop:
     """The other node's loop, and a controller_node that manages its gains."""
 
+    parameters: dict[str, Any]
+
     def __init__(self, rig: Rig) -> None:
-        self.rig = rig
+        self.rig, self.parameters = rig, {}
         self.commands = rig.listen("command", Float64, RELIABLE)
         self.setpoints = rig.listen("setpoint", Float64, RELIABLE)
         self.models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
@@ -81,6 +130,7 @@ class Loop:
             apply_to="/pid_controller",
             apply_parameters=names,
             verify_step_max=0.5,
+            **self.parameters,
         )
         self.rig.until(lambda: "ready:" in self.controller.log, "the controller_node", 60.0)
 
@@ -141,3 +191,16 @@ class Loop:
 
     def values(self) -> list[float]:
         return self.rig.values("pid_controller", *(f"gains.heater.{name}" for name in "pid"))
+
+
+class ReportingLoop(Loop):
+    """The same, where the other node tells its command in the messages of the measurement."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig, self.parameters = rig, dict(REPORTED)
+        self.setpoints = rig.listen("setpoint", JointState, RELIABLE)
+        self.models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+        self.gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+        rig.start_python("pid_controller", REPORTING.replace("PERIOD", str(PERIOD)))
+        self.start()
+        rig.until(self.is_watched, "the controller_node")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 from action_msgs.msg import GoalStatus
 from loop_rig import Rig
-from remote_loop import Loop
+from remote_loop import Loop, ReportingLoop
 from std_msgs.msg import Float64
 
 
@@ -53,3 +53,22 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert "/pid_controller has gains.heater.d 0, gains.heater.i 1.6" in result.reason
     assert loop.values() == [0.5, 1.6, 0.0]
     assert [m.data for m in loop.setpoints[-2:]] == [5.3, 4.8]
+
+
+def test_the_gains_of_a_joint_are_proved_by_the_state_of_its_controller(rig: Rig) -> None:
+    loop = ReportingLoop(rig)
+    loop.apply(0.5, 1.6, 2.0)
+    status, result = loop.verify(setpoint_step=0.5)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
+    assert result.passed, result.reason
+    (step,) = result.steps
+    assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
+    # Gains for a process with a third of the true gain.
+    loop.apply(0.8, 2.6, 0.6)
+    status, result = loop.verify(setpoint_step=0.5)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
+    assert not result.passed
+    assert loop.values() == [0.5, 1.6, 0.0]
+    # The other joint of the message stays where it was.
+    assert {(*m.name, m.velocity[0]) for m in loop.setpoints} == {("arm", "left", 0.25)}
+    assert [m.velocity[1] for m in loop.setpoints] == [5.5, 5.0, 5.5, 5.0]
