@@ -84,7 +84,7 @@ class Analysis:
     :param judgement: findings of the checks, and the verdict.
     :param predicted: for a running experiment, Ms with the gains of its model; None: not asked
         for, or no gains.
-    :param shaping: what the design of other gains takes; None: there may be no gains.
+    :param shaping: all that is needed to design other gains; None: no gains are allowed.
     """
 
     record: Record
@@ -432,7 +432,7 @@ def _judged(
 
 
 def _with_remarks(found: Identification, records: Sequence[Record]) -> Identification:
-    """Say with a model what was made of the records before."""
+    """Add to a model's warnings how the records were changed before."""
     said = [record.unthinned.remark for record in records if record.unthinned is not None]
     return replace(found, warnings=(*found.warnings, *said))
 

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""How wide a 95 % interval is."""
+"""The width of a 95 % interval."""
 
 from __future__ import annotations
 

@@ -88,14 +88,14 @@ T = TypeVar("T")
 
 
 def look_up(registry: Mapping[str, T], name: str, kind: str, error: type[RelayAutotuneError]) -> T:
-    """Return what has a name.
+    """Return the entry of a name.
 
-    :param registry: all that there is, by name.
-    :param name: which one.
-    :param kind: what it is, for the message.
+    :param registry: all entries by name.
+    :param name: of the entry.
+    :param kind: of the entry, for the message.
     :param error: class of the error.
     :raises RelayAutotuneError: of that class, if there is none of that name; the message lists
-        those there are.
+        the names.
     """
     if name not in registry:
         raise error(f"unknown {kind} {name!r}; known: {', '.join(registry)}")

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A judged model with what the design of gains for it takes, so that other gains can follow."""
+"""A judged model with all that is needed to design other gains for it."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def duration(seconds: float) -> str:
 def plus_minus(value: float, half: float) -> str:
     """Return the half width of an interval, such as ``± 0.12``; empty if it is not known.
 
-    Below the digits that are shown of the value it would tell of rounding, not of accuracy.
+    A half width below the shown digits of the value would be rounding, not accuracy.
 
     :param value: in the middle.
     :param half: half the width.

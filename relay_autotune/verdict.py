@@ -81,7 +81,7 @@ class Check:
     def __call__(self, evidence: Evidence) -> Finding | None:
         """Return what the check finds; None if it does not apply.
 
-        :param evidence: the experiment with what was made of it.
+        :param evidence: the experiment with its results.
         """
         measured = self.measure(evidence)
         if measured is None:
@@ -106,19 +106,19 @@ class Check:
 class Finding:
     """What one check found."""
 
-    name: str = told("", "Of the check.")
-    title: str = told("", "Of the check, for people.")
-    what: str = told("", "What was measured.")
+    name: str = told("", "Name of the check.")
+    title: str = told("", "Title of the check.")
+    what: str = told("", "The measured quantity.")
     value: float = told("", "The measured number; NaN: not computed.", nan=True, null=math.inf)
-    unit: str = told("", "Of value and limit.")
+    unit: str = told("", "Unit of value and limit.")
     limit: float = told(
         "",
-        "What the number may be at most; where the check failed, the limit of that.",
+        "Largest value of a check that passes; where it failed, of one that does not fail.",
         nan=True,
         null=math.inf,
     )
-    result: Result = told("", "What came of it.")
-    sentence: str = told("", "What a result that did not pass means; empty: it passed.", "")
+    result: Result = told("", "Result of the check.")
+    sentence: str = told("", "Meaning of a result that did not pass; empty: it passed.", "")
     remedy: str = told("", "What to do then.", "")
 
     @property

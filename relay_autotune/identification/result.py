@@ -35,10 +35,10 @@ class Validation:
     """
 
     period: float = told("", "Difference of the whole period.", math.nan)
-    period_high: float = told("", "Of the time with the command high.", math.nan)
-    period_low: float = told("", "Of the time with the command low.", math.nan)
-    peak_max: float = told("", "Of the highest measurement.", math.nan)
-    peak_min: float = told("", "Of the lowest measurement.", math.nan)
+    period_high: float = told("", "Difference of the time with the command high.", math.nan)
+    period_low: float = told("", "Difference of the time with the command low.", math.nan)
+    peak_max: float = told("", "Difference of the highest measurement.", math.nan)
+    peak_min: float = told("", "Difference of the lowest measurement.", math.nan)
     shape: float = told("", "Root mean square difference of the two curves.", math.nan, lower=0.0)
     reason: str = told("", "Why there is no limit cycle; empty if there is one.", "")
 

@@ -96,7 +96,7 @@ def _groups(case: Case) -> list[tuple[str, list[_Row]]]:
 
 
 def _each_method(case: Case) -> list[ModelCase]:
-    """Return one model of each method, first of all the one that counts."""
+    """Return one model of each method, the selected one first."""
     assert case.model is not None
     found = {case.model.method: case.model}
     for model in case.models:
