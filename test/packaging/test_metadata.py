@@ -81,6 +81,7 @@ def test_manifest_names_what_is_imported():
         "mcap": "mcap-ros2-support",
         "numpy": "python3-numpy",
         "scipy": "python3-scipy",
+        "tornado": "python3-tornado",
         "yaml": "python3-yaml",
     }
     manifest = ElementTree.parse(MANIFESTS[0])
