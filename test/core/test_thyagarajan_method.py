@@ -130,7 +130,7 @@ def test_a_peak_at_a_quarter_of_the_period_tells_gain_over_time_constant_only():
     found = thyagarajan(record_of(model, 0.3, 0.1, cycles=5))
     assert found.structure == "ipdt"
     assert found.values == pytest.approx([1.0, 1.0], rel=0.05)
-    assert "biased relay would tell" in found.warnings[0]
+    assert "biased relay would determine" in found.warnings[0]
     assert found.ultimate_gain == pytest.approx(ultimate_point(model).gain, rel=0.05)
 
 

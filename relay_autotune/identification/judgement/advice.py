@@ -84,18 +84,18 @@ def _for_slow(found: Identification, tests: _Tests) -> list[str]:
     slowest = max((abs(t) for t in found.model.time_constants), default=0.0)
     if tests.relay and not tests.biased:
         said.append(
-            "a relay with a bias would tell the gain, since the mean of its command is not that "
-            "at rest: set bias_ratio to 0.3"
+            "a relay with a bias would determine the gain, since its mean command differs from "
+            "that at rest: set bias_ratio to 0.3"
         )
     if not tests.rested:
         said.append(
-            "samples at rest before the first change of the command would tell the gain, since "
-            "they fix the measurement's zero"
+            "samples at rest before the first change of the command would determine the gain, "
+            "since they fix the measurement's zero"
         )
     if slowest > 0.0:
         said.append(
             f"a step of the command held for about {3.0 * slowest:.2g} s, three times the slowest "
-            "lag, would tell gain and time constant"
+            "lag, would determine gain and time constant"
         )
     return said
 

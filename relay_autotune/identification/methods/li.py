@@ -230,7 +230,7 @@ def require_difference(tests: Sequence[SymmetricCycle]) -> None:
     if max(added) - min(added) < _LEAST_APART * min(t.period for t in tests):
         raise IdentificationError(
             f"the tests all have the same dead time added, {added[0]:g} s, so that the second "
-            "tells nothing new: add one to the relay (its extra_delay) in one of them, such as a "
+            "adds nothing: add one to the relay (its extra_delay) in one of them, such as a "
             "quarter of the period"
         )
 

@@ -364,7 +364,7 @@ def _remarks(
 
 def _mismatch_text(model: Structure, difference: float) -> str:
     if math.isinf(difference):
-        apart = "cannot agree: by the period it has none"
+        apart = "cannot agree: no time constant gives the period"
     else:
         apart = (
             f"differ: the period's is {100.0 * math.expm1(difference):+.3g} % off the amplitude's"

@@ -190,8 +190,8 @@ def choose(reading: Reading, known: Known, categorised: str = "") -> tuple[Solve
     if found == "2":
         return _lags(2, dead_time), f"{why}: two equal lags with little dead time"
     text = (
-        f"{why}: {HIGHER_ORDER} equal lags, which stand for any higher order; none of it is "
-        "checked by the data"
+        f"{why}: {HIGHER_ORDER} equal lags, which stand for any higher order; the data do not "
+        "check that"
     )
     return _lags(HIGHER_ORDER, dead_time), text
 
@@ -206,7 +206,7 @@ def _by_peak(reading: Reading, shape: Shape, dead_time: float, why: str) -> tupl
             f"{why}: FOPDT, but with its peak within {_DEVIATIONS:g} standard deviations of P/4: "
             "the time constant is too long to be told from an integrator's or an unstable one's; "
             "gain/time constant is determined and given as the gain of an integrator. A biased "
-            "relay would tell the static gain"
+            "relay would determine the static gain"
         )
     if late > 0.0:
         return _sharp(dead_time), f"{why}: FOPDT"
@@ -384,8 +384,8 @@ def _sensitive(solver: Solver, shape: Shape) -> list[str]:
     if first is None or second is None:
         return []
     return [
-        f"D/tau = {SMALL_DEAD_TIME:g} is an assumption: with {_OTHER_RATIO:g} K_u would be "
-        f"{100.0 * (second.gain / first.gain - 1.0):+.0f} % other; a hysteresis makes that worse. "
+        f"D/tau = {SMALL_DEAD_TIME:g} is an assumption: with {_OTHER_RATIO:g} K_u would change by "
+        f"{100.0 * (second.gain / first.gain - 1.0):+.0f} %; a hysteresis makes that worse. "
         "Give the dead time where it is known"
     ]
 

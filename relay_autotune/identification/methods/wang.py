@@ -192,9 +192,9 @@ _MOST_PARTS = 20
 # Standard deviations above an integrator's ratio beyond which noise does not explain a ratio.
 _CERTAIN = 3.0
 _LIKE_AN_INTEGRATOR = (
-    "the peaks are those of an integrator's limit cycle, or noise lets them look so: gain and "
-    "time constant are hardly more than their ratio; a biased relay or the method waveform tells "
-    "them apart"
+    "the peaks are those of an integrator's limit cycle, or noise makes them look like it: of "
+    "gain and time constant hardly more than the ratio is known; a biased relay or the method "
+    "waveform determines both"
 )
 
 

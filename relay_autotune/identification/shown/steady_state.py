@@ -20,7 +20,7 @@ _LEAST_SAMPLES = 8
 
 UNKNOWN_REST = (
     "no samples at rest before the test: the set-point stands in for the steady state, and the "
-    "intervals know nothing of its error"
+    "intervals do not include its error"
 )
 
 

@@ -213,9 +213,9 @@ def _beside_rivals(found: Identification, fit: Fit, noise: Noise) -> Identificat
         return found
     best = stable[0]
     told = (
-        "whether the process integrates is not in the data: a stable "
+        "the data do not show whether the process integrates: a stable "
         f"{best.model.structure} with gain {best.model.gain:.3g} has {100 * best.support:.0f} "
-        "% of the support; a biased relay or a longer step would tell; K_u and w_u do not "
+        "% of the support; a biased relay or a longer step would show it; K_u and w_u do not "
         "depend on it"
     )
     return replace(found, warnings=(*found.warnings, told))
@@ -298,7 +298,7 @@ def _warnings(
         if math.isfinite(measured) and rms > max(_UNEXPLAINED * measured, 1e-6 * fit.scale):
             found.append(
                 f"{which}the residual ({rms:.3g} rms) is larger than the noise measured before "
-                f"the test ({measured:.3g}): look in the report at what the model leaves"
+                f"the test ({measured:.3g}): look at the residual in the report"
             )
         if record.lost_samples:
             found.append(

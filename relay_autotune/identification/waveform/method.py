@@ -120,7 +120,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     if problem.time.size < samples:
         told = (
             f"of {samples} samples {problem.time.size} were fitted, evenly spread: more would "
-            "take memory and tell nothing"
+            "take memory and add nothing"
         )
         fit = replace(fit, warnings=(*fit.warnings, told))
     return report(records, fit)
@@ -191,8 +191,8 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
             return Fit(whole, state, (chosen,) if known.structure else tuple(rest), scale)
         rest = [c for c in rest if c is not picked]
     raise IdentificationError(
-        "no structure fits the record by a process that the samples show: record longer, or check "
-        "that command and measurement belong to one loop"
+        "no structure fits the record with a process that the samples can show: record longer, or "
+        "check that command and measurement belong to one loop"
     )
 
 
@@ -320,7 +320,7 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
     if not changes_within(u, time).size:
         raise IdentificationError(
             "the command never changes within the record: nothing excites the process, "
-            "so that no model can be told; record a relay test or a step"
+            "so that no model can be found; record a relay test or a step"
         )
     if np.ptp(y) == 0.0:
         raise IdentificationError(
