@@ -129,7 +129,7 @@ class Identification:
     )
     integrated_error: float = told(
         "rad/s",
-        "Difference from the model that counts; NaN: it is that model, or not computed.",
+        "Difference from the selected model; NaN: it is that model, or not computed.",
         math.nan,
         lower=0.0,
     )

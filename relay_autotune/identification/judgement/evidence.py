@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the checks look at: the record, the model that counts, its rivals, the gains."""
+"""What the checks look at: the record, the selected model, its rivals, the gains."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Loop:
 
     :param controller: -command per measurement at complex frequencies s [u/y].
     :param ms_of: Ms of the loops that these gains make with models; inf: unstable.
-    :param ms: Ms on the model that counts.
+    :param ms: Ms on the selected model.
     :param ms_95: Ms that 95 % of the models within its uncertainty stay below.
     :param added_delay: dead time of the loop beside the process's own [s].
     """
@@ -54,7 +54,7 @@ class Evidence:
     """One experiment with its results.
 
     :param record: the samples.
-    :param found: the model that counts, with its uncertainty, its fit and its limit cycle.
+    :param found: the selected model, with its uncertainty, its fit and its limit cycle.
     :param beside: number of parameters that were estimated beside the model, as those of a load.
     :param free: True if the structure was chosen from the data, False if it was given.
     :param samples: True if the model was fitted to the samples themselves.

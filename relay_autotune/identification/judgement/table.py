@@ -362,7 +362,7 @@ LOOP_CHECKS = (
         name="rivals",
         title="Rivals",
         what="Ms of the gains on the worst of the other models that explain the record as well, "
-        "over Ms on the model that counts",
+        "over Ms on the selected model",
         unit="",
         doubtful=2.0,
         sentence="{detail} explains the record as well, and on it Ms is {value} times as large",
