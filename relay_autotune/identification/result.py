@@ -110,8 +110,8 @@ class Identification:
     >>> found.parameters, found.undetermined
     (('gain', 'time_constant', 'dead_time'), ())
 
-    The integrated error is ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the model
-    that counts (Thyagarajan and Yu 2003, eqs 29 and 30).
+    The integrated error is ``int |G_m - G|/|G| dw`` over two decades about w_u, with G the
+    selected model (Thyagarajan and Yu 2003, eqs 29 and 30).
     """
 
     method: str = told("", "Name in the registry.", word=True, column=1)

@@ -40,7 +40,7 @@ def assess(models: Sequence[Identification], record: Record) -> tuple[Identifica
     Fig 9), its error from the first model over two decades about w_u (eqs 29 and 30), and, where
     its method did not look at all samples, the quality of its fit to them.
 
-    :param models: of one record, the one that counts first.
+    :param models: of one record, the selected one first.
     :param record: the record.
     """
     seen, rest = _averaged(record), operating_point(record)
