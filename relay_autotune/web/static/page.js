@@ -109,10 +109,15 @@ function showControls() {
   if (!own) $("weight").value = asked.setpoint_weight;
 }
 
+let saidChecks = "";
+
 function showVerdict(verdict, checks) {
   const chip = $("verdict");
   if (chip.textContent !== verdict.text) chip.textContent = verdict.text;
   chip.className = `chip ${verdict.tone}`;
+  const said = JSON.stringify(checks);
+  if (said === saidChecks) return;
+  saidChecks = said;
   $("marks").replaceChildren();
   $("checks").replaceChildren();
   for (const [mark, tone, name, value, meaning] of checks) {
