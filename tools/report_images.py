@@ -5,8 +5,8 @@
 
     . ./env.sh && python3 tools/report_images.py [BROWSER]
 
-With a browser that takes Chromium's options, such as `chromium`, it also takes a picture of the
-page's first screen.
+With a browser that takes Chromium's options, such as `chromium`, it also takes pictures of the
+report's first screen and of the page on which gains are shaped.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def main() -> int:
         save(plate.figure(shown), str(IMAGES / f"report_{plate.key}.png"))
     if sys.argv[1:]:
         first_screen(sys.argv[1], case)
-    for picture in (IMAGES / "demo.png", *IMAGES.glob("report_*.png")):
+        page_in_browser(found)
+    for picture in (*IMAGES.glob("report_*.png"), IMAGES / "demo.png", IMAGES / "web_page.png"):
         # A palette is enough for lines and makes the file three times smaller; this one keeps rare
         # colours, such as those of the markers on a curve.
         with Image.open(picture) as image:
@@ -87,6 +88,34 @@ def first_screen(browser: str, case: Case) -> None:
             f"--screenshot={IMAGES / 'report_page.png'}",
         ]
         subprocess.run([browser, *options, page.as_uri()], check=True, timeout=120)
+
+
+def page_in_browser(found: Analysis) -> None:
+    """Take a picture of the page on which gains are shaped.
+
+    :param found: the analysis that it shows.
+    """
+    sys.path.insert(0, str(ROOT / "test/support"))
+    from chromium import Chromium  # type: ignore[import-not-found]
+
+    from relay_autotune.web.address import Address
+    from relay_autotune.web.server import Page, in_background
+    from relay_autotune.web.shape import Asked, Subject
+
+    case = case_of(found, "demo_output/bag")
+    subject = Subject(case, found.shaping, Asked(), lambda _: "replay demo_output/bag")
+    page = Page([subject], (), lambda *_: "", Address())
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        in_background(page) as url,
+        Chromium(Path(folder)) as browser,
+    ):
+        tab = browser.tab()
+        tab.size(1280, 1080)
+        tab.go(url)
+        tab.until(lambda: len(subject.trade_off()) >= len(list(subject.positions())), "all", 600)
+        tab.wait("document.querySelectorAll('#plot-trade .curve').length === 2")
+        tab.picture(IMAGES / "web_page.png")
 
 
 if __name__ == "__main__":

@@ -216,6 +216,7 @@ class Tab:
         )
 
     def picture(self, path: Path) -> None:
-        """Write what is shown, the whole page, as a PNG."""
-        answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
+        """Write what the window shows as a PNG."""
+        self.call("Page.bringToFront")
+        answer = self.call("Page.captureScreenshot", format="png")
         path.write_bytes(base64.b64decode(answer["data"]))
