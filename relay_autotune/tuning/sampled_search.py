@@ -94,8 +94,6 @@ class SampledResponses(Responses):
     ) -> None:
         self._law, self._period = law, period
         self._held = [HeldProcess(m, period, law.delay) for m in models]
-        self._open = np.array([held.unstable_poles for held in self._held])
-        self._double = np.array([m.integrators == 2 for m in models])
         super().__init__(models, grid, crossover)
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
@@ -128,6 +126,9 @@ class SampledResponses(Responses):
         :return: as for :class:`~relay_autotune.tuning.frontier.Responses`.
         """
         h, smoothing = self._period, self._law.smoothing
+        if not kp.size:
+            # No filter keeps the limit of the noise.
+            return (np.empty((0, self._poles[of].size)),) * 2
         z = np.exp(1j * self.grid * h)
         w = (2.0 / h) * np.tan(0.5 * h * self.grid)
         value = _each(lambda t: smoothing.value(t, h), tf, z)
@@ -139,13 +140,10 @@ class SampledResponses(Responses):
         inverse = self.inverse[of][None] / value[:, None, :]
         x, y = np.ascontiguousarray(inverse.real), np.ascontiguousarray(inverse.imag)
         loops = own[:, None, :] / inverse
-        gained = _gained(loops)
-        count = self._poles[of] + gained
-        starts = np.sign(loops[..., 0].imag)
+        # A loop that begins left of -1 has a real pole there, which moves with the phase.
         at_rest = self._at_rest[of] & (loops[..., 0].real < -1.0)
-        count = count + np.where(at_rest, starts, 0.0)
-        doubly = self._open[of] + np.where(starts > 0.0, 2, 0) + gained
-        count = np.where(self._double[of], doubly, count)
+        begun = np.where(at_rest, np.sign(loops[..., 0].imag), 0.0)
+        count = self._poles[of] + _gained(loops) + begun
         with np.errstate(invalid="ignore"):
             crossing = first_crossing(base + x, w * (lead + y), kp)
         stable = np.where(count == 0, crossing, 0.0)

@@ -116,6 +116,10 @@ def test_noise_in_the_command_is_limited_as_far_as_the_law_has_a_filter():
         assert gains.noise_gain * 0.02 < 0.1 * 1.1
         assert (gains.tf > 0.0) is (law != "simple_pid")
     assert "no filter to set" in " ".join(gains.warnings)
+    unstable = TransferFunction.unstable_fopdt(1.0, 1.0, 0.2)
+    gains = tune(unstable, options=asked("pid_controller", period, **noisy))
+    assert "the noise is not limited" in gains.reason
+    assert gains.ms < 1.41
 
 
 @pytest.mark.long
