@@ -51,7 +51,7 @@ from relay_autotune_msgs.msg import PidGains, TransferFunction
 RUNS = 200
 # Kills come at a random moment between the call of ~/apply and this time after it [s].
 WITHIN = 2.5
-SILENT = "any; nobody answers"
+SILENT = "any; no answer"
 PHASES = ("apply", "between", "verify", "after it", SILENT)
 # A process that has seen many peers die may hear nobody any more: kills until new ones come.
 EACH = 25
@@ -61,7 +61,7 @@ EACH = 25
 class Kill:
     """A kill and its result.
 
-    :param kind: whose gains: ``own`` or ``another node's``.
+    :param kind: whose gains: ``own``, or those of ``another`` node.
     :param phase: what had been asked for and had not been answered.
     :param seconds: from the start of the next process until the gains were seen in force.
     :param problem: which gains were in force where they must not; empty: none.
@@ -118,18 +118,23 @@ def rig_of_its_own() -> Iterator[Rig]:
 
 
 def kills_of(
-    stretch: Callable[[Iterable[int], float], list[Kill]], runs: int, deadline: float
+    stretch: Callable[[Iterable[int], float], Iterator[Kill]], runs: int, deadline: float
 ) -> list[Kill]:
     """Return the kills of one kind, with new processes for each stretch of them."""
     found: list[Kill] = []
     while len(found) < runs and time.monotonic() < deadline:
-        found += stretch(range(len(found), min(len(found) + EACH, runs)), deadline)
+        try:
+            counts = range(len(found), min(len(found) + EACH, runs))
+            for kill in stretch(counts, deadline):
+                found.append(kill)
+        except AssertionError as error:
+            print(str(error).splitlines()[0], file=sys.stderr)
+            found.append(Kill(stretch.__name__, SILENT, math.nan, ""))
     return found
 
 
-def own(counts: Iterable[int], deadline: float) -> list[Kill]:
+def own(counts: Iterable[int], deadline: float) -> Iterator[Kill]:
     """Kill a node that controls: it must start with the gains that it had proven."""
-    found: list[Kill] = []
     with rig_of_its_own() as rig:
         loop = HandLoop(rig, kc=0.3, ti=1.0)
         loop.apply(0.5, 0.6, "proven")
@@ -147,21 +152,15 @@ def own(counts: Iterable[int], deadline: float) -> list[Kill]:
             loop.node.signal(signal.SIGKILL)
             loop.node.wait()
             begun = time.monotonic()
-            try:
-                loop.start()
-                kc, ti = loop.gains_shown()
-            except AssertionError:
-                found.append(Kill("own", SILENT, math.nan, ""))
-                break
+            loop.start()
+            kc, ti = loop.gains_shown()
             right = (kc, ti) == (0.5, 0.6)
             taken = time.monotonic() - begun
-            found.append(Kill("own", phase, taken, "" if right else f"kc {kc}, ti {ti}"))
-    return found
+            yield Kill("own", phase, taken, "" if right else f"kc {kc}, ti {ti}")
 
 
-def another(counts: Iterable[int], deadline: float) -> list[Kill]:
+def another(counts: Iterable[int], deadline: float) -> Iterator[Kill]:
     """Kill a node that sets another node's gains: that node must get back its previous gains."""
-    found: list[Kill] = []
     with rig_of_its_own() as rig:
         loop = Loop(rig)
         before = loop.values()
@@ -200,13 +199,11 @@ def another(counts: Iterable[int], deadline: float) -> list[Kill]:
                 rig.until(are_right, "the gains of before")
             except AssertionError:
                 if not values:
-                    found.append(Kill("another node's", SILENT, math.nan, ""))
-                    break
+                    raise
             problem = "" if values in allowed else str(values)
-            found.append(Kill("another node's", phase, time.monotonic() - begun, problem))
+            yield Kill("another", phase, time.monotonic() - begun, problem)
             if values != before:
                 loop.trigger("revert")
-    return found
 
 
 def end_in_order() -> None:

@@ -64,6 +64,7 @@ class HandLoop:
         self.parameters |= parameters
         self.node = self.rig.start("controller_node", **self.parameters)
         self.rig.until(lambda: "ready:" in self.node.log, "the controller", 60.0)
+        self.rig.be_known_to("controller_node")
         before = len(self.commands)
 
         def answered() -> bool:

@@ -197,13 +197,13 @@ class Rig:
         client = self.clients.get(name)
         if client is None:
             client = self.clients[name] = self.node.create_client(kind, name)
-            self._be_known_to(name.rpartition("/")[0])
+            self.be_known_to(name.rpartition("/")[0])
         self.until(client.service_is_ready, f"service {name}")
         future = client.call_async(request)
         self.until(future.done, f"answer of {name}")
         return future.result()
 
-    def _be_known_to(self, node: str) -> None:
+    def be_known_to(self, node: str) -> None:
         """Wait until a node has discovered all clients made so far.
 
         Until then its answers are lost. It discovers them in the order in which they were made, so

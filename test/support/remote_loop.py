@@ -133,6 +133,7 @@ class Loop:
             **self.parameters,
         )
         self.rig.until(lambda: "ready:" in self.controller.log, "the controller_node", 60.0)
+        self.rig.be_known_to("controller_node")
 
     def is_watched(self) -> bool:
         reason = self.verify()[1].reason
