@@ -11,7 +11,7 @@ Each run offers other gains, calls ~/apply and, where that has answered, ~/verif
 with SIGKILL at a random moment, starts it again and looks at the gains: those of this node in a
 loop that is stepped by hand (see test/support/hand_loop.py), and those of another node in a loop
 in real time (test/support/remote_loop.py). The gains on trial would fail, so that only those of
-before are right. Half of the runs are of each kind, at the same time. Exit status 1 if other gains
+before are right. Half of the runs are of each kind. Exit status 1 if other gains
 are in force.
 """
 
@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import multiprocessing
 import signal
 import sys
 import tempfile
@@ -41,9 +40,9 @@ from std_srvs.srv import Trigger
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
 
 from hand_loop import HandLoop
-from loop_rig import Rig
+from loop_rig import Process, Rig
 from remote_loop import VERDICT, Loop
-from ros_domain import free_domain
+from ros_domain import free_domain, remove_unmapped
 
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, TransferFunction
@@ -117,6 +116,13 @@ def rig_of_its_own() -> Iterator[Rig]:
             rig.close()
 
 
+def kill(process: Process) -> None:
+    """Kill a process, and remove the shared memory that it leaves."""
+    process.signal(signal.SIGKILL)
+    process.wait()
+    remove_unmapped(process.segments)
+
+
 def kills_of(
     stretch: Callable[[Iterable[int], float], Iterator[Kill]], runs: int, deadline: float
 ) -> list[Kill]:
@@ -149,8 +155,7 @@ def own(counts: Iterable[int], deadline: float) -> Iterator[Kill]:
             # For a process with a third of the gain that it has.
             loop.offer(0.9 + 1e-4 * count, 0.3, f"tried {count}", gain=0.7)
             phase = course.until(random.uniform(0.0, WITHIN), 0.3)
-            loop.node.signal(signal.SIGKILL)
-            loop.node.wait()
+            kill(loop.node)
             begun = time.monotonic()
             loop.start()
             kc, ti = loop.gains_shown()
@@ -183,8 +188,7 @@ def another(counts: Iterable[int], deadline: float) -> Iterator[Kill]:
             rig.until(lambda name=name: f"gains of {name} wait" in loop.controller.log, name)
             rig.run_for(2.0)
             phase = course.until(random.uniform(0.0, WITHIN), 0.5)
-            loop.controller.signal(signal.SIGKILL)
-            loop.controller.wait()
+            kill(loop.controller)
             begun = time.monotonic()
             loop.start()
             # Gains stay if ~/apply was finished and no verification was running.
@@ -204,12 +208,6 @@ def another(counts: Iterable[int], deadline: float) -> Iterator[Kill]:
             yield Kill("another", phase, time.monotonic() - begun, problem)
             if values != before:
                 loop.trigger("revert")
-
-
-def end_in_order() -> None:
-    """Let a worker that is ended end the processes that it has started."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
 
 
 def rows(kills: list[Kill]) -> list[tuple[object, ...]]:
@@ -236,9 +234,7 @@ def main() -> int:
     asked = parser.parse_args()
     runs = 2 if asked.quick else asked.runs // 2
     deadline = time.monotonic() + 60.0 * asked.minutes
-    with multiprocessing.get_context("spawn").Pool(2, end_in_order) as pool:
-        parts = [pool.apply_async(kills_of, (work, runs, deadline)) for work in (own, another)]
-        kills = [kill for part in parts for kill in part.get()]
+    kills = [kill for work in (own, another) for kill in kills_of(work, runs, deadline)]
     headings = (
         *("gains", "killed in", "kills", "other gains than before"),
         *("start to gains, median [s]", "longest [s]"),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from relay_autotune.nodes.domain import free_domain, ports
 
-__all__ = ["free_domain", "mapped_segments", "remove_leftovers"]
+__all__ = ["free_domain", "mapped_segments", "remove_leftovers", "remove_unmapped"]
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -42,6 +42,15 @@ def remove_leftovers(domain: int, segments: set[Path]) -> None:
         number = re.search(r"fastrtps_port(\d+)", path.name)
         if number and int(number.group(1)) in ports(domain):
             _remove(path)
+
+
+def remove_unmapped(segments: set[Path]) -> None:
+    """Remove those segments of a killed process that no other process maps.
+
+    A process may be killed while it holds the lock of a port, and the port's next user would wait.
+    """
+    for path in segments.difference(*map(mapped_segments, _processes())):
+        _remove(path)
 
 
 def _processes() -> list[int]:
