@@ -52,7 +52,7 @@ _ENDS_WITHIN = 5.0
 # Interval of what is told without being asked [s].
 _EVERY = 0.5
 # Interval of samples [s]; the eye sees no more, and relay_node needs the processor.
-_LIVE_EVERY = 0.04
+_LIVE_EVERY = 0.025
 # Answers that are kept beside those of the slider's positions.
 _MOST_KEPT = 2000
 

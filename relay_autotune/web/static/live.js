@@ -60,7 +60,7 @@ export class Live {
       const begun = performance.now();
       this.draw();
       // A slow machine, which may be the one that tunes, draws less often.
-      setTimeout(() => { this.drawn = false; }, Math.max(50, 4 * (performance.now() - begun)));
+      setTimeout(() => { this.drawn = false; }, Math.max(30, 4 * (performance.now() - begun)));
     }, 0);
   }
 
