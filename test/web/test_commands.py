@@ -1,0 +1,52 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""`replay --web` and `tune --web` as their users start and end them."""
+
+import json
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+
+import pytest
+from served import REPOSITORY, conversation
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("replay", str(REPOSITORY / "bags/biased_relay"), "--pi"),
+        ("tune", "--gain", "1.65", "--time-constants", "20", "--dead-time", "10", "--pi"),
+    ],
+    ids=["replay", "tune"],
+)
+def test_a_page_is_served_until_ctrl_c_and_its_command_gives_the_same_gains(words):
+    process = subprocess.Popen(
+        [shutil.which(words[0]), *words[1:], "--web"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        said = process.stderr.readline()
+        url = re.search(r"the page is at (http://127\.0\.0\.1:\d+/) until Ctrl-C", said)[1]
+        first, answer = conversation(
+            url, {"of": 0, "n": 1, "asked": {"ms": 1.6, "controller": "pi"}}
+        )
+    finally:
+        process.send_signal(signal.SIGINT)
+        output, said = process.communicate(timeout=60.0)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    assert "ISA form" in output
+    assert first["subjects"][0]["first"]["controller"] == "pi"
+    shaped = answer["answer"]["shaped"]
+    again = shlex.split(shaped["command"])
+    assert "--web" not in again
+    done = subprocess.run(
+        [shutil.which(again[0]), *again[1:], "--json"], capture_output=True, text=True, check=True
+    )
+    found = json.loads(done.stdout)
+    found = found["experiments"][0] if "experiments" in found else found
+    gains = found["gains"][found["recommended"]]
+    assert f"{gains['kc']:.4f}" == shaped["isa"][0][1]
