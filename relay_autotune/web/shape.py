@@ -77,7 +77,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Curve:
+class LoopCurve:
     """The loop about the point -1.
 
     :param loop: its values, shape (f,).
@@ -104,7 +104,7 @@ class Shaped:
     gains: Gains
     judgement: Judgement
     steps: Steps
-    curve: Curve
+    curve: LoopCurve
     unstable: int
 
 
@@ -253,7 +253,7 @@ def _steps(
     return Steps(time, measurement, command, low, high, half)
 
 
-def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> Curve:
+def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> LoopCurve:
     loop = gains.loop(model)
     w = loop_frequencies(loop)
     values = loop(1j * w)
@@ -264,7 +264,7 @@ def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> Curve:
         some = w[:: max(1, w.size // _BAND)]
         around = gains(1j * some)[:, None] * shaping.task.around(some)
         band = swept_parts(around[np.all(np.abs(around) < _FAR, axis=1)].T)
-    return Curve(values, band)
+    return LoopCurve(values, band)
 
 
 def asked_of(fields: object, rules: tuple[str, ...]) -> Asked:
