@@ -4,9 +4,10 @@
 """apply_gains: show new gains beside those in force, apply them, and verify them with a step.
 
 The gains are those of the last tune, and go to the loop's controller_node; with --file they are
-written for ros2_controllers' pid_controller instead. Nothing is changed before you answer yes, or
-give --yes. The height of the step is --step, else verify_step of the node, else half of the swing
-that the tune made. If the step fails, the node takes the gains before back by itself.
+written instead, for ros2_controllers' pid_controller or the law that they are for. Nothing is
+changed before you answer yes, or give --yes. The height of the step is --step, else verify_step
+of the node, else half of the swing that the tune made. If the step fails, the node takes the gains
+before back by itself.
 
 Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
 command line is wrong.
@@ -89,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--revert", action="store_true", help="take the gains before back")
     parser.add_argument(
         "--file", metavar="FILE",
-        help="write the gains for ros2_controllers' pid_controller, and apply nothing",
+        help="write the gains, for pid_controller or the law that they are for; apply nothing",
     )  # fmt: skip
     parser.add_argument(
         "--wait", type=finite, default=60.0, metavar="S",
@@ -133,12 +134,14 @@ def apply_at(name: str, *, doubtful: bool) -> int:
 
 
 def _write(client: GainsClient, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.export import Target, exported, write
+    from relay_autotune.cli.export import WITHOUT_LAW, Target, exported, exports_of, write
 
     gains, doubt = client.waiting()
     _require_trust(doubt, options)
-    write(exported(gains, "pid_controller", Target(), doubt=doubt), options.file)
-    print(f"written: {options.file}; load it with ros2 param load /pid_controller {options.file}")
+    how = exports_of(gains.law)[0]
+    write(exported(gains, how, Target(), doubt=doubt), options.file)
+    load = f"; load it with ros2 param load /pid_controller {options.file}"
+    print(f"written for {how}: {options.file}{load if how == WITHOUT_LAW else ''}")
     return DONE
 
 

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
 from relay_autotune.cli.asking import agrees, asked_for_file
-from relay_autotune.cli.export import Target, exported, write
+from relay_autotune.cli.export import Target, exported, exports_of, write
 from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     START_WITHIN,
@@ -304,16 +304,17 @@ def _hand_over(client: TuneClient, options: argparse.Namespace) -> None:
     """Offer to apply and verify the gains, and write them for another controller."""
     result, file = client.result, options.export
     doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
+    how = exports_of(result.gains.law)[0]
     if not options.yes:
         there = client.controllers() if sys.stdin.isatty() else []
         for name in there:
             print()
             apply_at(name, doubtful=bool(doubt))
-        file = file or ("" if there else asked_for_file("\nWrite the gains for pid_controller"))
+        file = file or ("" if there else asked_for_file(f"\nWrite the gains for {how}"))
     if file:
         gains = gains_from_message(result.gains)
-        write(exported(gains, "pid_controller", Target(), doubt=doubt), file)
-        print(f"  {'gains for':<16} pid_controller: {file}")
+        write(exported(gains, how, Target(), doubt=doubt), file)
+        print(f"  {'gains for':<16} {how}: {file}")
 
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:

@@ -233,7 +233,6 @@ class Gains(Performance, Controller):
         "",
         "Law that they are for; left out: controller_node's, as a continuous controller.",
         "",
-        message=None,
         word=True,
         optional=True,
     )
@@ -242,7 +241,6 @@ class Gains(Performance, Controller):
         "Sampling period at which that law runs; left out: no law was named.",
         0.0,
         lower=0.0,
-        message=None,
         optional=True,
     )
     reason: str = told("", "Why this rule and these gains, a sentence for people.")

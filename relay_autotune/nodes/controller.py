@@ -293,6 +293,11 @@ class ControllerNode(ServedNode):
             return
         name = message.experiment_id
         try:
+            if gains.law not in self._place.laws:
+                raise TuningError(
+                    f"they are for the law {gains.law}, which {self._place.name} does not run: "
+                    f"write them to a file with apply_gains --file, or tune without that law"
+                )
             self._bounds.require(gains)
             self._keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
@@ -560,6 +565,7 @@ class OwnGains:
 
     name = "this node"
     outlives = False
+    laws: tuple[str, ...] = ("", "controller_node")
 
     def __init__(self, use: Callable[[GainSet | None], None]) -> None:
         self._use = use

@@ -34,6 +34,8 @@ class Place(Protocol):
     name: str
     outlives: bool
     """True if the gains stay in force when this process ends."""
+    laws: tuple[str, ...]
+    """Laws that it may run, by the names of :data:`~relay_autotune.loop.laws.LAWS`; "": none."""
 
     async def read(self) -> GainSet | None:
         """Return the gains in force, None if the command is held."""

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS
 
 # Names of the gains that may be sent, of the ISA and of the parallel form.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
@@ -81,6 +82,11 @@ class RemoteGains:
     """
 
     outlives = True
+    # Laws of nodes whose parameters are the gains themselves.
+    laws: tuple[str, ...] = (
+        "",
+        *(name for name in LAWS if name.startswith(("pid_controller", "control_toolbox"))),
+    )
 
     def __init__(self, node: Node, target: str, mapping: Mapping[str, str]) -> None:
         self.name = target

@@ -161,6 +161,7 @@ def test_forged_gains_are_not_applied(rig: Rig) -> None:
         ({"kc": 1e12, "p": 0.0, "i": 0.0}, "loop gain"),
         ({"ti": 1e-9, "p": 0.0, "i": 0.0}, "does not go with a period"),
         ({"kc": 2.9, "ti": 0.4, "p": 0.0, "i": 0.0}, "unstable loop"),
+        ({"law": "klipper_heater", "law_period": 0.1}, "which this node does not run"),
     ):
         send(said, pi_gains=gains_of(PROCESS, "done", **wrong), transfer_function=right)
         assert not rig.call(Trigger, "controller_node/apply", Trigger.Request()).success
