@@ -6,11 +6,16 @@
 Tests that need a browser are left out where there is none, and a line at the end says so.
 """
 
+import signal
+
 import pytest
 from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
+
+# nohup or a build server may have had it ignored; a node would rightly go on doing that
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 _LEFT_OUT = pytest.StashKey[int]()
 

@@ -5,19 +5,12 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from loop_rig import Rig
 from ros_domain import free_domain
-
-
-@pytest.fixture(scope="session", autouse=True)
-def hang_ups_end_processes() -> None:
-    """Undo what nohup or a build server has set: a node would rightly ignore the signal."""
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture
