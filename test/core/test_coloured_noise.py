@@ -189,3 +189,19 @@ def test_heating_up_from_cold_is_no_switch_of_the_relay():
     relay = find_relay(record)
     assert relay is not None
     assert record.time[relay.up[0]] > 300.0
+
+
+@pytest.mark.long
+def test_where_no_structure_fits_in_any_colour_the_noise_counts_as_white():
+    """An outlier ends a walk: in colour, each dead time is longer than the record allows."""
+    rng = np.random.default_rng(9)
+    count, share = int(rng.integers(25, 120)), rng.uniform(0.5, 0.97)
+    command = np.where(np.arange(count) < int(count * share), 0.0, 1.0)
+    white = rng.normal(size=count)
+    walk = lfilter([0.1], [1.0, -rng.uniform(0.8, 0.999)], white)
+    rng.random()
+    walk += rng.uniform(-1.0, 1.0) * command * np.linspace(0.0, 1.0, count)
+    walk[-1] += 100.0
+    time = PERIOD * np.arange(count)
+    found = identify_waveform(Record(time=time, measurement=walk, command=command))
+    assert np.all(np.isfinite(found.values))

@@ -319,6 +319,8 @@ def _earned(candidate: Candidate, length: float) -> Candidate:
 
 def _ordered(found: list[Candidate]) -> list[Candidate]:
     """Return the candidates; first the simplest that the criterion cannot tell from the best."""
+    if not found:
+        return []
     found = sorted(found, key=lambda c: c.criterion)
     best = found[0].criterion
     rivals = [c for c in found if c.criterion <= best + 2.0]
