@@ -14,8 +14,10 @@ from hypothesis import settings
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
-# nohup or a build server may have had it ignored; a node would rightly go on doing that
+# nohup, a shell's background or a build server may have had them ignored; commands that the tests
+# start would rightly go on doing that
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _LEFT_OUT = pytest.StashKey[int]()
 
