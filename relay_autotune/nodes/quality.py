@@ -162,6 +162,9 @@ def nearest(
 
 def who(end: Any) -> str:
     """Return the full name of the node of a publisher or subscription."""
+    # The middleware's word for a participant whose nodes have not been told yet.
+    if end.node_name == "_NODE_NAME_UNKNOWN_":
+        return "a node whose name is not known yet"
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import NodeNameNonExistentError
 from rclpy.qos import qos_profile_sensor_data
 
 from relay_autotune.errors import FieldError, LoopError
@@ -20,7 +21,7 @@ from relay_autotune.exchange.messages import record_from_message, without_imposs
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
@@ -281,9 +282,19 @@ class TuneClient(LoopClient):
             self._node.get_publisher_names_and_types_by_node
             if published
             else self._node.get_subscriber_names_and_types_by_node
-        )(name, space or "/")
+        )
         others = {self._resolved(other) for other in _OTHER_ENDS}
-        found = [end for end, types in ends if type_name in types and end not in others]
+
+        there: list[tuple[str, list[str]]] = []
+
+        def is_known() -> bool:
+            # Its services may be known before its name is.
+            with suppress(NodeNameNonExistentError):
+                there[:] = ends(name, space or "/")
+            return bool(there)
+
+        self._wait(is_known, time.monotonic() + ANSWER_WITHIN)
+        found = [end for end, types in there if type_name in types and end not in others]
         own = self._resolved(topic)
         if own in found or len(found) == 1:
             return own if own in found else found[0]

@@ -26,6 +26,9 @@ from relay_autotune_msgs.msg import RelayExperiment
 
 # Moments of a fault; `benchmarks/fault_table.py` tries two hundred.
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
+# On a busy machine the tune of this one may reach max_cycles first: it then ends at the baseline.
+BUSY = "fast switching"
+NAMES = [pytest.param(n, marks=[pytest.mark.nightly] if n == BUSY else []) for n in FAULTS]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +59,7 @@ def loop(loop_of: Callable[[str], Loop]) -> Loop:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_fault_ends_in_the_safe_command(
     loop_of: Callable[[str], Loop], name: str, seed: int
 ) -> None:
