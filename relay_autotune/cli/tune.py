@@ -137,13 +137,17 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.web:
         check_web(options)
     task = task_of_model(model_of(options), design_options(options))
-    status = _side_by_side(task, rule, options) if options.table else _one(task, rule, options)
+    found = _by_all_rules(task, rule) if options.table or options.web else ([], {})
+    if options.table:
+        status = _side_by_side(task, rule, options, *found)
+    else:
+        status = _one(task, rule, options)
     if options.web:
-        show(PROGRAM, parser, options, [_to_shape(task, rule)])
+        show(PROGRAM, parser, options, [_to_shape(task, rule, found[0])])
     return status
 
 
-def _to_shape(task: DesignTask, rule: str) -> tuple[Case, Shaping]:
+def _to_shape(task: DesignTask, rule: str, gains: Sequence[Gains]) -> tuple[Case, Shaping]:
     """Return a model that was given as a page shows it, and what the design of gains takes."""
     from relay_autotune.identification.result import FitReport
     from relay_autotune.record.record import Outcome
@@ -151,7 +155,6 @@ def _to_shape(task: DesignTask, rule: str) -> tuple[Case, Shaping]:
     from relay_autotune.shaping import Shaping
     from relay_autotune.text import process_text
 
-    gains, _ = _by_all_rules(task, rule)
     case = Case(
         source=process_text(task.model),
         experiment_id="",
@@ -186,10 +189,15 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     return DONE
 
 
-def _side_by_side(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
+def _side_by_side(
+    task: DesignTask,
+    rule: str,
+    options: argparse.Namespace,
+    gains: Sequence[Gains],
+    refused: dict[str, str],
+) -> int:
     from relay_autotune.cli.tune_table import process_lines, refusal_lines, side_by_side
 
-    gains, refused = _by_all_rules(task, rule)
     recommended = 0 if gains and gains[0].rule == rule else None
     inside = _compensators(task, refused)
     if options.json:

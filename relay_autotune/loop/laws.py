@@ -260,6 +260,11 @@ class Law:
     line: str = "{name}: {value}"
     remark: str = "#"
 
+    @property
+    def sets_gains(self) -> bool:
+        """True if its parameters p, i and d are the gains themselves."""
+        return [each.name for each in self.settings[:3]] == ["p", "i", "d"]
+
     def lag(self, period: float) -> float:
         """Return the dead time that stands for hold and delay in a continuous loop [s].
 
@@ -410,24 +415,18 @@ def _field(name: str) -> Setting:
     return Setting(name, lambda law: float(getattr(law.gains, name)))
 
 
-def _parallel(names: str, scale: float = 1.0) -> tuple[Setting, ...]:
-    """Return the settings of a parallel form, by their names."""
+def _parallel(names: str, of: Callable[[float], float] = lambda gain: gain) -> tuple[Setting, ...]:
+    """Return the settings of a parallel form, by their names, from its gains."""
     p, i, d = names.split()
     return (
-        Setting(p, lambda law: scale * law.gains.p),
-        Setting(i, lambda law: scale * law.gains.i),
-        Setting(d, lambda law: scale * law.gains.d),
+        Setting(p, lambda law: of(law.gains.p)),
+        Setting(i, lambda law: of(law.gains.i)),
+        Setting(d, lambda law: of(law.gains.d)),
     )
 
 
-def _sizes(names: str) -> tuple[Setting, ...]:
-    """Return the settings of a parallel form whose sign is set otherwise."""
-    p, i, d = names.split()
-    return (
-        Setting(p, lambda law: abs(law.gains.p)),
-        Setting(i, lambda law: abs(law.gains.i)),
-        Setting(d, lambda law: abs(law.gains.d)),
-    )
+def _of_255(gain: float) -> float:
+    return 255.0 * gain
 
 
 def _strategy(name: str) -> Setting:
@@ -509,7 +508,8 @@ _ROWS = (
         _PLAIN,
         "I stays within the output limits",
         (
-            *_sizes("Kp Ki Kd"),
+            # Their sign is that of ControllerDirection.
+            *_parallel("Kp Ki Kd", abs),
             Setting("SampleTime", lambda law: f"{1000.0 * law.period:.10g}"),
             Setting("POn", lambda law: "P_ON_E" if law.gains.b > 0.5 else "P_ON_M"),
             Setting(
@@ -565,7 +565,7 @@ _ROWS = (
         _FIRST_ORDER,
         "the integral keeps its value while u is limited; small changes of u may be left out",
         (
-            *_parallel("pid_Kp pid_Ki pid_Kd", 255.0),
+            *_parallel("pid_Kp pid_Ki pid_Kd", _of_255),
             Setting(
                 "smooth_time",
                 lambda law: max(law.gains.tf, law.period) if law.gains.td else None,
@@ -585,7 +585,7 @@ _ROWS = (
         _FIRST_ORDER,
         "Ki h I stays between 0 and the largest output",
         (
-            *_parallel("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", 255.0),
+            *_parallel("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", _of_255),
             Setting(
                 "PID_K1",
                 lambda law: (

@@ -78,6 +78,26 @@ def sampled_grid(model: TransferFunction, gains: Controller, period: float) -> F
     return np.asarray(np.append(grid[grid < top * (1.0 - 1e-7)], top * (1.0 - _BEFORE_END)))
 
 
+def circle(samples: int) -> ComplexArray:
+    """Return the half circle outside the unit circle for :func:`step_response`, shape (n + 1,).
+
+    :param samples: n, those of the response.
+    """
+    decay = _DECAY / (2.0 * samples)
+    return np.exp(decay + 1j * np.arange(samples + 1) * (math.pi / samples))
+
+
+def step_response(values: ComplexArray) -> FloatArray:
+    """Return the response to a unit step at the first sample, shape (..., n).
+
+    :param values: of a function of z on the :func:`circle` of n samples, shape (..., n + 1).
+    """
+    samples = values.shape[-1] - 1
+    step = 1.0 / (1.0 - 1.0 / circle(samples))
+    grown = np.exp(_DECAY / (2.0 * samples) * np.arange(samples))
+    return np.asarray(np.fft.irfft(values * step, axis=-1)[..., :samples] * grown)
+
+
 class SampledLoop:
     """A law and a process at the law's sampling period.
 
@@ -204,16 +224,8 @@ class SampledLoop:
 
         :param samples: number of samples.
         """
-        growth = _DECAY / (2.0 * samples)
-        z = np.exp(growth + 1j * np.arange(samples + 1) * (math.pi / samples))
-        decayed = np.exp(growth * np.arange(samples))
-        step = 1.0 / (1.0 - 1.0 / z)
         time = np.arange(samples) * self.law.period
-
-        def inverted(values: ComplexArray) -> FloatArray:
-            return np.asarray(np.fft.irfft(values * step)[:samples] * decayed)
-
-        y_r, y_d, u_r, u_d = map(inverted, self._closed(z))
+        y_r, y_d, u_r, u_d = map(step_response, self._closed(circle(samples)))
         return StepResponse(time, y_r, u_r), StepResponse(time, y_d, u_d)
 
     def _closed(self, z: ComplexArray) -> tuple[ComplexArray, ...]:

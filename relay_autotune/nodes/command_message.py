@@ -59,13 +59,13 @@ class CommandMessage:
             steps = steps_of(root, self.field, type_name)
         except FieldError as error:
             raise ParameterError(f"command_field: {error}") from None
-        self._is_single = _number_of(root, steps).form == "f4"
-        if _number_of(root, steps).form[0] != "f":
+        number = _number_of(root, steps)
+        if number.form[0] != "f":
             raise ParameterError(
-                f"command_field: {self.field} of {type_name} is a "
-                f"{_number_of(root, steps).name}; expected a float32 or float64, which can hold "
-                f"the relay's levels"
+                f"command_field: {self.field} of {type_name} is a {number.name}; expected a "
+                f"float32 or float64, which can hold the relay's levels"
             )
+        self._is_single = number.form == "f4"
         self._value, self._put = reading(steps), setting(steps)
         if steps == ("data",):
             self._put = _set_data

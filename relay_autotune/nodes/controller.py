@@ -27,6 +27,7 @@ from relay_autotune.control.verification import Step
 from relay_autotune.errors import FieldError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
@@ -565,7 +566,7 @@ class OwnGains:
 
     name = "this node"
     outlives = False
-    laws: tuple[str, ...] = ("", "controller_node")
+    laws: tuple[str, ...] = ("", OWN_LAW)
 
     def __init__(self, use: Callable[[GainSet | None], None]) -> None:
         self._use = use

@@ -138,7 +138,7 @@ class GainsClient(LoopClient):
         begun = time.monotonic()
         while (waited := time.monotonic() - begun) < seconds:
             tell(f"the loop settles with the new gains, {duration(waited)} of {duration(seconds)}")
-            self._wait(lambda: False, time.monotonic() + min(TOLD_EVERY, seconds - waited))
+            self.rest(min(TOLD_EVERY, seconds - waited))
 
     def verify(
         self, setpoint: float, load: float, patience: float, tell: Callable[[str], None]
@@ -174,4 +174,4 @@ class GainsClient(LoopClient):
                     f"with --verify-only"
                 )
             tell(result.reason)
-            self._wait(lambda: False, time.monotonic() + TOLD_EVERY)
+            self.rest(TOLD_EVERY)

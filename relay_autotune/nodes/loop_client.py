@@ -207,9 +207,16 @@ class LoopClient:
                 heard.append(commands.value(message))
 
         ear = self._node.create_subscription(commands.kind, name, hear, qos_profile_sensor_data)
-        self._wait(lambda: False, time.monotonic() + _LISTEN)
+        self.rest(_LISTEN)
         self._node.destroy_subscription(ear)
         return sum(heard) / len(heard) if heard else math.nan
+
+    def rest(self, seconds: float) -> None:
+        """Handle messages for a time.
+
+        :param seconds: the time [s].
+        """
+        self._wait(lambda: False, time.monotonic() + seconds)
 
     def _is_here(self, name: str) -> bool:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]

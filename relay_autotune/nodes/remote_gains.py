@@ -83,10 +83,7 @@ class RemoteGains:
 
     outlives = True
     # Laws of nodes whose parameters are the gains themselves.
-    laws: tuple[str, ...] = (
-        "",
-        *(name for name in LAWS if name.startswith(("pid_controller", "control_toolbox"))),
-    )
+    laws: tuple[str, ...] = ("", *(name for name, law in LAWS.items() if law.sets_gains))
 
     def __init__(self, node: Node, target: str, mapping: Mapping[str, str]) -> None:
         self.name = target

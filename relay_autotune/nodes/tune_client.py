@@ -212,13 +212,6 @@ class TuneClient(LoopClient):
             raise LoopError(f"the samples of {wanted} have not come within {patience:g} s")
         return record_from_message(found)
 
-    def rest(self, seconds: float) -> None:
-        """Handle messages for a time.
-
-        :param seconds: the time [s].
-        """
-        self._wait(lambda: False, time.monotonic() + seconds)
-
     def watch_measurement(self, take: Callable[[float], None]) -> None:
         """Hear each measurement that relay_node hears.
 

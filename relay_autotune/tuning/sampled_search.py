@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import Law, Rational, Slope
 from relay_autotune.loop.margins import peaks
-from relay_autotune.loop.sampled_loop import SampledLoop, sampled_grid
+from relay_autotune.loop.sampled_loop import SampledLoop, circle, sampled_grid, step_response
 from relay_autotune.process.held import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import Candidates
@@ -49,7 +49,6 @@ _SHARE = 0.95
 # Samples of a load response, and samples in an ultimate period above which the loop is as good as
 # continuous.
 _SAMPLES, _CONTINUOUS = 2048, 100.0
-_DECAY = math.log(1e8)
 # Time constants of a filter that are tried, in periods.
 _FILTERS = np.concatenate(([0.0], np.geomspace(1.05, 1e3, 80)))
 # The response of a filter to an impulse has ended after so many time constants.
@@ -273,15 +272,12 @@ class SampledSearch(Search):
         law = value * (p + i * 0.5 * h * (z + 1.0) / (z - 1.0))
         if np.any(c.td):
             law = law + d * _each(lambda t: smoothing.slope(t, h), c.tf, z)
-        step = 1.0 / (1.0 - 1.0 / z)
-        growth = np.exp(_DECAY / (2.0 * _SAMPLES) * np.arange(_SAMPLES))
-        y = np.fft.irfft(process / (1.0 + law * process) * step, axis=-1)[:, :_SAMPLES] * growth
+        y = step_response(process / (1.0 + law * process))
         return np.asarray(1.0 / c.ki + 2.0 * h * np.maximum(-y, 0.0).sum(axis=1))
 
     @cached_property
     def _circle(self) -> tuple[ComplexArray, ComplexArray]:
         """Return z on a circle outside the unit circle, and the process there."""
-        angles = np.arange(_SAMPLES + 1) * (math.pi / _SAMPLES)
-        z = np.exp(_DECAY / (2.0 * _SAMPLES) + 1j * angles)
+        z = circle(_SAMPLES)
         held = HeldProcess(self.held, self.period, self.law.delay)
         return z, self.model.process_sign * held(z)

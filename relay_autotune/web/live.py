@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from relay_autotune.exchange.fields import json_number
 from relay_autotune.report.style import in_steps, thinned
 from relay_autotune.web.wire import short
 
@@ -183,6 +184,6 @@ def _columns(samples: Sequence[tuple[float, float]]) -> tuple[list[float], list[
 def _document(told: Told) -> dict[str, Any]:
     """Return what is known as JSON has it: None stands for a number that is not known."""
     return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        name: json_number(value) if isinstance(value, float) else value
         for name, value in asdict(told).items()
     }

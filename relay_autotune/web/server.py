@@ -109,6 +109,17 @@ class Page:
         for asked in self.subjects[number].positions():
             self.worker.later(partial(self._answer, number, asked))
 
+    def question(self, number: object, given: object) -> tuple[int, Asked]:
+        """Return the model and what is asked for, from what a page has sent.
+
+        :param number: of the model.
+        :param given: what is asked for, as JSON was read.
+        :raises TuningError: if there is no such model, or a value is out of its range.
+        """
+        if not (isinstance(number, int) and 0 <= number < len(self.subjects)):
+            raise TuningError("there is no such experiment")
+        return number, asked_of(given, tuple(RULES))
+
     async def answer(self, number: int, asked: Asked) -> str:
         """Return the answer to what a page asks, as JSON.
 
@@ -198,13 +209,9 @@ class _Guarded(RequestHandler):
         given = parse_qs(self.request.query, max_num_fields=10)
         try:
             fields = json.loads(given.get("asked", ["{}"])[0])
-            number = int(given.get("of", ["0"])[0])
-            asked = asked_of(fields, tuple(RULES))
-            if not 0 <= number < len(self.page.subjects):
-                raise TuningError("there is no such experiment")
+            return self.page.question(int(given.get("of", ["0"])[0]), fields)
         except (ValueError, RecursionError) as error:
             raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not understood") from error
-        return number, asked
 
 
 class _Static(_Guarded):
@@ -320,10 +327,8 @@ class _Socket(_Guarded, WebSocketHandler):
             if self.page.live is not None and "do" in question:
                 self._wish(self.page.live, question["do"])
                 return
-            number, count = question["of"], question["n"]
-            if not (isinstance(number, int) and 0 <= number < len(self.page.subjects)):
-                raise TuningError("there is no such experiment")
-            asked = asked_of(question["asked"], tuple(RULES))
+            count = question["n"]
+            number, asked = self.page.question(question["of"], question["asked"])
             answer = await self.page.answer(number, asked)
         except (TuningError, KeyError, TypeError, ValueError, RecursionError):
             self.close(1008, "not understood")

@@ -8,7 +8,7 @@ import re
 
 import pytest
 from chromium import Chromium
-from served import HOSTILE, analysed, hostile, served, subject_of
+from served import HOSTILE, hostile, served
 
 from relay_autotune.web.address import Address
 from relay_autotune.web.shape import Asked
@@ -20,17 +20,6 @@ TAB, RIGHT, SPACE = ("Tab", 9), ("ArrowRight", 39), (" ", 32)
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     with Chromium(tmp_path_factory.mktemp("profile")) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def subject():
-    return subject_of(analysed())
-
-
-@pytest.fixture(scope="module")
-def url(subject):
-    with served([subject]) as found:
         yield found
 
 

@@ -9,7 +9,7 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
-from served import HOSTILE, analysed, conversation, hostile, served, subject_of
+from served import HOSTILE, conversation, hostile, served
 from tornado.httpclient import HTTPClientError
 
 from relay_autotune.errors import SelectionError
@@ -17,17 +17,6 @@ from relay_autotune.verdict import Judgement
 from relay_autotune.web.address import Address, address_of
 from relay_autotune.web.server import Page, serve
 from relay_autotune.web.shape import Subject
-
-
-@pytest.fixture(scope="module")
-def subject():
-    return subject_of(analysed())
-
-
-@pytest.fixture(scope="module")
-def url(subject):
-    with served([subject]) as found:
-        yield found
 
 
 def get(url: str, **headers: str):
