@@ -31,7 +31,7 @@ from std_msgs.msg import Float32, Float64, Float64MultiArray
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment
 
 BASELINE, SAFE, REST = 1.0, 0.75, 5.0
-PERIOD = 0.0025
+PERIOD = 0.005
 DEAD_TIME = 0.025
 TIME_CONSTANT = 0.05
 RELAY = {
