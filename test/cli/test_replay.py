@@ -168,7 +168,9 @@ def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     assert "experiment 2 of 2" in out
 
 
-@pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
+@pytest.mark.parametrize(
+    "outcome", [Outcome.ABORTED, pytest.param(Outcome.FAILED, marks=pytest.mark.nightly)]
+)
 def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, capsys, outcome):
     write_bag(tmp_path / "bag", tmp_path, relay_test(outcome=outcome))
     status, out, _ = run(capsys, "--json", tmp_path / "bag")

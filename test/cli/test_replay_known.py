@@ -70,7 +70,7 @@ def test_a_fact_that_cannot_be_is_one_line(tmp_path, capsys):
     assert err == "replay: --dead-time is -1, expected at least 0 s\n"
 
 
-@pytest.mark.parametrize("one_bag", [True, False])
+@pytest.mark.parametrize("one_bag", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_two_tests_give_one_model(tmp_path, capsys, one_bag):
     records = unbiased(), unbiased(8.0)
     if one_bag:

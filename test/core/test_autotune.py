@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.analysis import analyse, analyse_alone, model_so_far
+from relay_autotune.analysis import Analysis, analyse, analyse_alone, model_so_far
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.disturbance import last_cycles
 from relay_autotune.identification.known import Known
@@ -32,9 +33,18 @@ def _record(seed: int = 0, noise: float = 0.02) -> Record:
     return simulate_sampled_relay(model, relay, period=0.2, noise=draws)
 
 
+@cache
+def _analysed(method: str = "waveform", rule: str = "robust") -> Analysis:
+    return analyse(_record(), method=method, rule=rule)
+
+
 @pytest.mark.long
 def test_a_completed_experiment_yields_models_and_gains():
     found = analyse(_record())
+    # Equal records give equal numbers.
+    assert found.model.values.tolist() == _analysed().model.values.tolist()
+    assert found.model.covariance.tolist() == _analysed().model.covariance.tolist()
+    assert found.gains == _analysed().gains
     assert found.reason == ""
     assert found.model.method == "waveform"
     assert [m.method for m in found.models] == ["waveform", "wang_biased", "fourier"]
@@ -47,7 +57,7 @@ def test_a_completed_experiment_yields_models_and_gains():
 
 @pytest.mark.long
 def test_the_chosen_method_and_rule_come_first():
-    found = analyse(_record(), method="wang_biased", rule="imc")
+    found = _analysed("wang_biased", "imc")
     assert found.model.method == "wang_biased"
     assert found.best_gains.rule == "imc"
 
@@ -72,21 +82,13 @@ def test_while_it_runs_there_is_a_model_and_no_gains():
 @pytest.mark.long
 @pytest.mark.parametrize(("method", "rule"), [("waveform", "robust"), ("wang_biased", "imc")])
 def test_alone_they_are_what_they_are_beside_others(method, rule):
-    beside = analyse(_record(), method=method, rule=rule)
+    beside = _analysed(method, rule)
     alone = analyse_alone(_record(), method=method, rule=rule)
     assert [m.method for m in alone.models] == [method]
     assert alone.model.values.tolist() == beside.model.values.tolist()
     assert alone.model.fit.residual_rms == beside.model.fit.residual_rms
     assert alone.gains == (beside.best_gains,)
     assert alone.added_delay == beside.added_delay
-
-
-@pytest.mark.long
-def test_equal_records_give_equal_numbers():
-    one, two = analyse(_record()), analyse(_record())
-    assert one.model.values.tolist() == two.model.values.tolist()
-    assert one.model.covariance.tolist() == two.model.covariance.tolist()
-    assert one.gains == two.gains
 
 
 def test_data_that_tell_nothing_are_a_reason():

@@ -37,7 +37,7 @@ def run(model, *, sign, period, **acting):
 @pytest.mark.parametrize(
     ("model", "period", "noise_std"),
     [
-        (SECOND_ORDER, 0.015, 0.0),
+        pytest.param(SECOND_ORDER, 0.015, 0.0, marks=pytest.mark.nightly),
         pytest.param(SECOND_ORDER, 0.015, 0.03, marks=pytest.mark.nightly),
         pytest.param(SLOWER, 0.04, 0.0, marks=pytest.mark.nightly),
         (SLOWER, 0.04, 0.5),
@@ -56,7 +56,10 @@ def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, per
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("model", "period"), [(SECOND_ORDER, 0.05), (SLOWER, 0.1)])
+@pytest.mark.parametrize(
+    ("model", "period"),
+    [(SECOND_ORDER, 0.05), pytest.param(SLOWER, 0.1, marks=pytest.mark.nightly)],
+)
 def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     noise = {"noise_std": 0.01 * abs(model.gain)}
     tune = run(model, sign=model.process_sign, period=period, **noise)
@@ -70,7 +73,9 @@ def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     "acting",
     [
         {"drift": 0.003, "noise_std": 0.01},
-        {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01},
+        pytest.param(
+            {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01}, marks=pytest.mark.nightly
+        ),
         pytest.param({"quantisation": 0.1}, marks=pytest.mark.nightly),
         {"noise_std": 0.1},
     ],

@@ -44,6 +44,8 @@ def shell_commands(*start: str) -> list[list[str]]:
 
 
 def in_code(word: str) -> bool:
+    if word.isidentifier():
+        return word in WORDS
     return re.search(rf"(?<![\w]){re.escape(word)}(?![\w])", CODE) is not None
 
 
@@ -56,6 +58,7 @@ def code_text() -> str:
 
 
 CODE = code_text()
+WORDS = frozenset(re.findall(r"\w+", CODE))
 
 
 @pytest.mark.parametrize("page", GUIDE, ids=lambda p: str(p.relative_to(ROOT)))
