@@ -40,8 +40,6 @@ _FIGURES = (
 )  # fmt: skip
 # How long to look for the controller_node [s].
 _FOUND_WITHIN = 5.0
-# Relative difference of equal gains, since another node may round them.
-_SAME = 1e-9
 # What a loop does, by the fields of `Performance`.
 _EFFECTS = (
     ("Ms", "ms", ""),
@@ -165,7 +163,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     if not options.verify_only:
         settles = gains.settling_time if math.isfinite(gains.settling_time) else 0.0
         _require_trust(doubt, options)
-        if present is not None and _are_equal(present, gains):
+        if client.has(gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model)))
     step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
@@ -179,28 +177,22 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     if options.no_verify:
         print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
         return DONE
-    result = _verified(client, step, settles, options)
+    shown = StatusLine()
+    try:
+        result = client.prove(step, options.load, settles, options.wait, shown)
+    finally:
+        shown.clear()
     print("\n".join(verdict_lines(result, client.in_force(), width())))
     return DONE if result.passed else NOTHING_FOUND
 
 
-def _are_equal(present: Controller, gains: Controller) -> bool:
-    return all(
-        math.isclose(getattr(present, name), getattr(gains, name), rel_tol=_SAME)
-        for name, _ in _FIGURES
-    )
-
-
 def _usual_step(client: GainsClient, options: argparse.Namespace) -> float:
-    """Return the step of the node, else half of the swing of the tune, in two digits [y]."""
-    if given := client.values(client.name, ["verify_step"])["verify_step"]:
-        return float(given)
-    if options.load:
+    if options.load and not client.values(client.name, ["verify_step"])["verify_step"]:
         return 0.0
-    swing = client.swing()
-    if not swing:
+    step = client.usual_step()
+    if step is None:
         raise LoopError("the height of the step is not known: give --step")
-    return float(f"{0.5 * swing:.2g}")
+    return step
 
 
 def _question(options: argparse.Namespace, step: float) -> str:
@@ -213,31 +205,6 @@ def _question(options: argparse.Namespace, step: float) -> str:
     joined = " and ".join(steps)
     return (f"{what} with {joined}?" if options.verify_only else f"{what}, and verify them with "
             f"{joined}?").capitalize()  # fmt: skip
-
-
-def _verified(
-    client: GainsClient, step: float, settles: float, options: argparse.Namespace
-) -> Any:
-    """Verify with a step that the user has agreed to, whatever the node allows otherwise.
-
-    :param client: of the controller_node.
-    :param step: of the set-point [y].
-    :param settles: how long the loop takes to settle with gains that were just applied [s].
-    :param options: as the command line gives them.
-    """
-    names = ("verify_step", "verify_step_max")
-    before = client.values(client.name, names)
-    more = abs(step) > max(map(abs, before.values()))
-    if more:
-        client.set_values(client.name, {"verify_step_max": abs(step)})
-    shown = StatusLine()
-    try:
-        client.let_settle(settles, shown)
-        return client.verify(step, options.load, options.wait, shown)
-    finally:
-        shown.clear()
-        if more:
-            client.set_values(client.name, {"verify_step_max": before["verify_step_max"]})
 
 
 def beside(present: Controller | None, gains: Gains, model: TransferFunction) -> list[str]:

@@ -8,12 +8,14 @@ from __future__ import annotations
 import argparse
 import shlex
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say
 from relay_autotune.cli.export import Target, exported, exports_of
+from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.layout import WIDEST
 from relay_autotune.cli.tune_report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.tune_view import (
@@ -61,14 +63,14 @@ class _OnPage:
         shown: Any,
         ends: list[int],
         interrupted: list[int],
-        begun: Callable[[], None],
+        begun: Callable[[], object],
     ) -> None:
         self._live = live
         self._shown = shown
         self._ends = ends
         self._interrupted = interrupted
         self._heeded = len(interrupted)
-        self._begun: Callable[[], None] | None = begun
+        self._begun: Callable[[], object] | None = begun
 
     def take(self, feedback: Any) -> None:
         """Show a feedback."""
@@ -139,6 +141,8 @@ class TunePage:
 
         address = address_of(options.web_address)
         self._page = Page((), exports_of(""), written, address, self._live)
+        self._interrupted: list[int] = []
+        self._gains = GainsPage(client, self._live, self._page, self._is_to_end)
 
     def run(self, interrupted: list[int]) -> int:
         """Serve the page, and do what is wished there, until a signal comes.
@@ -148,6 +152,7 @@ class TunePage:
         :raises LoopError: if relay_node is lost during a tune.
         """
         status = DONE
+        self._interrupted = interrupted
         with in_background(self._page) as url:
             self._show_signals()
             say(
@@ -159,14 +164,34 @@ class TunePage:
                 while not interrupted:
                     self._client.rest(_TICK)
                     wish = self._live.next_wish()
-                    if wish == CHECK:
+                    if wish is None:
+                        self._gains.look_now_and_then()
+                    elif wish.what == CHECK:
                         self._check()
-                    elif wish == START:
+                    elif wish.what == START:
                         status = self._tune(interrupted)
+                        self._gains.look_after_tune()
+                    else:
+                        with self._commands_shown():
+                            self._gains.do(wish)
             except LoopError as error:
                 self._live.tell(phase="lost", tone="bad", status=str(error))
                 raise
+            finally:
+                self._gains.close()
         return status
+
+    def _is_to_end(self) -> bool:
+        return self._live.abort.is_set() or bool(self._interrupted)
+
+    @contextmanager
+    def _commands_shown(self) -> Iterator[None]:
+        """Show the commands as they come until the end of the block."""
+        end = self._begin_command() if self._begin_command is not None else lambda: None
+        try:
+            yield
+        finally:
+            end()
 
     def _show_signals(self) -> None:
         live = self._live
@@ -204,21 +229,16 @@ class TunePage:
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
             elapsed=0.0, cycles=(), process="", result=(),
         )  # fmt: skip
-        endings: list[Callable[[], None]] = []
-
-        def begun() -> None:
-            if self._begin_command is not None:
-                endings.append(self._begin_command())
-
         ends: list[int] = []
-        try:
+        with ExitStack() as stack:
             client.ask(self._options.amplitude, dry_run=False)
-            shown = _OnPage(live, self._shown, ends, interrupted, begun)
+            # Only once it has begun: see TuneClient.command_watch.
+            shown = _OnPage(
+                live, self._shown, ends, interrupted,
+                lambda: stack.enter_context(self._commands_shown()),
+            )  # fmt: skip
             self._follow(client, shown, ends, _TICK)
             self._shown.clear()
-        finally:
-            for end in endings:
-                end()
         result = client.result
         for refused in sorted(client.refused):
             say(self._program, refused)

@@ -30,7 +30,13 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.controller_parameters import FIXED, GAINS, OTHERS, PARAMETERS
+from relay_autotune.nodes.controller_parameters import (
+    FIXED,
+    GAINS,
+    NONE_WAIT,
+    OTHERS,
+    PARAMETERS,
+)
 from relay_autotune.nodes.following import FOLLOW_EVERY, Following
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.gains_keeper import GainsKeeper
@@ -73,6 +79,8 @@ class ControllerNode(ServedNode):
         self._results = ResultCheck(self, is_stable)
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
+        # Why those that came since were refused; empty: none were.
+        self._refused = ""
         # Why the waiting gains are doubtful; empty: they are trusted.
         self._doubt = ""
         self._applying = False
@@ -291,6 +299,7 @@ class ControllerNode(ServedNode):
             return
         gains = self._results.gains(message)
         if gains is None:
+            self._refused = self._results.refusals.last
             return
         name = message.experiment_id
         try:
@@ -303,8 +312,9 @@ class ControllerNode(ServedNode):
             self._keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
             self._results.refusals.say("gains", name, error)
+            self._refused = self._results.refusals.last
             return
-        self._pending = (name, gains)
+        self._pending, self._refused = (name, gains), ""
         self._doubt = why_doubtful(message)
         if self._doubt:
             self.get_logger().warning(f"gains of {name} are {self._doubt}")
@@ -364,7 +374,7 @@ class ControllerNode(ServedNode):
 
     async def _apply(self) -> tuple[bool, str]:
         if self._pending is None:
-            return False, "no gains wait to be applied"
+            return False, f"{NONE_WAIT}; {self._refused}" if self._refused else NONE_WAIT
         name, gains = pending = self._pending
         try:
             # The record may have come after the gains.
@@ -390,7 +400,7 @@ class ControllerNode(ServedNode):
     def _on_discard(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._pending is not None
         response.message = "discarded" if self._pending is not None else "no gains wait"
-        self._pending = None
+        self._pending, self._refused = None, ""
         return response
 
     async def _on_revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -12,6 +12,8 @@ from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.quantities import Quantity
 
+# Answer of ~/apply where no gains have come since the last were applied or discarded.
+NONE_WAIT = "no gains wait to be applied"
 GAINS = (
     Quantity(
         "kc",

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -21,17 +23,23 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
 )
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.nodes.controller_parameters import GAINS
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.controller_parameters import GAINS, NONE_WAIT
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.nodes.remote_gains import controller_of, mapping_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import TOLD_EVERY, duration
 from relay_autotune_msgs.action import Verify
-from relay_autotune_msgs.msg import PidGains, RelayExperiment
+from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 # How long a latched result may take to come [s].
 _RESULT_WITHIN = 5.0
+# How long the node may take to hear gains that are offered [s].
+_TAKEN_WITHIN = 5.0
+_TURN = 0.1
+# Relative difference of equal gains, since another node may round them.
+_SAME = 1e-9
 # Beginning of the refusal of ~/verify that time cures.
 _NOT_AT_REST = "the loop is not at rest"
 
@@ -42,11 +50,19 @@ class GainsClient(LoopClient):
     :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
     :param node: name of the controller_node.
     :param ros: arguments for ROS.
+    :param beside: another client of the same loop, whose own node this one uses; ``node`` is then
+        the full name. None: it has a node of its own.
     :raises ParameterError: if the name is not valid.
     """
 
-    def __init__(self, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
-        super().__init__("apply_gains", namespace, node, ros)
+    def __init__(
+        self,
+        namespace: str,
+        node: str,
+        ros: Sequence[str] = (),
+        beside: LoopClient | None = None,
+    ) -> None:
+        super().__init__("apply_gains", namespace, node, ros, beside)
         self._verify = ActionClient(self._node, Verify, f"{node}/verify")
 
     def close(self) -> None:
@@ -129,42 +145,143 @@ class GainsClient(LoopClient):
             raise LoopError(f"{self.name} refuses: {answer.message}")
         return str(answer.message)
 
-    def let_settle(self, seconds: float, tell: Callable[[str], None]) -> None:
-        """Wait until a loop with new gains has come to rest.
+    def has(self, gains: Controller) -> bool:
+        """Tell whether gains are in force already.
 
-        :param seconds: how long it takes [s].
-        :param tell: called each second with what is waited for.
+        :param gains: the gains; of another node's only those parts count that it is known to have.
         """
-        begun = time.monotonic()
-        while (waited := time.monotonic() - begun) < seconds:
-            tell(f"the loop settles with the new gains, {duration(waited)} of {duration(seconds)}")
-            self.rest(min(TOLD_EVERY, seconds - waited))
+        present = self.in_force()
+        others = () if self.values(self.name, ["apply_to"])["apply_to"] else ("tf", "b")
+        return present is not None and all(
+            math.isclose(getattr(present, name), getattr(gains, name), rel_tol=_SAME)
+            for name in ("kc", "ti", "td", *others)
+        )
 
-    def verify(
-        self, setpoint: float, load: float, patience: float, tell: Callable[[str], None]
+    def put_in_force(self, message: Any) -> str:
+        """Offer gains as identifier_node does, apply them, and return the answer of ~/apply.
+
+        The gains that waited before are discarded, so that no others can be applied.
+
+        :param message: the `PidGains`.
+        :raises LoopError: with the reason, if they are refused.
+        """
+        gains = gains_from_message(message)
+        if self.has(gains):
+            raise LoopError("these gains are in force already")
+        self.call(Trigger, f"{self.name}/discard", Trigger.Request())
+        offer = self._node.create_publisher(PidGains, self._resolved("pi_gains"), quality.RESULT)
+        try:
+            offer.publish(message)
+            deadline = time.monotonic() + _TAKEN_WITHIN
+            while True:
+                answer = self.call(Trigger, f"{self.name}/apply", Trigger.Request())
+                if answer.success:
+                    return str(answer.message)
+                if answer.message != NONE_WAIT or time.monotonic() > deadline:
+                    raise LoopError(f"{self.name} refuses: {answer.message}")
+                if self.has(gains):
+                    # auto_apply was faster.
+                    return "the gains are in force"
+                self.rest(_TURN)
+        finally:
+            self._node.destroy_publisher(offer)
+
+    @contextmanager
+    def accepting_doubtful(self) -> Iterator[None]:
+        """Let the node take doubtful gains and models until the end of the block."""
+        before = self.values(self.name, ["accept_doubtful"])
+        self.set_values(self.name, {"accept_doubtful": True})
+        try:
+            yield
+        finally:
+            self.set_values(self.name, before)
+
+    def usual_step(self) -> float | None:
+        """Return the step of the node, else half of the swing of the tune, in two digits [y].
+
+        None: neither is known.
+        """
+        if given := self.values(self.name, ["verify_step"])["verify_step"]:
+            return float(given)
+        swing = self.swing()
+        return float(f"{0.5 * swing:.2g}") if swing else None
+
+    def prove(
+        self,
+        setpoint: float,
+        load: float,
+        settles: float,
+        patience: float,
+        tell: Callable[[str], None],
+        leave: Callable[[], bool] = lambda: False,
     ) -> Any:
-        """Make the steps, as soon as the loop is at rest, and return the `Verify.Result`.
+        """Verify with a step that the user has agreed to, whatever the node allows otherwise.
 
         :param setpoint: step of the set-point [y]; 0: that of the node's parameter.
         :param load: step of the load [u]; 0: none.
-        :param patience: how long to wait until the loop is at rest [s].
+        :param settles: how long the loop takes to settle with gains that were just applied [s].
+        :param patience: how long to wait then until the loop is at rest [s].
         :param tell: called at least each second with what is waited for.
-        :raises LoopError: with the reason, if it was refused.
+        :param leave: returns True to end the verification without a verdict.
+        :return: the `Verify.Result`.
+        :raises LoopError: with the reason, if there is no verdict.
         """
+        before = self.values(self.name, ("verify_step", "verify_step_max"))
+        more = abs(setpoint) > max(map(abs, before.values()))
+        if more:
+            self.set_values(self.name, {"verify_step_max": abs(setpoint)})
+        try:
+            self._let_settle(settles, tell, leave)
+            return self._verified(setpoint, load, patience, tell, leave)
+        finally:
+            if more:
+                self.set_values(self.name, {"verify_step_max": before["verify_step_max"]})
+
+    def steps_of(self, result: Any) -> list[Any]:
+        """Return the steps of a verification with their samples, those that come in time.
+
+        :param result: the `Verify.Result`.
+        """
+        stamps = {(step.kind, str(step.header.stamp)): step for step in result.steps}
+        found = {}
+
+        def take(message: Any) -> bool:
+            key = message.kind, str(message.header.stamp)
+            if key in stamps:
+                found[key] = message
+            return len(found) == len(stamps)
+
+        self.latched(Verification, "verification", take, _RESULT_WITHIN)
+        return [found[key] for key in stamps if key in found]
+
+    def _let_settle(
+        self, seconds: float, tell: Callable[[str], None], leave: Callable[[], bool]
+    ) -> None:
+        begun = time.monotonic()
+        while (waited := time.monotonic() - begun) < seconds and not leave():
+            tell(f"the loop settles with the new gains, {duration(waited)} of {duration(seconds)}")
+            self._wait(leave, time.monotonic() + min(TOLD_EVERY, seconds - waited))
+
+    def _verified(
+        self,
+        setpoint: float,
+        load: float,
+        patience: float,
+        tell: Callable[[str], None],
+        leave: Callable[[], bool],
+    ) -> Any:
+        """Make the steps, as soon as the loop is at rest, and return the `Verify.Result`."""
         begun = time.monotonic()
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load)
-        while True:
+        while not leave():
             sent = self._verify.send_goal_async(
                 goal, feedback_callback=lambda message: tell(message.feedback.status)
             )
             if not self._wait(sent.done, time.monotonic() + ANSWER_WITHIN):
                 raise LoopError(f"{self.name} has not answered within {ANSWER_WITHIN:g} s")
-            answer = sent.result().get_result_async()
-            while not self._wait(answer.done, time.monotonic() + ANSWER_WITHIN):
-                if not self._verify.server_is_ready():
-                    raise LoopError(f"{self.name} has gone during the verification")
-            result = answer.result().result
-            if answer.result().status == GoalStatus.STATUS_SUCCEEDED:
+            answer = self._ended(sent.result(), leave)
+            result = answer.result
+            if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result
             if not result.reason.startswith(_NOT_AT_REST):
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
@@ -174,4 +291,19 @@ class GainsClient(LoopClient):
                     f"with --verify-only"
                 )
             tell(result.reason)
-            self.rest(TOLD_EVERY)
+            self._wait(leave, time.monotonic() + TOLD_EVERY)
+        raise LoopError("the verification was ended before its step; the gains stay in force")
+
+    def _ended(self, goal: Any, leave: Callable[[], bool]) -> Any:
+        """Return the answer to a goal once it has ended, and cancel it where that is wished."""
+        answer, cancelled = goal.get_result_async(), False
+        while True:
+            deadline = time.monotonic() + ANSWER_WITHIN
+            while time.monotonic() < deadline:
+                if self._wait(answer.done, time.monotonic() + _TURN):
+                    return answer.result()
+                if leave() and not cancelled:
+                    goal.cancel_goal_async()
+                    cancelled = True
+            if not self._verify.server_is_ready():
+                raise LoopError(f"{self.name} has gone during the verification")

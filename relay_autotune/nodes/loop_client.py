@@ -43,27 +43,44 @@ class LoopClient:
     :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
     :param node: name of the node that is called most.
     :param ros: arguments for ROS.
+    :param beside: another client, whose own node and executor this one uses; None: it has its own.
     :raises ParameterError: if the name is not valid.
     """
 
-    def __init__(self, own: str, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        own: str,
+        namespace: str,
+        node: str,
+        ros: Sequence[str] = (),
+        beside: LoopClient | None = None,
+    ) -> None:
         try:
             validate_namespace(f"/{namespace.strip('/')}")
             validate_topic_name(f"{node}/tune")
         except (InvalidNamespaceException, InvalidTopicNameException) as error:
             text = str(error).splitlines()[0].rstrip(":")
             raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
-        self._context = Context()
-        rclpy.init(
-            context=self._context, args=list(ros), signal_handler_options=SignalHandlerOptions.NO
-        )
-        self._node = Node(own, namespace=namespace or None, context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._is_guest = beside is not None
+        if beside is None:
+            self._context = Context()
+            rclpy.init(
+                context=self._context,
+                args=list(ros),
+                signal_handler_options=SignalHandlerOptions.NO,
+            )
+            self._node = Node(own, namespace=namespace or None, context=self._context)
+            self._executor = SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self._node)
+        else:
+            self._context, self._node = beside._context, beside._node
+            self._executor = beside._executor
         self.name = self._node.resolve_service_name(node)
 
     def close(self) -> None:
         """Leave the graph."""
+        if self._is_guest:
+            return
         self._executor.shutdown(timeout_sec=0.0)
         self._node.destroy_node()
         self._context.try_shutdown()

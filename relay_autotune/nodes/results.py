@@ -50,6 +50,8 @@ class Refusals:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._said: set[str] = set()
+        self.last = ""
+        """The last refusal as a sentence, whether it was logged or not."""
 
     def say(self, what: str, experiment_id: str, error: RelayAutotuneError) -> None:
         """Log a refusal, unless this cause was logged before.
@@ -58,6 +60,8 @@ class Refusals:
         :param experiment_id: its experiment, according to the message.
         :param error: the reason.
         """
+        told = f"{what} of {experiment_id or 'an experiment without id'} refused: {error}"
+        self.last = told
         # The same fault with other numbers is the same cause.
         cause = f"{what}: {_NUMBER.sub('#', str(error))}"
         if cause in self._said or len(self._said) > _MOST_REASONS:
@@ -65,8 +69,7 @@ class Refusals:
         self._said.add(cause)
         last = "" if len(self._said) <= _MOST_REASONS else "; further reasons are not logged"
         self._node.get_logger().error(
-            f"{what} of {experiment_id or 'an experiment without id'} refused: {error} (others "
-            f"refused for the same reason are not logged){last}"
+            f"{told} (others refused for the same reason are not logged){last}"
         )
 
 

@@ -13,7 +13,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.text import date_text, digits
-from relay_autotune.tuning import analyse_loop
+from relay_autotune.tuning import Controller, Performance, analyse_loop
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
@@ -159,33 +159,54 @@ def beside_present(case: Case) -> tuple[Row, ...]:
     new, present = case.best_gains, case.present
     if case.model is None or new is None or present is None:
         return ()
-    rows = [
-        Row("kc [u/y]", digits(present.kc), digits(new.kc), ""),
-        Row("ti [s]", digits(present.ti), digits(new.ti), ""),
-        Row("td [s]", digits(present.td), digits(new.td), ""),
-    ]
+    old = told_of(present, performance_of(present, case))
+    return tuple(
+        Row(name, value, other, meaning)
+        for (name, value, meaning), (_, other, _) in zip(old, told_of(new, new), strict=False)
+    )
+
+
+def performance_of(present: Controller, case: Case) -> Performance | None:
+    """Return what the present gains do on the model; None: the loop is unstable, or there is none.
+
+    :param present: the gains.
+    :param case: the experiment.
+    """
+    if case.model is None:
+        return None
     try:
-        now = analyse_loop(present, in_loop(case, case.model.model))
+        return analyse_loop(present, in_loop(case, case.model.model))
     except TuningError:
-        unstable = "the present gains make the loop unstable on the model"
-        return (*rows, Row("Ms", "-", digits(new.ms, 3), unstable))
-    degrees = math.degrees
-    return (
+        return None
+
+
+def told_of(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:
+    """Return the names, values and meanings by which gains are compared.
+
+    :param gains: the gains.
+    :param does: what they do on the model; None: they make the loop unstable.
+    """
+    rows = [
+        ("kc [u/y]", digits(gains.kc), ""),
+        ("ti [s]", digits(gains.ti), ""),
+        ("td [s]", digits(gains.td), ""),
+    ]
+    if does is None:
+        return [*rows, ("Ms", "-", "the present gains make the loop unstable on the model")]
+    return [
         *rows,
-        Row("Ms", digits(now.ms, 3), digits(new.ms, 3), "below 1.4 careful, above 2 risky"),
-        Row(
+        ("Ms", digits(does.ms, 3), "below 1.4 careful, above 2 risky"),
+        (
             "phase margin [deg]",
-            digits(degrees(now.phase_margin), 3),
-            digits(degrees(new.phase_margin), 3),
+            digits(math.degrees(does.phase_margin), 3),
             "the larger, the calmer",
         ),
-        Row(
+        (
             "IAE after a load step [y s/u]",
-            digits(now.iae_load, 3),
-            digits(new.iae_load, 3),
+            digits(does.iae_load, 3),
             "the smaller, the faster a load is compensated",
         ),
-    )
+    ]
 
 
 def repeats_of(case: Case) -> tuple[NamedNumber, ...]:

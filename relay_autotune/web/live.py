@@ -21,13 +21,33 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.exchange.fields import json_number
-from relay_autotune.report.style import in_steps, thinned
-from relay_autotune.web.wire import short
+from relay_autotune.report.style import in_steps
+from relay_autotune.web.shape import Asked
+from relay_autotune.web.wire import curve
 
 # Samples of each signal that are kept for a page that is opened late.
 _KEPT = 50_000
 CHECK, START, ABORT = "check", "start", "abort"
-WISHES = (CHECK, START, ABORT)
+APPLY, VERIFY, REVERT = "apply", "verify", "revert"
+WISHES = (CHECK, START, ABORT, APPLY, VERIFY, REVERT)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a page wishes.
+
+    :param what: one of `WISHES`.
+    :param of: number of the model whose gains are meant.
+    :param asked: what these gains were asked for by; None: no gains are meant.
+    :param step: of the set-point, to verify the gains [y]; 0: none.
+    :param doubtful: whether gains whose verdict is not trusted are accepted.
+    """
+
+    what: str
+    of: int = 0
+    asked: Asked | None = None
+    step: float = 0.0
+    doubtful: bool = False
 
 
 @dataclass(frozen=True)
@@ -35,7 +55,7 @@ class Told:
     """What is known of the tune besides its samples.
 
     :param node: full name of the relay_node.
-    :param phase: "idle", "checking", "tuning" or "analysing".
+    :param phase: "idle", "checking", "tuning", "analysing", "applying", "verifying" or "lost".
     :param state: what the experiment does, a word.
     :param status: what it waits for and what it sees, a sentence.
     :param tone: "", "good", "warn" or "bad".
@@ -50,6 +70,10 @@ class Told:
     :param checked: number of checks so far.
     :param accepted: whether a tune could start, as far as the last check knows.
     :param result: lines of the last result.
+    :param controller: full name of the controller_node; empty: there is none.
+    :param present: its gains, in words.
+    :param step: of its set-point that verifies gains as usual [y]; NaN: not known.
+    :param proof: lines of the last verification.
     """
 
     node: str
@@ -68,6 +92,10 @@ class Told:
     checked: int = 0
     accepted: bool = False
     result: tuple[str, ...] = ()
+    controller: str = ""
+    present: str = ""
+    step: float = math.nan
+    proof: tuple[str, ...] = ()
 
 
 @dataclass
@@ -90,9 +118,11 @@ class Live:
         self._is_new = True
         self._signals = {"measurement": _Signal(), "command": _Signal()}
         self._begun = time.monotonic()
-        self._wishes: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._wishes: queue.SimpleQueue[Wish] = queue.SimpleQueue()
+        self._shown: dict[str, Any] = {}
+        self._shown_anew: set[str] = set()
         self.abort = threading.Event()
-        """Whether a page wishes that the tune ends."""
+        """Whether a page wishes that the tune, or the verification, ends."""
 
     @property
     def told(self) -> Told:
@@ -109,6 +139,16 @@ class Live:
             self._told = replace(self._told, **changed)
             self._is_new = True
 
+    def show(self, name: str, document: Any) -> None:
+        """Show curves that change seldom.
+
+        :param name: of the figure.
+        :param document: what it shows, as JSON has it.
+        """
+        with self._lock:
+            self._shown[name] = document
+            self._shown_anew.add(name)
+
     def sample(self, signal: str, value: float) -> None:
         """Take a sample of now.
 
@@ -122,22 +162,22 @@ class Live:
             self._signals[signal].kept.append(at)
             self._signals[signal].new.append(at)
 
-    def wish(self, what: str) -> None:
+    def wish(self, wish: Wish) -> None:
         """Take a wish of a page.
 
-        :param what: one of `WISHES`; during a tune only its end can be wished.
+        :param wish: during a tune or a verification only its end can be wished.
         """
-        if what == ABORT:
+        if wish.what == ABORT:
             self.abort.set()
         elif self.told.phase == "idle":
-            self._wishes.put(what)
+            self._wishes.put(wish)
 
-    def next_wish(self) -> str:
-        """Return the next wish; empty: there is none."""
+    def next_wish(self) -> Wish | None:
+        """Return the next wish; None: there is none."""
         try:
             return self._wishes.get_nowait()
         except queue.Empty:
-            return ""
+            return None
 
     def forget_wishes(self) -> None:
         """Drop what was wished before a tune began or ended, such as by a second click."""
@@ -149,16 +189,17 @@ class Live:
         """Return what a page shows that has just been opened."""
         with self._lock:
             told = _document(self._told)
+            shown = dict(self._shown)
             kept = {name: list(signal.kept) for name, signal in self._signals.items()}
         time_, measurement = (np.array(part) for part in _columns(kept["measurement"]))
         held, command = (np.array(part) for part in _columns(kept["command"]))
         if command.size > 1:
             held, command = in_steps(held, command)
         found = {
-            "measurement": [short(part) for part in thinned(time_, measurement)],
-            "command": [short(part) for part in thinned(held, command)],
+            "measurement": curve(time_, measurement),
+            "command": curve(held, command),
         }
-        return {"live": told, "samples": found, "all": True}
+        return {"live": told, "samples": found, "shown": shown, "all": True}
 
     def news(self) -> dict[str, Any] | None:
         """Return what pages have not been told yet; None: nothing."""
@@ -167,6 +208,9 @@ class Live:
             if self._is_new:
                 news["live"] = _document(self._told)
                 self._is_new = False
+            if self._shown_anew:
+                news["shown"] = {name: self._shown[name] for name in self._shown_anew}
+                self._shown_anew.clear()
             samples = {}
             for name, signal in self._signals.items():
                 if signal.new:

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
+from math import isfinite
 from threading import Thread
 from typing import Any
 from urllib.parse import parse_qs
@@ -27,14 +28,14 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
 from relay_autotune.escape import visible
-from relay_autotune.loop.gains import Gains
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
 from relay_autotune.tuning import RULES
 from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.address import Address
-from relay_autotune.web.live import WISHES, Live
+from relay_autotune.web.live import WISHES, Live, Wish
 from relay_autotune.web.shape import Asked, Subject, asked_of
 from relay_autotune.web.worker import Worker
 
@@ -292,6 +293,7 @@ class _Socket(_Guarded, WebSocketHandler):
         """Tell the page everything, and from then on what is new."""
         self.set_nodelay(True)
         self._told: dict[int, int] = {}
+        self._present: dict[int, Controller | None] = {}
         self._shown = 0
         if self.page.live is not None:
             # What is new until now is part of everything.
@@ -325,7 +327,7 @@ class _Socket(_Guarded, WebSocketHandler):
         try:
             question = json.loads(message)
             if self.page.live is not None and "do" in question:
-                self._wish(self.page.live, question["do"])
+                self.page.live.wish(self._wish(question))
                 return
             count = question["n"]
             number, asked = self.page.question(question["of"], question["asked"])
@@ -338,10 +340,20 @@ class _Socket(_Guarded, WebSocketHandler):
                              "took": round(took, 3)})  # fmt: skip
         self.tell(f'{head[:-1]},"answer":{answer}}}')
 
-    def _wish(self, live: Live, what: object) -> None:
-        if what not in WISHES:
+    def _wish(self, question: dict[str, Any]) -> Wish:
+        what, of, step = question["do"], question.get("of", 0), question.get("step", 0.0)
+        asked = question.get("asked")
+        if what not in WISHES or not isinstance(of, int):
             raise TuningError("there is no such wish")
-        live.wish(str(what))
+        if isinstance(step, bool) or not isinstance(step, (int, float)) or not isfinite(step):
+            raise TuningError("expected a number for the step")
+        return Wish(
+            what,
+            of,
+            None if asked is None else asked_of(asked, tuple(RULES)),
+            float(step),
+            question.get("accept_doubtful") is True,
+        )
 
     def _tell_news(self) -> None:
         if self._shown != len(self.page.subjects):
@@ -351,6 +363,10 @@ class _Socket(_Guarded, WebSocketHandler):
             if len(known) != self._told.get(number):
                 self._told[number] = len(known)
                 self.tell(wire.to_text({"of": number, "trade_off": known}))
+            if subject.case.present != self._present.get(number):
+                self._present[number] = subject.case.present
+                rows = wire.of_present(subject.case)
+                self.tell(wire.to_text({"of": number, "present": rows}))
 
 
 def _one_line(error: Exception) -> str:

@@ -13,14 +13,15 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.escape import visible
 from relay_autotune.report.case import Case, EstimatedQuantity
 from relay_autotune.report.findings import (
-    beside_present,
     checks_of,
     facts_of,
+    performance_of,
+    told_of,
     verdict_of,
     warnings_of,
 )
@@ -55,6 +56,15 @@ def short(values: FloatArray) -> list[float | None]:
     return [v if f else None for v, f in zip(rounded, finite.tolist(), strict=True)]
 
 
+def curve(time: ArrayLike, values: ArrayLike) -> list[list[float | None]]:
+    """Return a signal for a figure: times and values, with few points and digits.
+
+    :param time: s, shape (n,).
+    :param values: shape (n,).
+    """
+    return [short(part) for part in thinned(np.asarray(time, float), np.asarray(values, float))]
+
+
 def of_subject(subject: Subject) -> dict[str, Any]:
     """Return what a page shows of a model whatever the gains are.
 
@@ -75,11 +85,22 @@ def of_subject(subject: Subject) -> dict[str, Any]:
         else [_estimate(e) for e in (*model.estimates, *model.ultimate)],
         "record": _record(case),
         "rules": [{"rule": g.rule, "ms": short(np.array([g.ms, g.iae_load]))} for g in case.gains],
+        "present": of_present(case),
         "may_shape": subject.shaping is not None,
         "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
         "first": of_asked(subject.first),
         "slider": [CALM, FAST, STEP],
     }
+
+
+def of_present(case: Case) -> list[list[str]]:
+    """Return the present gains and what they do on the model: names, values and meanings.
+
+    :param case: the experiment.
+    """
+    if case.present is None or case.model is None:
+        return []
+    return [list(row) for row in told_of(case.present, performance_of(case.present, case))]
 
 
 def of_asked(asked: Asked) -> dict[str, Any]:
@@ -119,7 +140,7 @@ def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
         "effects": _effects(subject, shaped),
-        "beside": [[r.name, r.present, r.new, r.meaning] for r in beside_present(case)],
+        "beside": [value for _, value, _ in told_of(gains, gains)],
         "at": short(np.array([gains.ms, gains.iae_load])),
         "b": gains.b,
         "ms": gains.ms,
@@ -193,15 +214,13 @@ def _record(case: Case) -> dict[str, Any] | None:
     record = case.record
     if record is None:
         return None
-    time, measurement = thinned(record.time, record.measurement)
     held, command = in_steps(record.time, record.command)
     found = {
-        "time": short(time),
-        "measurement": short(measurement),
-        "command": [short(part) for part in thinned(held, command)],
+        "measurement": curve(record.time, record.measurement),
+        "command": curve(held, command),
         "model": None,
     }
     model = case.model
     if model is not None and model.fitted.size == len(record):
-        found["model"] = [short(part) for part in thinned(record.time, model.fitted)]
+        found["model"] = curve(record.time, model.fitted)
     return found

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from chromium import Chromium
 from loop_rig import RELIABLE, Process, Rig
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from served import OpenPage
 from std_msgs.msg import Float64
 
@@ -109,20 +111,43 @@ def test_an_open_page_does_not_count_as_somebody_who_hears_the_command(rig: Rig)
     assert command.wait() == 1
 
 
+LOOP = {
+    "mode": "lockstep", "lockstep_speed": 4.0, "sample_period": 0.02, "structure": "fopdt",
+    "gain": 2.0, "time_constants": [0.8], "dead_time": 0.4, "operating_point": [5.0, 1.0],
+    "noise_std": 0.002, "seed": 5,
+}  # fmt: skip
+
+
 @pytest.mark.browser
-def test_a_whole_tune_by_clicks(rig: Rig, tmp_path: Path) -> None:
-    plant = PLANT | {"dead_time": 1.0, "sample_period": 0.1, "mode": "lockstep", "seed": 3}
-    rig.start("plant_node", *NAMED, time_constants=[2.0], **plant)
-    rig.relay(*NAMED, amplitude=0.5, baseline=1.0, sample_period=0.1)
+def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) -> None:
+    rig.start("plant_node", *NAMED, **LOOP)
+    rig.relay(
+        *NAMED, sample_period=0.02, amplitude=0.5, settle_time=1.0, measurement_timeout=10.0,
+        controller_timeout=10.0,
+    )  # fmt: skip
+    rig.start(
+        "controller_node", *NAMED, sample_period=0.02, kc=0.3, ti=0.8, initial_command=1.0,
+        initial_setpoint=5.0,
+    )  # fmt: skip
     rig.start("identifier_node", *NAMED)
     command, url = page_of(rig)
-    accepted(rig, OpenPage(url))
+    page = OpenPage(url)
+    accepted(rig, page)
+    gains = "/tank/controller_node"
     with Chromium(tmp_path / "profile") as browser:
         tab, other = browser.tab(url), browser.tab(url)
+
+        def agree(button: str, *parts: str) -> None:
+            tab.wait(f"!document.querySelector('{button}').disabled")
+            tab.click(button)
+            tab.wait("document.querySelector('#question').open")
+            assert all(part in tab.text("#question-text") for part in parts)
+            tab.click("#question-yes")
+
         tab.wait("document.body.dataset.phase === 'idle'")
         tab.click("#start")
         tab.wait("document.querySelector('#question').open")
-        assert "relay between 0.65 and 1.65" in tab.text("#question-text")
+        assert "relay between" in tab.text("#question-text")
         tab.click("#question-yes")
         complete = "document.querySelector('#live-status').innerText === 'the tune is complete'"
         other.wait(complete, 120.0)
@@ -132,10 +157,46 @@ def test_a_whole_tune_by_clicks(rig: Rig, tmp_path: Path) -> None:
             each.wait("document.querySelector('#plot-live-measurement .curve')")
             assert each.text("#verdict") == "gains ready to use"
             assert each.eval("document.querySelectorAll('#live-cycles li').length") > 0
-            assert each.said == []
         kc = re.search(r"kc (\S+)", tab.text("#gains"))[1]
         assert kc in tab.eval("document.querySelector('#live-result').textContent")
-        assert tab.text("#command").startswith("replay ")
         assert str(rig.records) in tab.text("#command")
+        # calmer gains than those of the tune are shaped, applied and proven
+        tab.eval("ms = document.querySelector('#ms'), ms.value = 1.3,"
+                 "ms.dispatchEvent(new Event('input'))")  # fmt: skip
+        tab.wait("document.body.dataset.settled === 'yes'")
+        calm = re.search(r"kc (\S+)", tab.text("#gains"))[1]
+        assert float(calm) < float(kc)
+        tab.wait("document.querySelector('#beside').innerText.includes('0.3000')")
+        tab.eval("step = document.querySelector('#step'), step.value = 0.2,"
+                 "step.dispatchEvent(new Event('input'))")  # fmt: skip
+        agree("#apply", "kc 0.3000", f"kc {calm}", "steps by 0.2 y")
+        other.wait("document.body.dataset.phase === 'verifying'")
+        other.wait("document.body.dataset.phase === 'idle'", 90.0)
+        assert "passed" in other.text("#live-status")
+        assert f"{rig.values(gains, 'kc')[0]:.4f}" == calm
+        for each in (tab, other):
+            assert "the loop does what the model predicts" in each.text("#force-proof")
+            assert each.eval("document.querySelectorAll('#plot-proof .curve').length") == 2
+        # a verification that is ended on another page takes nothing back
+        agree("#verify", f"keeps kc {calm}")
+        other.wait("!document.querySelector('#abort').disabled")
+        other.click("#abort")
+        tab.wait(
+            "document.querySelector('#live-status').innerText.includes('cancelled')"
+            "|| document.querySelector('#live-status').innerText.includes('was ended')"
+        )
+        assert f"{rig.values(gains, 'kc')[0]:.4f}" == calm
+        agree("#revert", "that it had before")
+        tab.wait("document.querySelector('#live-status').innerText.includes('again')")
+        assert rig.values(gains, "kc", "ti") == [0.3, 0.8]
+        # a refusal is told with its reason
+        rig.call(
+            SetParameters, f"{gains}/set_parameters",
+            SetParameters.Request(parameters=[Parameter("kc_max", value=0.4).to_parameter_msg()]),
+        )  # fmt: skip
+        agree("#apply-only", "They are not verified")
+        tab.wait("document.querySelector('#live-status').innerText.includes('out of bounds')")
+        assert rig.values(gains, "kc") == [0.3]
+        assert tab.said == other.said == []
     command.signal(signal.SIGINT)
     assert command.wait() == 0

@@ -14,7 +14,7 @@ from served import HOSTILE, analysed, served, subject_of
 from tornado.websocket import websocket_connect
 
 from relay_autotune.web import live as live_module
-from relay_autotune.web.live import Live
+from relay_autotune.web.live import Live, Wish
 
 
 def talk(url, work):
@@ -90,31 +90,40 @@ def test_five_pages_are_told_the_same():
 
 def test_only_what_is_possible_can_be_wished():
     live = Live("/relay_node")
-    live.wish("start")
-    assert live.next_wish() == "start"
+    live.wish(Wish("start"))
+    assert live.next_wish() == Wish("start")
     live.tell(phase="tuning")
-    live.wish("start")
-    assert live.next_wish() == ""
+    live.wish(Wish("apply"))
+    assert live.next_wish() is None
     assert not live.abort.is_set()
-    live.wish("abort")
+    live.wish(Wish("abort"))
     assert live.abort.is_set()
     live.forget_wishes()
     assert not live.abort.is_set()
 
 
-@pytest.mark.parametrize("wish", ["reboot", 7, None, ["start"], {"start": 1}])
+@pytest.mark.parametrize(
+    "wish",
+    [
+        *({"do": what} for what in ("reboot", 7, None, ["start"], {"start": 1})),
+        {"do": "apply", "of": "0", "asked": {}},
+        {"do": "apply", "of": 0, "asked": {"rule": "os.system"}},
+        {"do": "verify", "step": "1"},
+        {"do": "verify", "step": math.inf},
+    ],
+)
 def test_an_impossible_wish_ends_the_connection(wish):
     live = Live("/relay_node")
 
     async def ask(socket):
         await heard(socket, lambda m: "subjects" in m)
-        await socket.write_message(json.dumps({"do": wish}))
+        await socket.write_message(json.dumps(wish))
         while await socket.read_message() is not None:
             continue
 
     with served([], live=live) as url:
         talk(url, ask)
-    assert live.next_wish() == ""
+    assert live.next_wish() is None
 
 
 def test_a_page_without_a_loop_takes_no_wishes():

@@ -20,10 +20,12 @@ function texts(host, name, lines) {
 }
 
 export class Live {
-  // send: sends a wish; agreed: asks a question and resolves to the answer
-  constructor(send, agreed) {
+  // send: sends a wish; agreed: asks a question and resolves to the answer; offered: returns the
+  // gains that the page shows, as {wish, words, doubtful}; null: it shows none
+  constructor(send, agreed, offered) {
     this.send = send;
     this.agreed = agreed;
+    this.offered = offered;
     this.told = null;
     this.asking = 0; // number of the check after which the start is to be confirmed; 0: none
     this.drawn = false;
@@ -35,11 +37,18 @@ export class Live {
     $("check").addEventListener("click", () => send("check"));
     $("start").addEventListener("click", () => { this.asking = this.told.checked + 1; send("check"); });
     $("abort").addEventListener("click", () => send("abort"));
+    this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
+    $("apply").addEventListener("click", () => this.apply(Number($("step").value)));
+    $("apply-only").addEventListener("click", () => this.apply(0));
+    $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
+    $("revert").addEventListener("click", () => this.revert());
+    $("step").addEventListener("input", () => this.showForce());
   }
 
   // message: {live: what is known, samples: the newest, all: they replace those before}
   take(message) {
     if (message.live) this.show(message.live);
+    if (message.shown && message.shown.proof) this.showProof(message.shown.proof);
     for (const [name, [times, values]] of Object.entries(message.samples || {})) {
       const [t, v] = message.all ? [[], []] : this.signals[name];
       for (let k = 0; k < times.length; k += 1) {
@@ -94,16 +103,18 @@ export class Live {
     $("live").hidden = false;
     $("live-bar").hidden = false;
     $("live-title").textContent = told.node;
-    const running = told.phase === "tuning";
-    const state = running ? told.state || "asked" : told.phase;
+    const tuning = told.phase === "tuning";
+    const running = tuning || told.phase === "verifying";
+    const state = tuning ? told.state || "asked" : told.phase;
     if ($("live-state").textContent !== state) $("live-state").textContent = state;
     $("live-state").className = `chip ${told.tone || TONES[told.state] || ""}`;
     $("live-status").textContent = told.status;
     $("abort").disabled = !running;
+    $("abort").textContent = told.phase === "verifying" ? "End the verification" : "Abort the tune";
     $("check").disabled = $("start").disabled = told.phase !== "idle";
     $("progress").value = told.progress || 0;
     const left = told.remaining > 0 ? `, about ${told.remaining.toFixed(0)} s left` : "";
-    $("live-times").textContent = running ? `${told.elapsed.toFixed(0)} s so far${left}` : "";
+    $("live-times").textContent = tuning ? `${told.elapsed.toFixed(0)} s so far${left}` : "";
     if (before && before.cycles.length > told.cycles.length) $("live-cycles").replaceChildren();
     texts($("live-cycles"), "li", told.cycles);
     $("live-process").textContent = told.process;
@@ -113,10 +124,69 @@ export class Live {
     $("result-box").hidden = !told.result.length;
     $("live-result").textContent = told.result.join("\n");
     document.body.dataset.phase = told.phase;
+    $("force").hidden = !told.controller;
+    if (told.step !== null && (!before || before.step !== told.step)) $("step").value = told.step;
+    $("force-proof").hidden = !told.proof.length;
+    $("force-proof").textContent = told.proof.join("\n");
+    this.showForce();
     if (this.asking && told.checked >= this.asking) {
       this.asking = 0;
       if (told.accepted) this.ask(told.checks);
     }
+  }
+
+  // The gains of the page beside those of the running controller, and what may be done.
+  showForce() {
+    if (!this.told || !this.told.controller) return;
+    const { controller, present, phase } = this.told;
+    const new_ = this.offered();
+    $("force-now").textContent = `${controller} has ${present}`;
+    $("force-new").textContent = new_ ? `Applied would be ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
+    const idle = phase === "idle";
+    const step = Number($("step").value);
+    const moves = Number.isFinite(step) && step !== 0;
+    $("apply").disabled = !(idle && new_ && moves);
+    $("apply-only").disabled = !(idle && new_);
+    $("verify").disabled = !(idle && moves);
+    $("revert").disabled = !idle;
+  }
+
+  showProof(steps) {
+    $("proof").hidden = !steps.length;
+    if (!steps.length) return;
+    const [step] = steps;
+    const curve = ([x, y], kind, name) => ({ x, y, kind, name });
+    this.proof.draw({
+      curves: [curve(step.measurement, "measured", "measured"), curve(step.predicted, "model", "predicted")],
+      said: `${step.name}, ${step.passed ? "as predicted" : "not as predicted"}`,
+    });
+  }
+
+  stepWords(step) {
+    return `Its set-point then steps by ${step} y and back, once the loop is at rest. If the loop does not do what the model predicts, the gains before come back by themselves.`;
+  }
+
+  async apply(step) {
+    const new_ = this.offered();
+    if (!new_) return;
+    const { controller, present } = this.told;
+    if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
+    const then = step ? this.stepWords(step) : "They are not verified.";
+    const what = `${controller} has ${present}. At once it gets ${new_.words}, without a bump of the command. ${then}`;
+    if (await this.agreed(what, step ? "Apply and verify" : "Apply")) {
+      this.send("apply", { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) });
+    }
+  }
+
+  async verify(step) {
+    const { controller, present } = this.told;
+    if (await this.agreed(`${controller} keeps ${present}. ${this.stepWords(step)}`, "Verify")) this.send("verify", { step });
+  }
+
+  async revert() {
+    const { controller, present } = this.told;
+    const what = `${controller} has ${present}. At once it gets the gains that it had before, without a bump of the command.`;
+    if (await this.agreed(what, "Take them back")) this.send("revert");
   }
 
   async ask(checks) {

@@ -149,16 +149,26 @@ function showTrade() {
   plots.trade.draw({ curves, marks, said });
 }
 
+function gainsWords(s, between = ", ") {
+  return s.isa.filter(([name, value]) => value !== "0" && name !== "tf")
+    .map(([name, value, unit]) => `${name} ${value}${unit ? ` ${unit}` : ""}`).join(between);
+}
+
+function showBeside() {
+  const rows = subjects[chosen].present;
+  $("beside-box").hidden = !(rows.length && shaped);
+  if (shaped) table($("beside"), rows.map(([name, now, meaning], k) => [name, now, shaped.beside[k], meaning]), ["", "", "", "text"]);
+  if (live) live.showForce();
+}
+
 function showShaped() {
   const s = shaped;
   showVerdict(s.verdict, s.checks);
-  $("gains").textContent = s.isa.filter(([name, value]) => value !== "0" && name !== "tf")
-    .map(([name, value, unit]) => `${name} ${value}${unit ? ` ${unit}` : ""}`).join("   ");
+  $("gains").textContent = gainsWords(s, "   ");
   table($("isa"), s.isa, ["", "number", "unit", "meaning"]);
   table($("parallel"), s.parallel, ["", "number", "unit"]);
   table($("effects"), s.effects, ["", "", "interval"]);
-  $("beside-box").hidden = !s.beside.length;
-  table($("beside"), s.beside, ["", "", "", "text"]);
+  showBeside();
   $("why").textContent = `Rule ${s.rule}: ${s.reason}`;
   $("notes").hidden = !s.warnings.length;
   $("warnings").replaceChildren();
@@ -202,6 +212,7 @@ function showRefused(text) {
   for (const id of ["isa", "parallel", "effects", "beside"]) $(id).replaceChildren();
   $("command").textContent = "";
   for (const name of ["measurement", "command", "nyquist"]) plots[name].draw({ curves: [] });
+  if (live) live.showForce();
 }
 
 function showSubject() {
@@ -221,7 +232,7 @@ function showSubject() {
   $("record").hidden = !subject.record;
   if (subject.record) {
     const r = subject.record;
-    const curves = [{ x: r.time, y: r.measurement, kind: "measured", name: "measurement" }];
+    const curves = [{ x: r.measurement[0], y: r.measurement[1], kind: "measured", name: "measurement" }];
     if (r.model) curves.push({ x: r.model[0], y: r.model[1], kind: "model", name: "model" });
     plots.record.draw({ curves });
     plots.relay.draw({ curves: [{ x: r.command[0], y: r.command[1], kind: "command" }] });
@@ -295,11 +306,17 @@ async function download(path, file, more) {
   }
 }
 
+// The gains that the page shows now, for the running controller.
+function offered() {
+  if (!shaped) return null;
+  return { wish: { of: chosen, asked: shaped.asked }, words: gainsWords(shaped), doubtful: shaped.doubtful };
+}
+
 let live = null; // made when the server has a loop to watch
 
 function take(message) {
-  if (message.live || message.samples) {
-    live ??= new Live((what) => socket.send(JSON.stringify({ do: what })), agreed);
+  if (message.live || message.samples || message.shown) {
+    live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), agreed, offered);
     live.take(message);
     return;
   }
@@ -323,6 +340,11 @@ function take(message) {
   if (message.trade_off) {
     trades[message.of] = message.trade_off;
     if (message.of === chosen) { trade = message.trade_off; showTrade(); }
+    return;
+  }
+  if (message.present) {
+    subjects[message.of].present = message.present;
+    if (message.of === chosen) showBeside();
     return;
   }
   if (message.n === waiting) waiting = 0;

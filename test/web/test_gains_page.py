@@ -1,0 +1,62 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which gains of the page are sent to a running controller."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from served import analysed, subject_of
+
+from relay_autotune.analysis import analyse
+from relay_autotune.cli.gains_page import GainsPage
+from relay_autotune.errors import TuningError
+from relay_autotune.exchange.messages import gains_from_message
+from relay_autotune.record.record import Outcome
+from relay_autotune.verdict import Judgement
+from relay_autotune.web.live import Live, Wish
+from relay_autotune.web.shape import Asked
+from relay_autotune_msgs.msg import PidGains
+
+CALM = Wish("apply", 0, Asked(controller="pi", ms=1.3), 0.0)
+
+
+def sent(subject, wish):
+    """Return the message with the gains that a wish means."""
+    page = SimpleNamespace(subjects=[subject])
+    return GainsPage(None, Live("/relay_node"), page, lambda: False)._message(wish)[0]
+
+
+def test_the_gains_are_those_that_the_page_shows():
+    subject = subject_of(analysed())
+    message = sent(subject, CALM)
+    assert gains_from_message(message) == subject.shaped(CALM.asked).gains
+    assert message.experiment_id == subject.case.experiment_id
+    assert message.final
+    assert message.verdict == PidGains.VERDICT_TRUSTED
+
+
+def test_doubtful_gains_are_sent_only_when_they_are_accepted_and_say_so(monkeypatch):
+    subject = subject_of(analysed())
+    finding = replace(subject.shaping.findings[0], result=1, sentence="the data drift", remedy="x")
+    monkeypatch.setattr(
+        type(subject.shaping), "judgement", lambda self, gains: Judgement((finding,))
+    )
+    with pytest.raises(TuningError, match="the data drift"):
+        sent(subject, CALM)
+    message = sent(subject, replace(CALM, doubtful=True))
+    assert message.verdict == PidGains.VERDICT_DOUBTFUL
+    assert "the data drift" in message.verdict_reason
+
+
+def test_an_experiment_that_was_aborted_has_no_gains_to_send():
+    aborted = replace(analysed().record, outcome=Outcome.ABORTED, reason="a button")
+    with pytest.raises(TuningError, match="aborted"):
+        sent(subject_of(analyse(aborted)), replace(CALM, doubtful=True))
+
+
+@pytest.mark.parametrize("wish", [replace(CALM, of=1), replace(CALM, of=-1), Wish("apply")])
+def test_gains_that_are_not_there_are_not_sent(wish):
+    with pytest.raises(TuningError, match="no such gains"):
+        sent(subject_of(analysed()), wish)
