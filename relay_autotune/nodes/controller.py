@@ -101,6 +101,8 @@ class ControllerNode(ServedNode):
         self._count = 0
         self._ending = False
         self._held = False
+        # True while nobody subscribes to the commands.
+        self._untaken = True
         # Steps that a verification adds to set-point and command.
         self._offset = self._load = 0.0
         # True while this node writes its gains into its own parameters.
@@ -185,6 +187,7 @@ class ControllerNode(ServedNode):
             f"ready: {said(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
             f"commands go to {self._commands.topic_name}"
+            + ", held until somebody subscribes to it" * (self._remote is None)
         )
 
     # The loop.
@@ -245,12 +248,31 @@ class ControllerNode(ServedNode):
             if self._verifier.is_running and (reason := self._remote.why_silent()):
                 self._verifier.interrupt(reason)
         else:
+            if self._is_untaken():
+                # An integral that went on would be a jump for whoever takes the commands later.
+                self._pid.track(self._pid.command)
             command = self._pid.step(at, self._setpoint + self._offset, value)
             self._message.data = self._limits.clip(command + self._load)
             self._commands.publish(self._message)
             self._commanded = True
         if math.isfinite(value) and math.isfinite(command):
             self._verifier.sample(at, value, command)
+
+    def _is_untaken(self) -> bool:
+        """Tell whether nobody subscribes to the commands, and log where that has changed."""
+        untaken = self._commands.get_subscription_count() == 0
+        if untaken is not self._untaken:
+            self._untaken = untaken
+            topic, held = self._commands.topic_name, self._pid.command
+            if untaken:
+                self._verifier.interrupt(f"nobody subscribes to {topic} any more")
+                self.get_logger().warning(
+                    f"nobody subscribes to {topic}: the command is held at {held:g} until "
+                    f"somebody does"
+                )
+            else:
+                self.get_logger().info(f"{topic} has a subscriber: it begins from {held:g}")
+        return untaken
 
     def _is_possible(self, value: float) -> bool:
         return is_usable(value) and self._range.low <= value <= self._range.high
@@ -270,7 +292,7 @@ class ControllerNode(ServedNode):
     def _on_command(self, message: Float64) -> None:
         if self._remote is not None:
             self._remote.hear_command(message.data)
-        elif self._held:
+        elif self._held or self._untaken:
             self._pid.track(message.data)
 
     def _on_hold(self, message: Bool) -> None:
@@ -443,6 +465,8 @@ class ControllerNode(ServedNode):
                 f"the model that would predict the step is {self._model_doubt}; set the parameter "
                 "accept_doubtful to true to step all the same"
             )
+        if self._remote is None and self._untaken:
+            raise NotVerifiable(f"nobody subscribes to {self._commands.topic_name}")
         if self._remote is not None:
             self._remote.require_ready()
             kept = await self._place.read()

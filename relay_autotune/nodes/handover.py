@@ -19,9 +19,10 @@ _RETURN_TIME = 5.0
 class Handover:
     """The present controller's command, and the command to the actuator when no tune runs.
 
-    Without a tune, each command of the controller is passed on at once. After a tune, the
-    controller's command may differ from the actuator's. The difference shrinks to zero along a
-    straight line over the return time, so that the actuator sees no bump.
+    Without a tune, each command of the controller is passed on at once. After a tune, a silence of
+    the controller or a start from a known command, the controller's command may differ from the
+    actuator's. The difference shrinks to zero along a straight line over the return time, so that
+    the actuator sees no bump.
 
     :param send: publishes a command.
     """
@@ -70,7 +71,7 @@ class Handover:
         if self._active:
             return None
         if not math.isnan(self._left_at):
-            # First command after a tune: its difference from the last one would be the bump.
+            # First command since: its difference from the last one would be the bump.
             self._offset, self._return_from = self._left_at - command, now
             self._left_at = math.nan
         self._kept.append(command)

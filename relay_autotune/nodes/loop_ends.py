@@ -55,6 +55,8 @@ class LoopEnds:
         self._takeover = takeover
         self._stop = stop
         self.handover = Handover(ends.send)
+        # The actuator is there already; the controller may be elsewhere.
+        self.handover.give_back(self._value("initial_command"), self._value("return_time"))
         self.commanded = math.nan
         """The last command of the tune [u]."""
         self._experiment: RelayExperiment | None = None
@@ -245,6 +247,19 @@ class LoopEnds:
         self.handover.give_back(left, self._value("return_time") or period)
         self._driven = self._driven and not self._takeover
 
+    def leave(self) -> None:
+        """Stop passing on a controller's commands; send the safe command if one is given."""
+        self.handover.take_over()
+        if self._takeover:
+            return
+        safe = self._value("safe_command")
+        if math.isfinite(safe):
+            self._ends.send_until_acknowledged(safe)
+        self._node.get_logger().warning(
+            f"nobody passes on what comes on {self._controller.topic_name} any more: the command "
+            f"stays at {self._ends.last:g}"
+        )
+
     # Callbacks.
 
     def _on_controller(self, message: Float64) -> None:
@@ -315,6 +330,7 @@ class LoopEnds:
         self._driven = False
         # The safe command goes out before the log message.
         self._node.hold(safe)
+        self.handover.give_back(safe, self._value("return_time"))
         self._silent = (
             f"{self._controller.topic_name} has been silent for more than {timeout:g} s; the "
             f"command is held at {safe:g} until it comes again"

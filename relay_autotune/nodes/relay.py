@@ -516,7 +516,9 @@ class RelayNode(ServedNode):
         try:
             if session is not None:
                 self._stop(session, reason)
-            elif self._held is not None and not self._loop.is_driven:
+            elif self._loop.is_driven:
+                self._loop.leave()
+            elif self._held is not None:
                 self._send_safe(self._held)
             self.work_off()
             self._ends.experiments.wait_for_all_acked(ACKNOWLEDGE)

@@ -147,6 +147,40 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     assert record.settings is not None
 
 
+def test_commands_that_nobody_takes_are_held_and_begin_without_a_bump(rig: Rig) -> None:
+    heard = rig.listen("measurement", Float64, RELIABLE)
+    rig.plant(**PLANT | {"mode": "realtime", "speed": 1.0, "sample_period": 0.005})
+    # Its error would move an integral that went on, by 0.3 u each second.
+    waiting = CONTROLLER | {"use_sim_time": False, "initial_setpoint": 5.8}
+    controller = rig.start("controller_node", **waiting)
+    rig.until(lambda: "held until somebody subscribes" in controller.log, "the controller")
+    before = len(heard)
+    rig.until(lambda: len(heard) > before + 300, "measurements")
+    commands = rig.listen("controller_command", Float64, RELIABLE)
+    rig.until(lambda: len(commands) > 200, "commands")
+    assert commands[0].data == pytest.approx(1.0, abs=0.05)
+    assert commands[-1].data > 1.1
+    assert controller.log.count("has a subscriber: it begins from 1\n") == 1
+
+
+def test_a_relay_node_that_passes_commands_on_begins_and_ends_at_known_ones(rig: Rig) -> None:
+    commands = rig.listen("command", Float64, RELIABLE)
+    relay = rig.relay(initial_command=2.0, return_time=30.0, safe_command=1.5)
+    sender = rig.node.create_publisher(Float64, "controller_command", RELIABLE)
+
+    def passed() -> bool:
+        sender.publish(Float64(data=0.0))
+        return len(commands) > 20
+
+    rig.until(passed, "commands that are passed on")
+    # The controller is at 0, the actuator was at 2.
+    assert commands[0].data == pytest.approx(2.0, abs=1e-9)
+    assert 1.0 < commands[20].data < 2.0
+    relay.signal(signal.SIGTERM)
+    relay.wait()
+    rig.until(lambda: commands[-1].data == 1.5, "the safe command")
+
+
 def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     """The published model has half the gain of the process."""
     commands = rig.listen("command", Float64, RELIABLE)
