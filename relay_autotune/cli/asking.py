@@ -6,11 +6,15 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
 
 from relay_autotune.errors import LoopError
+
+# What people type between two numbers; a single point belongs to a number.
+_BETWEEN = re.compile(r"\.{2,}|[,;]|\b(?:to|and)\b")
 
 
 def asked_for_file(what: str) -> str:
@@ -34,18 +38,20 @@ def agrees(question: str, *, yes: bool) -> bool:
     return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
 
 
-def asked(what: str, flag: str, known: str, read: Callable[[str], Any]) -> Any:
+def asked(what: str, flag: str, known: str, example: str, read: Callable[[str], Any]) -> Any:
     """Ask for a value until it can be read.
 
     :param what: what is asked for, with its unit.
     :param flag: the flag that would have given it.
     :param known: the value that Enter takes; empty: none.
+    :param example: what may be typed.
     :param read: returns the value of a text; None: it has none.
     """
     _require_somebody(flag)
-    shown = f"{what} [{known}]: " if known else f"{what}: "
+    shown = f"{what}, such as {example}" + f" [{known}]: " * bool(known) + ": " * (not known)
     while (value := read(_input(shown) or known)) is None:
-        print(f"expected {'two numbers' if read is pair_of else 'a number'}", file=sys.stderr)
+        found = "two numbers, the lower one first" if read is pair_of else "a number"
+        print(f"expected {found}, such as {example}", file=sys.stderr)
     return value
 
 
@@ -71,7 +77,7 @@ def number_of(text: str) -> float | None:
 
 
 def pair_of(text: str) -> list[float] | None:
-    """Return two finite numbers, or None if a text is something else."""
-    numbers = [number_of(word) for word in text.replace(",", " ").split()]
+    """Return two finite numbers in order, such as 0 5, 0 to 5, 0,5 or 0..5; None: other text."""
+    numbers = [number_of(word) for word in _BETWEEN.sub(" ", text.strip(" ()[]")).split()]
     found = [number for number in numbers if number is not None]
-    return found if len(found) == len(numbers) == 2 else None
+    return found if len(found) == len(numbers) == 2 and found[0] < found[1] else None

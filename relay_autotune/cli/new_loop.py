@@ -125,21 +125,19 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
             present = client.commanded(options.command, command_kind, command_field, others)
         except ParameterError as error:
             raise SelectionError(_as_flags(str(error))) from None
-        # Its mean command is the baseline where a controller commands through relay_node.
-        controlled = client.is_controlled()
+        client.require_uncontrolled()
     told = "" if math.isnan(present) else f"{present:.6g}"
-    at = math.nan if controlled and options.at is None else options.at
+    at = options.at
     if at is None:
-        at = asked("present command, at which the process rests [u]", "--at", told, number_of)
-    within = options.within or asked(
-        "lowest and highest measurement that the process may see [y]", "--within", "", pair_of
-    )
+        what = "present command, at which the process rests [u]"
+        at = asked(what, "--at", told, told or "2.5", number_of)
+    what = "lowest and highest measurement that the process may see [y]"
+    within = options.within or asked(what, "--within", "", "30 50", pair_of)
     command_within = options.command_within
     if command_within is None and not options.amplitude:
         # The amplitude is found between these.
-        command_within = asked(
-            "lowest and highest command of the actuator [u]", "--command-within", "", pair_of
-        )
+        what = "lowest and highest command of the actuator [u]"
+        command_within = asked(what, "--command-within", "", "0 5", pair_of)
     values: dict[str, Any] = {
         "baseline": at,
         "measurement_min": within[0],
@@ -161,8 +159,6 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     relay = [*named, "-r", f"measurement:={options.measurement}"]
     relay += ["-r", f"command:={options.command}"]
     for name, value in values.items():
-        if value != value:
-            continue
         relay += ["-p", f"{name}:={number(value) if isinstance(value, float) else value}"]
     nodes = {"relay_node": relay}
     return OwnNodes(nodes if options.record_only else nodes | {"identifier_node": named})

@@ -186,8 +186,7 @@ class ControllerNode(ServedNode):
         self.get_logger().info(
             f"ready: {said(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
-            f"commands go to {self._commands.topic_name}"
-            + ", held until somebody subscribes to it" * (self._remote is None)
+            f"commands go to {self._commands.topic_name}, held until somebody subscribes to it"
         )
 
     # The loop.

@@ -191,9 +191,19 @@ class LoopClient:
         meant = f"; type {flag} {first}" if first else ""
         raise LoopError(f"{name} has no {what} within {patience:g} s{meant}{others}")
 
-    def is_controlled(self) -> bool:
-        """Tell whether a controller of this namespace publishes controller_command."""
-        return self._node.count_publishers(self._resolved("controller_command")) > 0
+    def require_uncontrolled(self) -> None:
+        """Refuse a namespace in which a controller commands through relay_node.
+
+        :raises LoopError: with its name, and what to do.
+        """
+        topic = self._resolved("controller_command")
+        controllers = self._node.get_publishers_info_by_topic(topic)
+        if controllers:
+            raise LoopError(
+                f"{quality.who(controllers[0])} publishes {topic}: its commands would reach the "
+                f"actuator only until the nodes of this command end; stop it, or start relay_node "
+                f"and identifier_node yourself, and leave out --measurement and --command"
+            )
 
     def require_field(self, type_name: str, field: str) -> None:
         """Refuse a field that the measurement's type does not have.

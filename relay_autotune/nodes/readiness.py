@@ -220,9 +220,9 @@ def plan_of(
     if parameters.finds_amplitude:
         levels = Levels(parameters, baseline)
         plan = (
-            f"relay from between {levels.low:g} and {levels.high:g} about the baseline "
-            f"{baseline:g}, growing within {parameters.command_min:g} and "
-            f"{parameters.command_max:g}"
+            f"relay between {levels.low:g} and {levels.high:g} about the baseline {baseline:g} "
+            f"at first; these grow until the oscillation is clear of the noise, up to "
+            f"{parameters.command_min:g} and {parameters.command_max:g}"
         )
     else:
         middle = baseline + parameters.relay_bias

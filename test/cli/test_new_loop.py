@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from relay_autotune.cli.asking import agrees
+from relay_autotune.cli.asking import agrees, pair_of
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 
@@ -21,8 +21,8 @@ from relay_autotune.errors import LoopError, ParameterError, SelectionError
 class Looker:
     """A client of a loop whose topics have these types, with a present command."""
 
-    def __init__(self, present: float = math.nan, controlled: bool = False) -> None:
-        self.present, self.controlled = present, controlled
+    def __init__(self, present: float = math.nan) -> None:
+        self.present = present
 
     def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
         return {"/tank/level": "std_msgs/msg/Float32"}.get(topic, "std_msgs/msg/Float64")
@@ -34,8 +34,8 @@ class Looker:
         if field == "nothing":
             raise ParameterError(f"measurement_field: {type_name} has no field {field!r}")
 
-    def is_controlled(self) -> bool:
-        return self.controlled
+    def require_uncontrolled(self) -> None:
+        pass
 
 
 def options(*words: str) -> argparse.Namespace:
@@ -93,9 +93,16 @@ def test_the_command_that_is_heard_needs_only_enter(typed: list[str]) -> None:
     assert arguments(Looker(present=2.25), options("--within", "1", "9"))["baseline"] == "2.25"
 
 
-def test_a_controller_in_the_loop_tells_the_baseline_by_itself(typed: list[str]) -> None:
-    given = options("--within", "1", "9", "--command-within", "0", "5")
-    assert "baseline" not in arguments(Looker(controlled=True), given)
+@pytest.mark.parametrize(
+    ("text", "pair"),
+    [
+        ("0 5", [0, 5]), ("0 to 5", [0, 5]), ("0,5", [0, 5]), ("0..5", [0, 5]),
+        (" [0; 5.5] ", [0, 5.5]), ("-1.5 .. -.5", [-1.5, -0.5]), ("1e-3 and 2", [0.001, 2]),
+        ("5 0", None), ("0 5 6", None), ("0 five", None), ("", None),
+    ],
+)  # fmt: skip
+def test_two_numbers_are_taken_as_people_type_them(text: str, pair: list[float] | None) -> None:
+    assert pair_of(text) == pair
 
 
 def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> None:
