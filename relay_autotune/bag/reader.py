@@ -51,7 +51,7 @@ class Selection:
 
     :param measurement: topic or column of the measurement; None: found.
     :param command: topic or column of the command; None: found.
-    :param time: column of the time in a CSV file; None: the first.
+    :param time: column of the time in a text; None: found.
     :param start: beginning of the part to use [s from the first sample]; None: all.
     :param end: end of the part to use [s from the first sample]; None: all.
     :param clock: which time of a message counts, one of ``CLOCKS``.
@@ -70,6 +70,8 @@ class Selection:
     largest_chunk: int = LARGEST_CHUNK
     joint: str = ""
     joint_order: tuple[str, ...] = ()
+    time_unit: str | None = None
+    period: float | None = None
 
     @property
     def is_part(self) -> bool:
@@ -88,8 +90,9 @@ def read_experiments(
     else an experiment of relay_node whose recording was cut short; else the one pair of topics
     that looks like measurement and command.
 
-    :param path: a rosbag2 directory, an MCAP or ``.db3`` file, or a CSV file (by its ending); or
-        several of the first three that are one timeline.
+    :param path: a rosbag2 directory, an MCAP or ``.db3`` file, or a text with columns (``.csv``,
+        ``.txt``, ``.dat``, ``.tsv`` or ``.log``); or several of the first three that are one
+        timeline.
     :param selection: what is wanted of it; default: everything.
     :param progress: called with the progress of reading a bag.
     :raises SelectionError: if the selection does not fit, or more than one pair does.
@@ -97,17 +100,19 @@ def read_experiments(
     """
     paths = [Path(path)] if isinstance(path, Path | str) else [Path(part) for part in path]
     path, wanted = paths[0], selection or Selection()
-    if len(paths) > 1 and any(part.suffix.lower() == ".csv" for part in paths):
+    if len(paths) > 1 and any(map(_is_text, paths)):
         raise SelectionError("CSV files cannot be joined to one timeline; expected bags")
-    if path.suffix.lower() == ".csv":
+    if _is_text(path):
         if wanted.joint:
             raise SelectionError(
                 f"--joint {wanted.joint} is for bags, whose messages name joints; of {path} name "
                 "two columns with --measurement and --command"
             )
         records, notes = _of_csv(path, wanted)
-    elif wanted.time is not None:
-        raise SelectionError(f"--time names a column of a CSV file, but {path} is not one")
+    elif (wanted.time, wanted.time_unit, wanted.period) != (None, None, None):
+        raise SelectionError(
+            f"--time, --time-unit and --period are for CSV files, but {path} is not one"
+        )
     else:
         with ExitStack() as opened:
             files: list[McapFile | SqliteFile] = []
@@ -145,6 +150,10 @@ def may_be_recording(path: Path) -> bool:
             return known_start(file.read(32))
     except RelayAutotuneError:
         return True
+
+
+def _is_text(path: Path) -> bool:
+    return path.suffix.lower() in (".csv", ".txt", ".dat", ".tsv", ".log")
 
 
 def _named_so(path: Path) -> bool:
@@ -217,11 +226,13 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
 
 
 def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
-    from relay_autotune.bag.csv_file import read_csv
+    from relay_autotune.bag.csv_file import Columns, read_csv
     from relay_autotune.bag.foreign import take_apart
 
-    columns = (wanted.measurement, wanted.command, wanted.time)
-    log = read_csv(path, *columns)
+    columns = Columns(
+        wanted.measurement, wanted.command, wanted.time, wanted.time_unit, wanted.period
+    )
+    log = read_csv(path, columns)
     record = join(log.measurement, log.command, dated=log.dated)
     records, notes = take_apart(record, whole=wanted.is_part)
     return records, [*log.notes, *notes]

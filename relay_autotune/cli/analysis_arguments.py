@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from relay_autotune.bag.csv_file import TIME_UNITS
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.reader import Selection
 from relay_autotune.bag.timing import CLOCKS
@@ -34,7 +35,7 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
             metavar="TOPIC[:FIELD]",
             help=f"topic, or column of a CSV, of the {signal}",
         )
-    taken.add_argument("--time", metavar="NAME", help="column of the time [s] of a CSV")
+    add_times(taken)
     taken.add_argument(
         "--start", type=finite, metavar="S", help="leave out what is before S [s from the start]"
     )
@@ -72,6 +73,20 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     add_quantities(how, declared(Known))
     how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
     add_design(parser)
+
+
+def add_times(parser: argparse._ActionsContainer) -> None:
+    """Add options: what a CSV file does not say of its times.
+
+    :param parser: of the command, or a group of its options.
+    """
+    parser.add_argument("--time", metavar="NAME", help="column of the time of a CSV")
+    parser.add_argument(
+        "--time-unit", choices=TIME_UNITS, help="its unit, where the CSV does not say it (s)"
+    )
+    parser.add_argument(
+        "--period", type=finite, metavar="S", help="time from row to row of a CSV without times"
+    )
 
 
 def _size(text: str) -> int:
@@ -127,6 +142,8 @@ def jobs_of(
                 options.max_chunk,
                 joint,
                 order,
+                options.time_unit,
+                options.period,
             ),
             method=options.method,
             rule=options.rule,

@@ -11,8 +11,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from relay_autotune.bag.csv_file import read_csv
+from relay_autotune.bag.csv_file import Columns, read_csv
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
+from relay_autotune.cli.analysis_arguments import add_times
 from relay_autotune.cli.arguments import DONE, finite, guarded, say
 from relay_autotune.errors import BagError, SelectionError
 
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("bag", metavar="BAG", type=Path, help="directory to make")
     parser.add_argument("--measurement", metavar="NAME", help="column of the measurement")
     parser.add_argument("--command", metavar="NAME", help="column of the command")
-    parser.add_argument("--time", metavar="NAME", help="column of the time [s]")
+    add_times(parser)
     parser.add_argument("--measurement-topic", metavar="TOPIC", help="name of its topic")
     parser.add_argument("--command-topic", metavar="TOPIC", help="name of its topic")
     parser.add_argument(
@@ -61,7 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    log = read_csv(options.csv, options.measurement, options.command, options.time)
+    wanted = Columns(
+        options.measurement, options.command, options.time, options.time_unit, options.period
+    )
+    log = read_csv(options.csv, wanted)
     for note in log.notes:
         say(PROGRAM, f"{options.csv}: {note}")
     measurement, command = log.measurement, log.command

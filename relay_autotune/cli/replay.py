@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 PROGRAM = "replay"
 
 _EPILOG = """\
-A BAG is a rosbag2 directory, an .mcap file, or a .csv file with a header line.
+A BAG is a rosbag2 directory, an .mcap file, or a table of text such as a .csv.
 Topics need not be named if the bag holds experiments of relay_node, or one pair
 of topics, each of a single number, that looks like measurement and command.
 Of several BAGs, those that are no recording are passed over, with a line each.

@@ -64,13 +64,17 @@ def test_dates_in_seconds_become_the_start(tmp_path):
     [
         ("", "is empty; expected a header line"),
         ("\n\n", "is empty; expected a header line"),
-        ("t y u\n0 1 2\n", r"has the columns 't y u'; expected at least three"),
+        ("t y u\n0 1 2\n", "has 1 rows of numbers; expected at least two"),
+        ("t,y\n0,1\n1,2\n", r"2 columns: 't', 'y'; expected time, measurement and command"),
+        ("y,u,v\n1,1,2\n2,2,3\n2,3,3\n1,3,3\n1,3,4\n", "'y' does not rise.*--period S"),
+        ("t,setpoint,y\n0,1,2\n1,2,3\n", "'setpoint' seems to be a set-point"),
+        ("stamp,y,u\n0,1,2\n10000,2,3\n", "steps by 10000 from row to row.*--time-unit s|ms"),
         ("t;y;u\n0;1,5;2\n1;1.5;2\n", "a decimal comma and others with a point"),
         ("t;y;u\n0;1.000,5;2\n1;2;2\n", r"line 2: 'y' is '1.000,5'; expected a number"),
         ("t,y,u\n0,1,2\n2026-01-01T00:00:00,2,1\n", "of 2 cells of 't' 1 are dates"),
         ("t,y,u\n" + "0" * (1 << 20) + ",1,2\n", "a line of more than 1048576 characters"),
         ("t,y,u\n", "has 0 rows of numbers"),
-        ("t,y,u\n0,1,2\n1,nan,2\n", r"line 3: 'y' is nan; expected a finite number"),
+        ("t,y,u\n0,1,2\n1,inf,2\n", r"line 3: 'y' is inf; expected a finite number"),
         ("t,y,u\n0,1,2\n1,3,-inf\n", r"line 3: 'u' is -inf; expected a finite"),
         ("t,y,u\n0,1,2\n1,3 V,2\n", r"line 3: 'y' is '3 V'; expected a number"),
         ("t,y,u\n0,1,2\n1e18,2,3\n", "expected a time in seconds"),
@@ -79,7 +83,7 @@ def test_dates_in_seconds_become_the_start(tmp_path):
     ],
 )
 def test_bad_content_is_a_sentence(tmp_path, text, sentence):
-    with pytest.raises(BagError, match=sentence) as caught:
+    with pytest.raises((BagError, SelectionError), match=sentence) as caught:
         read_experiments(write(tmp_path / "a.csv", text))
     assert "\n" not in str(caught.value)
 
@@ -167,6 +171,16 @@ def stamped(form):
         ("t (min)", lambda t: f"{t / 60:.12f}", "the time is taken in min, as", 0.0),
         ("t", lambda t: f"{1.79e12 + 1e3 * t:.0f}", "'t' is taken as milliseconds", 1.79e9),
         ("t", lambda t: f"{1.79e15 + 1e6 * t:.0f}", "'t' is taken as microseconds", 1.79e9),
+        ("time_ms", lambda t: f"{1e3 * t:g}", "the time is taken in ms, as 'time_ms' says", 0.0),
+        ("micros", lambda t: f"{1e6 * t:.0f}", "the time is taken in micros, as", 0.0),
+        (
+            "t",
+            lambda t: f"23:59:{55 + t:06.3f}" if t < 5.0 else f"0:00:{t - 5.0:06.3f}",
+            "'t' is taken as the time of day",
+            0.0,
+        ),
+        ("t", lambda t: f"09/21/2026 01:46:{40 + t:06.3f} PM", "taken as dates in UTC", None),
+        ("t", lambda t: f"21.9.2026 13:46:{40 + t:.1f}", "taken as dates in UTC", None),
         ("t", lambda t: f"2026-09-21T13:46:{40 + t:06.3f}Z", "taken as dates in UTC", None),
         ("t", lambda t: f"2026-09-21 15:46:{40 + t:06.3f}+02:00", "taken as dates", None),
     ],
@@ -276,3 +290,57 @@ def test_columns_are_called_as_exports_call_the_joints(tmp_path):
         assert record.measurement.tolist() == [row[column] for row in y]
     with pytest.raises(SelectionError, match=r"no column '/joint_states:velocity\[arm\]'"):
         read_experiments(path, Selection("/joint_states:velocity[arm]", "/effort:data[1]"))
+
+
+WAYS = {
+    "spaces": ("t  y u\n", lambda t, y, u: f" {t}   {y}\t{u}"),
+    "spaces and commas": (
+        "",
+        lambda t, y, u: f"{t.replace('.', ',')} {y.replace('.', ',')} {u.replace('.', ',')}",
+    ),
+    "command first": ("Time,Q1,T1\n", lambda t, y, u: f"{t},{u},{y}"),
+    "command first, no names": ("", lambda t, y, u: f"{t},{u},{y}"),
+    "a preamble": ("Motor 3\n\nPID,1,2,3\n2 May, at noon\nt,y,u\n", "{},{},{}".format),
+    "an index": (",Time,y,u\n", lambda t, y, u: f"{float(t) * 2:g},{t},{y},{u}"),
+    "time last": ("y,u,Timestamp\n", lambda t, y, u: f"{y},{u},{t}"),
+    "names without cells": ("# t,y,u,P,I,D\n", "{},{},{}".format),
+    "units behind numbers": ("t,y,u\n", lambda t, y, u: f"{t},{y} \u00b0C,{u}%"),
+    "units below names": ("t,y,u\nms,degC,%\n", lambda t, y, u: f"{float(t) * 1e3:g},{y},{u}"),
+    "an indent": ("\t\tt\ty\tu\n", "{}\t{}\t{}".format),
+    "no number": ("t,y,u\n0.25,nan,0.5\n0.3,null,0.5\n", "{},{},{}".format),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_tables_as_programs_write_them(tmp_path, way):
+    head, form = WAYS[way]
+    names = way in ("an index", "names without cells")
+    text = head + "\n".join(form(*line(k).split(",")) for k in range(20))
+    wanted = Selection("y", "u") if names else None
+    same_as_plain(tmp_path, read_experiments(write(tmp_path / "a.txt", text), wanted))
+
+
+def test_rows_without_times_need_their_period(tmp_path):
+    cells = [line(k).split(",") for k in range(20)]
+    text = "input,output\n" + "\n".join(f"{u},{y}" for _, y, u in cells)
+    path = write(tmp_path / "a.csv", text)
+    found = read_experiments(path, Selection(period=0.5))
+    same_as_plain(tmp_path, found)
+    assert "'input' is taken as the command" in found.notes[0]
+    for wanted in (Selection(period=0.5, time="input"), Selection(period=0.0)):
+        with pytest.raises(SelectionError, match="--period"):
+            read_experiments(path, wanted)
+
+
+def test_a_relay_may_be_on_or_off_and_a_few_damaged_rows_are_left_out(tmp_path):
+    rows = [f"{0.1 * k:.1f},{k % 7},{'ON' if k // 5 % 2 else 'off'}" for k in range(200)]
+    rows[40] = "4.0,o.3,off"
+    rows[60:60] = ["time,temp,heater", "# restarted"]
+    found = read_experiments(write(tmp_path / "a.csv", "time,temp,heater\n" + "\n".join(rows)))
+    (record,) = found.experiments
+    assert len(record) == 199
+    assert set(record.command.tolist()) == {0.0, 1.0}
+    assert "1 rows hold something else than numbers and are left out, the first: line 42" in (
+        " ".join(found.notes)
+    )
+    assert "2 lines between the rows hold remarks" in " ".join(found.notes)

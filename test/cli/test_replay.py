@@ -323,7 +323,7 @@ def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
         (["--rule", "thumb"], "unknown rule 'thumb'; known: robust"),
         (["--start", "5", "--end", "5"], "--start 5 is not before --end 5"),
         (["--start", "1e9"], "no sample lies between"),
-        (["--time", "t"], "--time names a column of a CSV file"),
+        (["--time", "t"], "--time, --time-unit and --period are for CSV files"),
     ],
 )
 def test_choices_that_do_not_fit_end_with_status_2(tmp_path, capsys, options, sentence):
