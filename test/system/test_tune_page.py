@@ -112,7 +112,7 @@ def test_an_open_page_does_not_count_as_somebody_who_hears_the_command(rig: Rig)
 
 
 LOOP = {
-    "mode": "lockstep", "lockstep_speed": 4.0, "sample_period": 0.02, "structure": "fopdt",
+    "mode": "clock", "speed": 2.0, "sample_period": 0.05, "structure": "fopdt",
     "gain": 2.0, "time_constants": [0.8], "dead_time": 0.4, "operating_point": [5.0, 1.0],
     "noise_std": 0.002, "seed": 5,
 }  # fmt: skip
@@ -122,14 +122,14 @@ LOOP = {
 def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) -> None:
     rig.start("plant_node", *NAMED, **LOOP)
     rig.relay(
-        *NAMED, sample_period=0.02, amplitude=0.5, settle_time=1.0, measurement_timeout=10.0,
+        *NAMED, use_sim_time=True, amplitude=0.5, settle_time=1.0, measurement_timeout=10.0,
         controller_timeout=10.0,
     )  # fmt: skip
     rig.start(
-        "controller_node", *NAMED, sample_period=0.02, kc=0.3, ti=0.8, initial_command=1.0,
+        "controller_node", *NAMED, use_sim_time=True, kc=0.3, ti=0.8, initial_command=1.0,
         initial_setpoint=5.0,
     )  # fmt: skip
-    rig.start("identifier_node", *NAMED)
+    rig.start("identifier_node", *NAMED, use_sim_time=True)
     command, url = page_of(rig)
     page = OpenPage(url)
     accepted(rig, page)
@@ -167,9 +167,13 @@ def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) ->
         calm = re.search(r"kc (\S+)", tab.text("#gains"))[1]
         assert float(calm) < float(kc)
         tab.wait("document.querySelector('#beside').innerText.includes('0.3000')")
-        tab.eval("step = document.querySelector('#step'), step.value = 0.2,"
+        tab.eval("step = document.querySelector('#step'), step.value = 0.5,"
                  "step.dispatchEvent(new Event('input'))")  # fmt: skip
-        agree("#apply", "kc 0.3000", f"kc {calm}", "steps by 0.2 y")
+        # the tune has moved it away from its set-point
+        rig.until(
+            lambda: all(abs(y - 5.0) < 0.02 for y in page.samples["measurement"][-100:]), "rest"
+        )
+        agree("#apply", "kc 0.3000", f"kc {calm}", "steps by 0.5 y")
         other.wait("document.body.dataset.phase === 'verifying'")
         other.wait("document.body.dataset.phase === 'idle'", 90.0)
         assert "passed" in other.text("#live-status")
