@@ -27,16 +27,19 @@ from relay_autotune.cli.tune_view import (
     result_lines,
 )
 from relay_autotune.errors import LoopError, RelayAutotuneError
-from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.exchange.messages import identification_from_message, record_from_cycles
+from relay_autotune.experiment.early_end import ULTIMATE_GAIN
+from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes.tune_client import TuneClient
-from relay_autotune.report.case import case_of
+from relay_autotune.report.case import EstimatedQuantity, case_of, model_case
 from relay_autotune.text import process_text
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
 from relay_autotune.web.live import CHECK, START, Live
 from relay_autotune.web.server import Page, in_background
 from relay_autotune.web.shape import Asked, Subject
+from relay_autotune.web.wire import of_running
 
 # How long messages are handled before wishes are looked at [s].
 _TICK = 0.05
@@ -54,6 +57,7 @@ class _OnPage:
     :param shown: the terminal.
     :param ends: gets a number when the tune is to end.
     :param interrupted: signals that have come.
+    :param cycles: messages of the cycles so far.
     :param begun: called at the first feedback.
     """
 
@@ -63,6 +67,7 @@ class _OnPage:
         shown: Any,
         ends: list[int],
         interrupted: list[int],
+        cycles: list[Any],
         begun: Callable[[], object],
     ) -> None:
         self._live = live
@@ -70,6 +75,8 @@ class _OnPage:
         self._ends = ends
         self._interrupted = interrupted
         self._heeded = len(interrupted)
+        self._cycles = cycles
+        self._gains: list[tuple[int, EstimatedQuantity]] = []
         self._begun: Callable[[], object] | None = begun
 
     def take(self, feedback: Any) -> None:
@@ -90,10 +97,21 @@ class _OnPage:
             words = (f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback))
             changed["cycles"] = (*told.cycles, ", ".join(filter(None, words)))
         if feedback.transfer_function.experiment_id:
-            model = transfer_function_from_message(feedback.transfer_function)
-            changed["process"] = process_text(model)
+            found = identification_from_message(feedback.transfer_function)
+            changed["process"] = process_text(found.model)
+            self._show_model(found, feedback.cycle)
         self._live.tell(**changed)
         self._shown.take(feedback)
+
+    def _show_model(self, found: Identification, cycle: int) -> None:
+        """Show a model over the data so far, and how its intervals narrow."""
+        case = model_case(found, None)
+        self._gains += [(cycle, e) for e in case.ultimate if e.name == ULTIMATE_GAIN]
+        record = None
+        # Without the first cycle it is not known where the process was at rest.
+        if {0, *(c.index for c in self._cycles)} == set(range(len(self._cycles))):
+            record = record_from_cycles(self._cycles)
+        self._live.show("model", of_running(case, record, self._gains))
 
     def tick(self) -> None:
         """Heed what was wished or signalled since the last call."""
@@ -142,6 +160,8 @@ class TunePage:
         address = address_of(options.web_address)
         self._page = Page((), exports_of(""), written, address, self._live)
         self._interrupted: list[int] = []
+        # Messages of the cycles of the running tune.
+        self._cycles: list[Any] = []
         self._gains = GainsPage(client, self._live, self._page, self._is_to_end)
 
     def run(self, interrupted: list[int]) -> int:
@@ -199,10 +219,15 @@ class TunePage:
             self._client.watch_measurement(lambda value: live.sample("measurement", value))
             self._begin_command = self._client.command_watch(
                 lambda value: live.sample("command", value),
-                lambda s: live.tell(setpoint=s.setpoint, hysteresis=s.hysteresis),
+                self._take_cycle,
             )
         except RelayAutotuneError as error:
             live.tell(status=str(error), tone="warn")
+
+    def _take_cycle(self, cycle: Any) -> None:
+        settings = cycle.settings
+        self._live.tell(setpoint=settings.setpoint, hysteresis=settings.hysteresis)
+        self._cycles.append(cycle)
 
     def _check(self) -> None:
         """Ask whether a tune could start, and how."""
@@ -225,6 +250,8 @@ class TunePage:
         """Tune until the result is there."""
         client, live = self._client, self._live
         live.forget_wishes()
+        self._cycles.clear()
+        live.show("model", None)
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
             elapsed=0.0, cycles=(), process="", result=(),
@@ -234,7 +261,7 @@ class TunePage:
             client.ask(self._options.amplitude, dry_run=False)
             # Only once it has begun: see TuneClient.command_watch.
             shown = _OnPage(
-                live, self._shown, ends, interrupted,
+                live, self._shown, ends, interrupted, self._cycles,
                 lambda: stack.enter_context(self._commands_shown()),
             )  # fmt: skip
             self._follow(client, shown, ends, _TICK)

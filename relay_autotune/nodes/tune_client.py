@@ -230,7 +230,7 @@ class TuneClient(LoopClient):
         self._node.create_subscription(reader.kind, name, hear, qos_profile_sensor_data)
 
     def command_watch(
-        self, take: Callable[[float], None], settings: Callable[[Any], None]
+        self, take: Callable[[float], None], cycle: Callable[[Any], None]
     ) -> Callable[[], Callable[[], None]]:
         """Return what begins to hear the commands of a tune; it returns what ends it.
 
@@ -238,7 +238,7 @@ class TuneClient(LoopClient):
         its commands, and this client would count as somebody.
 
         :param take: called with each command [u].
-        :param settings: called with the `RelaySettings` of each cycle.
+        :param cycle: called with each `RelayCycle`.
         :raises LoopError: if the topic cannot be told from others.
         """
         kind, field = self.values(self.name, ["command_type", "command_field"]).values()
@@ -255,7 +255,7 @@ class TuneClient(LoopClient):
                 self._node.create_subscription(
                     RelayCycle,
                     self._resolved("relay_cycle"),
-                    lambda cycle: settings(cycle.settings),
+                    cycle,
                     qos_profile_sensor_data,
                 ),
             ]

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.escape import visible
-from relay_autotune.report.case import Case, EstimatedQuantity
+from relay_autotune.process.response import response
+from relay_autotune.record.record import Record
+from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase
 from relay_autotune.report.findings import (
     checks_of,
     facts_of,
@@ -32,6 +35,8 @@ from relay_autotune.web.shape import CALM, FAST, STEP, Asked, Shaped, Subject
 
 FloatArray = NDArray[np.floating]
 
+# Samples at which the model of a running tune is computed.
+_MOST_SIMULATED = 2000
 # Significant digits of a curve relative to its largest value: finer than a pixel.
 _DIGITS = 4
 
@@ -91,6 +96,37 @@ def of_subject(subject: Subject) -> dict[str, Any]:
         "first": of_asked(subject.first),
         "slider": [CALM, FAST, STEP],
     }
+
+
+def of_running(
+    model: ModelCase, record: Record | None, gains: Sequence[tuple[int, EstimatedQuantity]]
+) -> dict[str, Any]:
+    """Return what a page shows of the newest model while a tune runs.
+
+    The model is drawn from rest, `y = y_0 + G u`, with the y_0 that fits best.
+
+    :param model: the model.
+    :param record: the samples so far, from rest on; None: they are not known.
+    :param gains: K_u of each model so far, with the number of whole cycles.
+    """
+    found: dict[str, Any] = {
+        "estimates": [_estimate(e) for e in (*model.estimates, *model.ultimate)],
+        "gains": {
+            "cycle": [cycle for cycle, _ in gains],
+            **{
+                name: short(np.array([getattr(e, name) for _, e in gains]))
+                for name in ("value", "low", "high")
+            },
+        },
+        "data": None,
+    }
+    if record is not None:
+        few = slice(None, None, math.ceil(len(record) / _MOST_SIMULATED))
+        time = record.time[few]
+        moved = response(model.model, time, record.input())
+        rest = float(np.mean(record.measurement[few] - moved))
+        found["data"] = [curve(record.time, record.measurement), curve(time, rest + moved)]
+    return found
 
 
 def of_present(case: Case) -> list[list[str]]:

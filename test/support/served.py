@@ -116,6 +116,8 @@ class OpenPage:
         self._address = url.replace("http:", "ws:", 1) + "socket"
         self.told: dict[str, Any] = {}
         """What it was told last of the loop."""
+        self.shown: dict[str, Any] = {}
+        """The figures that change seldom, by name."""
         self.samples: dict[str, list[float]] = {"measurement": [], "command": []}
         self.subjects: list[dict[str, Any]] = []
         self.ended = threading.Event()
@@ -133,6 +135,7 @@ class OpenPage:
         while (text := await self._socket.read_message()) is not None:
             message = json.loads(text)
             self.told = message.get("live", self.told)
+            self.shown |= message.get("shown", {})
             self.subjects = message.get("subjects", self.subjects)
             for name, (_, values) in message.get("samples", {}).items():
                 self.samples[name] += values

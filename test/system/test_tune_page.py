@@ -157,6 +157,10 @@ def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) ->
             each.wait("document.querySelector('#plot-live-measurement .curve')")
             assert each.text("#verdict") == "gains ready to use"
             assert each.eval("document.querySelectorAll('#live-cycles li').length") > 0
+            # the model over the data, and how sure it is
+            each.wait("document.querySelectorAll('#plot-so-far .curve').length === 2")
+            each.wait("document.querySelectorAll('#plot-ku .curve').length === 1")
+            assert "dead time" in each.text("#live-estimates")
         kc = re.search(r"kc (\S+)", tab.text("#gains"))[1]
         assert kc in tab.eval("document.querySelector('#live-result').textContent")
         assert str(rig.records) in tab.text("#command")

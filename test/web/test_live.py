@@ -8,13 +8,16 @@ import json
 import math
 import time
 
+import numpy as np
 import pytest
 from chromium import Chromium
 from served import HOSTILE, analysed, served, subject_of
 from tornado.websocket import websocket_connect
 
+from relay_autotune.report.case import model_case
 from relay_autotune.web import live as live_module
 from relay_autotune.web.live import Live, Wish
+from relay_autotune.web.wire import of_running
 
 
 def talk(url, work):
@@ -100,6 +103,31 @@ def test_only_what_is_possible_can_be_wished():
     assert live.abort.is_set()
     live.forget_wishes()
     assert not live.abort.is_set()
+
+
+def test_the_model_of_a_running_tune_lies_on_the_data_with_its_intervals():
+    analysis = analysed()
+    model = model_case(analysis.model, None)
+    (gain, _) = model.ultimate
+    told = of_running(model, analysis.record, [(2, gain), (3, gain)])
+    _, (times, drawn) = told["data"]
+    record = analysis.record
+    expected = np.interp(times, record.time, analysis.model.fitted)
+    assert np.max(np.abs(np.array(drawn) - expected)) < 0.02 * np.ptp(record.measurement)
+    assert told["gains"]["cycle"] == [2, 3]
+    assert told["gains"]["low"][0] < told["gains"]["value"][0] < told["gains"]["high"][0]
+    assert [row[0] for row in told["estimates"]][:1] == ["gain"]
+    assert of_running(model, None, [])["data"] is None
+    assert json.dumps(told, allow_nan=False)
+
+
+def test_figures_are_told_when_they_change_and_to_a_page_that_is_opened_late():
+    live = Live("/relay_node")
+    live.news()
+    live.show("proof", [1])
+    assert live.news() == {"shown": {"proof": [1]}}
+    assert live.news() is None
+    assert live.everything()["shown"] == {"proof": [1]}
 
 
 @pytest.mark.parametrize(

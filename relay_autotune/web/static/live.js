@@ -10,6 +10,22 @@ const $ = (id) => document.getElementById(id);
 const MOST = 3000;
 const TONES = { settling: "warn", kick: "warn", relay: "warn", completed: "good", aborted: "bad", failed: "bad" };
 
+export function table(host, rows, cells) {
+  const body = document.createElement("tbody");
+  for (const row of rows) {
+    const line = document.createElement("tr");
+    row.forEach((text, k) => {
+      const cell = document.createElement(k === 0 ? "th" : "td");
+      cell.textContent = text;
+      if (cells[k]) cell.className = cells[k];
+      if (k === 0) cell.scope = "row";
+      line.append(cell);
+    });
+    body.append(line);
+  }
+  host.replaceChildren(...(host.tagName === "TBODY" ? body.children : [body]));
+}
+
 function texts(host, name, lines) {
   if (host.children.length === lines.length) return;
   host.replaceChildren(...lines.map((line) => {
@@ -37,6 +53,8 @@ export class Live {
     $("check").addEventListener("click", () => send("check"));
     $("start").addEventListener("click", () => { this.asking = this.told.checked + 1; send("check"); });
     $("abort").addEventListener("click", () => send("abort"));
+    this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
+    this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
     this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
     $("apply").addEventListener("click", () => this.apply(Number($("step").value)));
     $("apply-only").addEventListener("click", () => this.apply(0));
@@ -48,7 +66,9 @@ export class Live {
   // message: {live: what is known, samples: the newest, all: they replace those before}
   take(message) {
     if (message.live) this.show(message.live);
-    if (message.shown && message.shown.proof) this.showProof(message.shown.proof);
+    const { proof, model } = message.shown || {};
+    if (proof) this.showProof(proof);
+    if (model !== undefined) this.showModel(model);
     for (const [name, [times, values]] of Object.entries(message.samples || {})) {
       const [t, v] = message.all ? [[], []] : this.signals[name];
       for (let k = 0; k < times.length; k += 1) {
@@ -149,6 +169,24 @@ export class Live {
     $("apply-only").disabled = !(idle && new_);
     $("verify").disabled = !(idle && moves);
     $("revert").disabled = !idle;
+  }
+
+  // The newest model of the running tune; null: there is none yet.
+  showModel(model) {
+    $("so-far").hidden = !model;
+    table($("live-estimates"), model ? model.estimates : [], ["", "", "unit", "interval"]);
+    if (!model) return;
+    const [data, drawn] = model.data || [[[], []], [[], []]];
+    const curve = ([x, y], kind, name) => ({ x, y, kind, name });
+    this.model.draw({ curves: [curve(data, "measured", "measurement"), curve(drawn, "model", "model")] });
+    const { cycle, value, low, high } = model.gains;
+    const sure = low.map((each, k) => k).filter((k) => low[k] !== null);
+    const of = (values) => sure.map((k) => values[k]);
+    this.ultimate.draw({
+      bands: [{ x: of(cycle), low: of(low), high: of(high), name: "95 % interval" }],
+      curves: [curve([cycle, value], "model", "K_u")],
+      said: `now ${value[value.length - 1]}`,
+    });
   }
 
   showProof(steps) {

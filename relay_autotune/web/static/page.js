@@ -4,7 +4,7 @@
 // The page: it asks for gains as the controls say, and shows what is answered. All text from the
 // server is set as text, never as markup.
 
-import { Live } from "./live.js";
+import { Live, table } from "./live.js";
 import { Plot } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
@@ -36,18 +36,6 @@ function put(parent, name, text, kind) {
   if (kind) made.className = kind;
   parent.append(made);
   return made;
-}
-
-function table(host, rows, cells) {
-  host.replaceChildren();
-  const body = host.tagName === "TBODY" ? host : put(host, "tbody");
-  for (const row of rows) {
-    const line = put(body, "tr");
-    row.forEach((text, k) => {
-      const cell = put(line, k === 0 ? "th" : "td", text, cells[k]);
-      if (k === 0) cell.scope = "row";
-    });
-  }
 }
 
 // What is asked stands in the address, so that a page that is loaded again shows the same.
