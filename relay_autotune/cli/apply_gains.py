@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         "--wait", type=finite, default=60.0, metavar="S",
         help="how long to wait until the loop is at rest [s] (%(default)s)",
     )  # fmt: skip
+    parser.set_defaults(stays=True)
     return parser
 
 
@@ -115,19 +116,30 @@ def _work(options: argparse.Namespace) -> int:
         return apply_and_verify(client, options)
 
 
-def apply_at(name: str, *, doubtful: bool) -> int:
+def apply_at(
+    name: str,
+    *,
+    doubtful: bool,
+    yes: bool = False,
+    stays: bool = True,
+    patience: float = _FOUND_WITHIN,
+) -> int:
     """Offer the newest gains to a controller_node; return the exit status.
 
     :param name: its full name.
     :param doubtful: True: also gains whose verdict is not trusted.
+    :param yes: True: do not ask.
+    :param stays: True: it goes on running, so that it can be asked for the gains before.
+    :param patience: how long to look for it [s].
     """
     from relay_autotune.nodes.gains_client import GainsClient
 
     namespace, _, node = name.rpartition("/")
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
+    options.yes, options.stays = yes, stays
     with GainsClient(namespace, node) as client:
         with Working(f"looking for {name}"):
-            client.find(_FOUND_WITHIN)
+            client.find(patience)
         return apply_and_verify(client, options)
 
 
@@ -182,7 +194,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
         result = client.prove(step, options.load, settles, options.wait, shown)
     finally:
         shown.clear()
-    print("\n".join(verdict_lines(result, client.in_force(), width())))
+    print("\n".join(verdict_lines(result, client.in_force(), width(), stays=options.stays)))
     return DONE if result.passed else NOTHING_FOUND
 
 
@@ -241,12 +253,15 @@ def _performance(present: Controller | None, model: TransferFunction) -> Perform
         return None
 
 
-def verdict_lines(result: Any, present: Controller | None, columns: int) -> list[str]:
+def verdict_lines(
+    result: Any, present: Controller | None, columns: int, *, stays: bool = True
+) -> list[str]:
     """Return what a verification has found, in a line for each step and three more.
 
     :param result: the `Verify.Result`.
     :param present: the gains in force after it.
     :param columns: that a line may have.
+    :param stays: True if the controller_node goes on running.
     """
     told = "passed: the loop does what the model predicts" if result.passed else result.reason
     lines = labelled("verdict", told, columns)
@@ -270,7 +285,7 @@ def verdict_lines(result: Any, present: Controller | None, columns: int) -> list
     now = "none, the command is held"
     if present is not None:
         now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
-    after = f"; {PROGRAM} --revert takes those before" if result.passed else ""
+    after = f"; {PROGRAM} --revert takes those before" if result.passed and stays else ""
     return lines + labelled("gains in force", f"{now}{after}", columns)
 
 

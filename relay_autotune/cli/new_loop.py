@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import finite
@@ -104,8 +105,16 @@ def is_new_loop(options: argparse.Namespace) -> bool:
 
 
 def own_namespace(options: argparse.Namespace) -> str:
-    """Return the namespace of the nodes: that of the flag, else one of this process alone."""
-    return str(options.namespace or f"tune_loop_{os.getpid()}")
+    """Return the namespace of the nodes: that of the flag, else one of this process alone.
+
+    For a joint it is the same each time, so that the next tune of it puts right what a loss of
+    power has left of a verification.
+    """
+    if options.namespace:
+        return str(options.namespace)
+    if options.joint:
+        return re.sub(r"\W", "_", f"tune_{options.controller}_{options.joint}")
+    return f"tune_loop_{os.getpid()}"
 
 
 def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
@@ -155,13 +164,32 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         values["command_period"] = options.command_period
     if command_within is not None:
         values |= {"command_min": command_within[0], "command_max": command_within[1]}
-    named = ["-r", f"__ns:=/{own_namespace(options).strip('/')}"]
-    relay = [*named, "-r", f"measurement:={options.measurement}"]
-    relay += ["-r", f"command:={options.command}"]
-    for name, value in values.items():
-        relay += ["-p", f"{name}:={number(value) if isinstance(value, float) else value}"]
-    nodes = {"relay_node": relay}
-    return OwnNodes(nodes if options.record_only else nodes | {"identifier_node": named})
+    space = own_namespace(options)
+    topics = {"measurement": options.measurement, "command": options.command}
+    nodes = {"relay_node": ros_arguments(space, topics, values)}
+    if not options.record_only:
+        nodes["identifier_node"] = ros_arguments(space)
+    return OwnNodes(nodes)
+
+
+def ros_arguments(
+    namespace: str,
+    topics: Mapping[str, str] | None = None,
+    values: Mapping[str, Any] | None = None,
+) -> list[str]:
+    """Return the arguments for ROS of a node.
+
+    :param namespace: of the node.
+    :param topics: the names of its topics.
+    :param values: of its parameters.
+    """
+    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"]
+    for name, topic in (topics or {}).items():
+        arguments += ["-r", f"{name}:={topic}"]
+    for name, value in (values or {}).items():
+        shown = number(value) if isinstance(value, float) else value
+        arguments += ["-p", f"{name}:={shown}"]
+    return arguments
 
 
 def with_flags(check: str) -> str:

@@ -40,19 +40,27 @@ class OwnNodes:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  it is closed at the end of the block
 
     def __enter__(self) -> OwnNodes:
+        for name, arguments in self._nodes.items():
+            self.start(name, arguments)
+        return self
+
+    def start(self, name: str, arguments: Sequence[str]) -> None:
+        """Start one node more.
+
+        :param name: of its executable.
+        :param arguments: its arguments for ROS.
+        """
         # Loaded before the fork: after it only few calls are allowed.
         prctl = ctypes.CDLL(None).prctl
-        for name, arguments in self._nodes.items():
-            run = f"from relay_autotune.start import {name}; raise SystemExit({name}())"
-            self._running[name] = subprocess.Popen(
-                [sys.executable, "-c", run, "--ros-args", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=self._log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
-            )
-        return self
+        run = f"from relay_autotune.start import {name}; raise SystemExit({name}())"
+        self._running[name] = subprocess.Popen(
+            [sys.executable, "-c", run, "--ros-args", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
+        )
 
     def require_alive(self) -> None:
         """Refuse to go on without a node.

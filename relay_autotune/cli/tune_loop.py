@@ -23,14 +23,16 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, nullcontext, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
 from relay_autotune.cli.asking import agrees, asked_for_file
 from relay_autotune.cli.export import Target, exported, exports_of, write
+from relay_autotune.cli.joint_tune import JointTune, add_joint, is_of_joint
 from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     START_WITHIN,
@@ -84,9 +86,10 @@ def main(args: Sequence[str] | None = None) -> int:
             "--json, --report and --export"
         )
     options.typed = given
-    if options.measurement and options.command:
+    if (options.measurement and options.command) or options.joint:
         # At once, since what follows takes a second to load.
-        told = f"looking at {options.measurement} and {options.command}; nothing is commanded yet"
+        what = (options.joint or options.measurement, options.controller or options.command)
+        told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
         print(told, file=sys.stderr, flush=True)
     import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
 
@@ -135,6 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_new_loop(parser)
+    add_joint(parser)
     add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
     return parser
 
@@ -157,7 +161,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         check_output(PROGRAM, options.report)
     if options.web:
         check_web(options)
-    new = is_new_loop(options)
+    of_joint = is_of_joint(options)
+    new = of_joint or is_new_loop(options)
     try:
         namespace = own_namespace(options) if new else options.namespace
         client = TuneClient(namespace, options.node, ros)
@@ -166,11 +171,12 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         return USAGE
     with ExitStack() as stack:
         stack.enter_context(client)
-        patience = options.wait
+        patience, joint = options.wait, None
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            nodes = stack.enter_context(nodes_for(client, options))
+            joint = JointTune(client, options) if of_joint else None
+            nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
             patience = max(patience, START_WITHIN)
         deadline = time.monotonic() + patience
 
@@ -185,6 +191,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
                 needs_identifier=not (options.dry_run or options.record_only),
                 leave=leave,
             )
+        if joint:
+            joint.show()
         asks_here = not (options.dry_run or options.web)
         if new and asks_here and not _is_agreed(client, options, deadline):
             return NOTHING_FOUND
@@ -204,14 +212,16 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
+        opens = joint is not None and not options.dry_run
         try:
-            while True:
-                client.ask(options.amplitude, options.dry_run)
-                _follow(client, shown, interrupted)
-                if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
-                    break
-                time.sleep(_TICK)
-            shown.clear()
+            with joint.opened() if joint and opens else nullcontext(lambda: "") as why_over:
+                while True:
+                    client.ask(options.amplitude, options.dry_run)
+                    _follow(client, shown, interrupted, why_over=why_over)
+                    if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
+                        break
+                    time.sleep(_TICK)
+                shown.clear()
         finally:
             wait_again()
         # The tune is over, so a signal may end the command at once.
@@ -219,7 +229,10 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
-            return _conclude(client, options)
+            apply = None
+            if joint and joint.applies:
+                apply = partial(joint.apply, nodes)
+            return _conclude(client, options, joint.target if joint else Target(), apply)
         except OSError:
             # The terminal is closed.
             if signal.SIGHUP in interrupted:
@@ -251,17 +264,33 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
     return agrees("Start the tune?", yes=options.yes)
 
 
-def _follow(client: TuneClient, shown: Shown, interrupted: list[int], tick: float = _TICK) -> None:
-    """Show the feedback until the result is there, and cancel when asked to."""
+def _follow(
+    client: TuneClient,
+    shown: Shown,
+    interrupted: list[int],
+    tick: float = _TICK,
+    why_over: Callable[[], str] = lambda: "",
+) -> None:
+    """Show the feedback until the result is there, and cancel when asked to.
+
+    :param client: that has asked for the tune.
+    :param shown: where the feedback goes.
+    :param interrupted: signals that have come.
+    :param tick: interval of the looks [s].
+    :param why_over: tells why the tune has to end by itself; empty: it goes on.
+    """
     asked = 0
     while not client.done():
         client.spin(tick)
         for feedback in client.news():
             shown.take(feedback)
         shown.tick()
-        if interrupted and not asked:
+        over = why_over() if not asked else ""
+        if (interrupted or over) and not asked:
             asked = 1
             client.cancel()
+            if over:
+                shown.say(over)
             shown.say("cancelling: the safe command goes out, then the recording is closed")
         elif any(number != signal.SIGHUP for number in interrupted[1:]):
             # SIGHUP does not count: a shell that ends with its terminal sends it once more.
@@ -271,7 +300,19 @@ def _follow(client: TuneClient, shown: Shown, interrupted: list[int], tick: floa
             )
 
 
-def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
+def _conclude(
+    client: TuneClient,
+    options: argparse.Namespace,
+    target: Target,
+    apply: Callable[[str], int] | None,
+) -> int:
+    """Show the result, and hand the gains over; return the exit status.
+
+    :param client: with the result.
+    :param options: of the command line.
+    :param target: where exported gains go.
+    :param apply: offers the gains to a joint's controller; None: there is none.
+    """
     result, cancelled = client.result, client.cancelled
     for refused in sorted(client.refused):
         say(PROGRAM, refused)
@@ -282,12 +323,14 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
         print("\n".join(result_lines(result, cancelled, paint, width())), flush=True)
     flags, report = _afterwards(client, options)
     # Gains of nodes that end with this command cannot be asked for later.
-    controllers = [] if is_new_loop(options) else client.controllers()
+    new = bool(options.joint) or is_new_loop(options)
+    controllers = [] if new else client.controllers()
+    in_force = True
     if options.json:
         print(json.dumps(document(result, client.name, cancelled, report)))
     else:
-        if is_new_loop(options) and result.gains.experiment_id:
-            _hand_over(client, options)
+        if new and result.gains.experiment_id:
+            in_force = _hand_over(client, options, target, apply)
         steps = next_commands(result, controllers, _prefix(), flags, report)
         if steps:
             print("\nNext:")
@@ -295,17 +338,25 @@ def _conclude(client: TuneClient, options: argparse.Namespace) -> int:
             print(f"  {what:<26} {command}")
     complete = result.gains.experiment_id or options.record_only
     written = report or not options.report
-    if not (client.succeeded and complete and written):
+    if not (client.succeeded and complete and written and in_force):
         return NOTHING_FOUND
     return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
 
 
-def _hand_over(client: TuneClient, options: argparse.Namespace) -> None:
-    """Offer to apply and verify the gains, and write them for another controller."""
+def _hand_over(
+    client: TuneClient,
+    options: argparse.Namespace,
+    target: Target,
+    apply: Callable[[str], int] | None,
+) -> bool:
+    """Offer to apply and verify the gains, and write them for another controller.
+
+    :return: False if they were to be in force with the controller of a joint, and are not.
+    """
     result, file = client.result, options.export
     doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
     how = exports_of(result.gains.law)[0]
-    if not options.yes:
+    if not (options.yes or options.joint):
         there = client.controllers() if sys.stdin.isatty() else []
         for name in there:
             print()
@@ -313,8 +364,12 @@ def _hand_over(client: TuneClient, options: argparse.Namespace) -> None:
         file = file or ("" if there else asked_for_file(f"\nWrite the gains for {how}"))
     if file:
         gains = gains_from_message(result.gains)
-        write(exported(gains, how, Target(), doubt=doubt), file)
+        write(exported(gains, how, target, doubt=doubt), file)
         print(f"  {'gains for':<16} {how}: {file}")
+    if apply is None:
+        return True
+    print()
+    return apply(doubt) == DONE
 
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:

@@ -42,6 +42,14 @@ _TURN = 0.1
 _SAME = 1e-9
 # Beginning of the refusal of ~/verify that time cures.
 _NOT_AT_REST = "the loop is not at rest"
+# Parts of the refusals of a node that has just started, until it has found the others.
+_NOT_YET = (
+    "is not there, or has no parameter services",
+    "no model has come",
+    "nobody takes a set-point",
+    "has been heard",
+    "have come with a command",
+)
 
 
 class GainsClient(LoopClient):
@@ -77,7 +85,7 @@ class GainsClient(LoopClient):
         :raises LoopError: if it is not there.
         """
         if not self._wait(self._verify.server_is_ready, time.monotonic() + patience):
-            there = ", ".join(n for n in self._owners("/verify") if n != self.name) or "none"
+            there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
             raise LoopError(
                 f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
                 f"{there}. Start it, or name another with --namespace and --node"
@@ -140,10 +148,14 @@ class GainsClient(LoopClient):
         :param service: which of them.
         :raises LoopError: with the reason, if it refuses.
         """
-        answer = self.call(Trigger, f"{self.name}/{service}", Trigger.Request())
-        if not answer.success:
-            raise LoopError(f"{self.name} refuses: {answer.message}")
-        return str(answer.message)
+        deadline = time.monotonic() + ANSWER_WITHIN
+        while True:
+            answer = self.call(Trigger, f"{self.name}/{service}", Trigger.Request())
+            if answer.success:
+                return str(answer.message)
+            if not _is_early(answer.message) or time.monotonic() > deadline:
+                raise LoopError(f"{self.name} refuses: {answer.message}")
+            self.rest(_TURN)
 
     def has(self, gains: Controller) -> bool:
         """Tell whether gains are in force already.
@@ -283,7 +295,8 @@ class GainsClient(LoopClient):
             result = answer.result
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result
-            if not result.reason.startswith(_NOT_AT_REST):
+            early = _is_early(result.reason) and time.monotonic() - begun < ANSWER_WITHIN
+            if not (early or result.reason.startswith(_NOT_AT_REST)):
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
             if time.monotonic() - begun > patience:
                 raise LoopError(
@@ -307,3 +320,8 @@ class GainsClient(LoopClient):
                     cancelled = True
             if not self._verify.server_is_ready():
                 raise LoopError(f"{self.name} has gone during the verification")
+
+
+def _is_early(reason: str) -> bool:
+    """Return whether a refusal may disappear without action."""
+    return reason == NONE_WAIT or any(part in reason for part in _NOT_YET)

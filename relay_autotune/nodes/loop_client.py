@@ -34,6 +34,8 @@ from relay_autotune.nodes.live_types import reader_of
 _LISTEN = 1.0
 # How long a node may take to answer [s].
 ANSWER_WITHIN = 10.0
+# Interval in which a message is published until it has arrived [s].
+_AGAIN = 0.2
 
 
 class LoopClient:
@@ -76,6 +78,7 @@ class LoopClient:
             self._context, self._node = beside._context, beside._node
             self._executor = beside._executor
         self.name = self._node.resolve_service_name(node)
+        self._services: dict[str, Any] = {}
 
     def close(self) -> None:
         """Leave the graph."""
@@ -123,13 +126,91 @@ class LoopClient:
         :param patience: how long to wait for it [s].
         :raises LoopError: if it does not answer.
         """
-        client = self._node.create_client(kind, service)
         deadline = time.monotonic() + patience
-        if self._wait(client.service_is_ready, deadline):
-            answer = client.call_async(request)
+        if self._wait(self._service(kind, service).service_is_ready, deadline):
+            answer = self.begin(kind, service, request)
             if self._wait(answer.done, deadline):
                 return answer.result()
         raise LoopError(f"{service} has not answered within {patience:g} s")
+
+    def begin(self, kind: Any, service: str, request: Any) -> Any:
+        """Ask a service, and return the future of its answer.
+
+        :param kind: the service class.
+        :param service: its full name.
+        :param request: what is asked.
+        """
+        return self._service(kind, service).call_async(request)
+
+    def _service(self, kind: Any, service: str) -> Any:
+        if service not in self._services:
+            self._services[service] = self._node.create_client(kind, service)
+        return self._services[service]
+
+    def wait(self, condition: Callable[[], bool], patience: float) -> bool:
+        """Handle messages until a condition holds, and return whether it does.
+
+        :param condition: what is waited for.
+        :param patience: how long [s].
+        """
+        return self._wait(condition, time.monotonic() + patience)
+
+    def rest(self, seconds: float) -> None:
+        """Handle messages for a time.
+
+        :param seconds: the time [s].
+        """
+        self._wait(lambda: False, time.monotonic() + seconds)
+
+    def heard(self, kind: Any, topic: str, seconds: float, least: int = 1) -> list[Any]:
+        """Return the messages of a topic that come within a time.
+
+        :param kind: the message class.
+        :param topic: its full name.
+        :param seconds: the time, from the first message on [s].
+        :param least: how many are waited for, at most `ANSWER_WITHIN`.
+        """
+        came: list[Any] = []
+        # Best effort, so that nobody waits for this client.
+        ear = self._node.create_subscription(kind, topic, came.append, qos_profile_sensor_data)
+        self._wait(lambda: len(came) >= least, time.monotonic() + ANSWER_WITHIN)
+        if came:
+            self.rest(seconds)
+        self._node.destroy_subscription(ear)
+        return came
+
+    def publish(
+        self, message: Any, topic: str, kind: Any, answers: str, accepted: Callable[[Any], bool]
+    ) -> bool:
+        """Publish a message every 0.2 s until an answer shows that it was taken.
+
+        :param message: what is published.
+        :param topic: its full name.
+        :param kind: class of the answers.
+        :param answers: full name of their topic.
+        :param accepted: tells whether an answer shows it.
+        :return: whether one did.
+        """
+        shown: list[bool] = []
+        ear = self._node.create_subscription(
+            kind, answers, lambda m: shown.append(accepted(m)), qos_profile_sensor_data
+        )
+        mouth = self._node.create_publisher(type(message), topic, quality.COMMAND)
+        deadline = time.monotonic() + ANSWER_WITHIN
+        while not any(shown) and time.monotonic() < deadline:
+            if mouth.get_subscription_count():
+                mouth.publish(message)
+            self.wait(lambda: any(shown), _AGAIN)
+        self._node.destroy_publisher(mouth)
+        self._node.destroy_subscription(ear)
+        return any(shown)
+
+    def has_publisher(self, topic: str) -> bool:
+        """Tell whether a topic has a publisher.
+
+        :param topic: its full name.
+        """
+        return self._node.count_publishers(topic) > 0
 
     def values(
         self, node: str, names: Sequence[str], patience: float = ANSWER_WITHIN
@@ -238,18 +319,14 @@ class LoopClient:
         self._node.destroy_subscription(ear)
         return sum(heard) / len(heard) if heard else math.nan
 
-    def rest(self, seconds: float) -> None:
-        """Handle messages for a time.
-
-        :param seconds: the time [s].
-        """
-        self._wait(lambda: False, time.monotonic() + seconds)
-
     def _is_here(self, name: str) -> bool:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]
 
-    def _owners(self, ending: str) -> list[str]:
-        """Return the full names of the nodes with a service that has this ending."""
+    def owners(self, ending: str) -> list[str]:
+        """Return the full names of the nodes with a service that has this ending.
+
+        :param ending: such as ``/apply``.
+        """
         services = self._node.get_service_names_and_types()
         goals = [name.removesuffix("/_action/send_goal") for name, _ in services]
         return sorted({name.removesuffix(ending) for name in goals if name.endswith(ending)})

@@ -370,6 +370,7 @@ class RelayNode(ServedNode):
             sample_period=parameters.sample_period,
             clock=self._now_ns if self._simulated else None,
             repeats=self._hear is not None,
+            one_clock=self._reported is not None,
         )
         sample, recorded = self._recordings.begin(
             identity, self.get_parameter("record_directory").value

@@ -38,6 +38,7 @@ class Session:
     :param sample_period: period of the samples [s]; 0: they are stamped.
     :param clock: the simulated clock [ns]; None: time is real.
     :param repeats: True if a measurement is a sample again while the sensor is silent.
+    :param one_clock: True if the stamp of a sample is the time of the command, too.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Session:
         sample_period: float = 0.0,
         clock: Callable[[], int] | None = None,
         repeats: bool = False,
+        one_clock: bool = False,
     ) -> None:
         self.experiment = experiment
         self.id = experiment_id
@@ -60,6 +62,7 @@ class Session:
         self._step = experiment.step
         self._period = sample_period
         self._clock = clock
+        self._one_clock = one_clock
         self._count = 0
         self._last = (0, 0, 0.0, 0.0)
         self._first_answer_ns = 0
@@ -122,8 +125,8 @@ class Session:
     def answered(self) -> None:
         """Note that the last answer was sent; to be called right after sending."""
         received, source, measurement, command = self._last
-        if self._period > 0.0:
-            # Sample number and period are the only clock of such an experiment.
+        if self._period > 0.0 or self._one_clock:
+            # Sample number and period, or the stamps, are the only clock of such an experiment.
             received = sent = source
         elif self._clock is not None:
             sent = self._clock()

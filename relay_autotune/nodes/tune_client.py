@@ -96,7 +96,7 @@ class TuneClient(LoopClient):
         deadline = time.monotonic() + patience
         if not self._wait(lambda: leave() or self._client.server_is_ready(), deadline):
             # This client itself appears in the graph under the name that it looks for.
-            others = ", ".join(n for n in self._owners("/tune") if n != self.name) or "none"
+            others = ", ".join(n for n in self.owners("/tune") if n != self.name) or "none"
             raise LoopError(
                 f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
                 f"{others}. Start it, or name another with --namespace and --node"
@@ -195,7 +195,7 @@ class TuneClient(LoopClient):
 
     def controllers(self) -> list[str]:
         """Return the full names of the nodes of this namespace that can apply gains."""
-        return [name for name in self._owners("/apply") if self._is_here(name)]
+        return [name for name in self.owners("/apply") if self._is_here(name)]
 
     def record(self, patience: float) -> Record:
         """Return the samples of the tune, which relay_node publishes latched.

@@ -41,6 +41,7 @@ VERBS = {
     "bag convert": set(),
     "bag play": {"--rate"},
     "pkg prefix": {"--share"},
+    "control switch_controllers": {"--strict", "--activate", "--deactivate"},
 }
 OTHERS = {
     *(".", "cd", "colcon", "echo", "export", "kill", "make", "pip", "python3", "rosdep", "sed"),

@@ -31,6 +31,8 @@ from relay_autotune.record.record import PiecewiseConstant, Record
 FloatArray = NDArray[np.float64]
 
 _NEGLIGIBLE = 1e-10
+# More different commands than these in a cycle are not those of a relay.
+_LEVELS = 6
 
 
 def assess(models: Sequence[Identification], record: Record) -> tuple[Identification, ...]:
@@ -115,6 +117,11 @@ def operating_point(record: Record) -> float:
 
 
 def _averaged(record: Record) -> Fold | None:
+    # With a relay on the set-point, a controller answers with other commands in each sample: the
+    # same relay on the model's command would make another oscillation.
+    *_, first, last = (0, 0, *record.cycle_start)
+    if np.unique(record.command[first:last]).size > _LEVELS:
+        return None
     try:
         return fold(record)
     except (IdentificationError, RecordError):

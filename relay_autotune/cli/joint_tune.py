@@ -1,0 +1,483 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What tune_loop does for a joint of ros2_control: find its loop, say the plan, open it, apply."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.cli.apply_gains import apply_at
+from relay_autotune.cli.asking import asked, number_of, pair_of
+from relay_autotune.cli.export import Target
+from relay_autotune.cli.layout import width
+from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes
+from relay_autotune.cli.progress import Working
+from relay_autotune.cli.tune_view import check_lines
+from relay_autotune.errors import LoopError, SelectionError
+
+if TYPE_CHECKING:
+    from relay_autotune.nodes.controller_manager import ManagedController
+    from relay_autotune.nodes.tune_client import TuneClient
+
+_JOINT_STATES = "/joint_states"
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+_FLOATS = "std_msgs/msg/Float64MultiArray"
+# Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
+_OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
+_OF_TOPICS = ("command", "command_field", "command_period")
+
+
+def add_joint(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a joint of ros2_control.
+
+    :param parser: of tune_loop.
+    """
+    group = parser.add_argument_group(
+        "a joint of ros2_control",
+        "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
+        "applies and verifies the gains",
+    )
+    group.add_argument("--controller", metavar="NAME", help="an active pid_controller")
+    group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
+    group.add_argument(
+        "--controller-manager", default="", metavar="NAME",
+        help="full name of the controller_manager; default: the only one that is there",
+    )  # fmt: skip
+    group.add_argument(
+        "--open", action="store_true",
+        help="switch its controllers off for the tune, and command the joint itself; default: "
+        "the controller stays active, and its reference is moved",
+    )  # fmt: skip
+    group.add_argument(
+        "--forward", metavar="NAME",
+        help="with --open: the controller that passes commands on; default: found",
+    )  # fmt: skip
+    group.add_argument(
+        "--keep-gains", action="store_true", help="leave the gains of the controller as they are"
+    )
+
+
+def is_of_joint(options: argparse.Namespace) -> bool:
+    """Return whether a joint is to be tuned.
+
+    :param options: with the flags of `add_joint` and `add_new_loop`.
+    :raises SelectionError: if the flags do not go together.
+    """
+    if not (options.controller or options.joint):
+        if options.open or options.forward or options.keep_gains or options.controller_manager:
+            raise SelectionError("--open and the like are for a joint: give --controller, --joint")
+        return False
+    if not (options.controller and options.joint):
+        raise SelectionError("--controller and --joint go together: give both")
+    if options.web or (options.json and not (options.keep_gains or options.dry_run)):
+        raise SelectionError(
+            "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"
+        )
+    for name in (*_OF_TOPICS, *(() if options.open else _OF_OPENED)):
+        if getattr(options, name) is not None:
+            what = "a loop of two topics" if name in _OF_TOPICS else "--open"
+            raise SelectionError(
+                f"--{name.replace('_', '-')} is for {what}: leave it out, since the controller "
+                f"tells it"
+            )
+    return True
+
+
+class JointTune:
+    """A joint that is to be tuned.
+
+    :param client: a node of the graph.
+    :param options: with the flags of `add_joint` and `add_new_loop`.
+    :raises LoopError: if the loop is not there, or something is not known and nobody can be asked.
+    """
+
+    def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
+        from relay_autotune.nodes.controller_manager import (
+            ControllerManager,
+            forwarding,
+            in_the_way,
+        )
+        from relay_autotune.nodes.joint_loop import joint_loop
+
+        self._client, self._options = client, options
+        self._space = own_namespace(options)
+        self._forward: ManagedController | None = None
+        self._former: tuple[str, ...] = ()
+        with Working(f"looking at {options.controller}"):
+            self._manager = ControllerManager(client, options.controller_manager, options.wait)
+            self._loop = joint_loop(client, self._manager, options.controller, options.joint)
+            if options.open:
+                loaded = self._manager.controllers()
+                self._forward = forwarding(loaded, self._loop.interface, options.forward or "")
+                self._former = in_the_way(loaded, self._forward.needs)
+                self._held = self._commands_beside(self._forward)
+        loop = self._loop
+        if loop.is_chained and not options.open:
+            raise LoopError(
+                f"{loop.controller} takes its references from another controller, not from "
+                f"{loop.reference_topic}: give --open, or deactivate that controller"
+            )
+        if not options.open and not math.isfinite(loop.state.reference):
+            raise LoopError(
+                f"{loop.controller} has no reference for {loop.joint} yet: publish one on "
+                f"{loop.reference_topic}, and wait until the joint rests there"
+            )
+        self._within_from = "--within"
+        self._within = options.within
+        if self._within is None and loop.within is not None:
+            self._within, self._within_from = list(loop.within), "robot_description"
+        if self._within is None:
+            what = f"lowest and highest {loop.measured} that {loop.joint} may have [y]"
+            self._within = asked(what, "--within", "", "-5 5", pair_of)
+        self._baseline = loop.state.output if options.at is None else options.at
+        if options.open and not math.isfinite(self._baseline):
+            what = f"present {loop.commanded} of {loop.joint}, at which it rests [u]"
+            self._baseline = asked(what, "--at", "", "0", number_of)
+        self._command_within = self._range() if options.open else None
+
+    # What is to happen.
+
+    def plan(self) -> list[str]:
+        """Return the plan, as lines of a checklist."""
+        from relay_autotune.nodes.checklist import ChecklistLine, Mark
+
+        loop = self._loop
+        lines = [
+            ChecklistLine(Mark.OK, name, told)
+            for name, told in (
+                ("joint", f"{loop.joint}: {loop.measured}, commanded by {loop.interface}"),
+                (
+                    "controller",
+                    f"{loop.controller} of {self._manager.name}, {1.0 / loop.period:.4g} Hz"
+                    + ("" if self._forward else ", stays active"),
+                ),
+                *self._moves(),
+                ("gains now", ", ".join(map("{} {:.6g}".format, "pid", loop.gains))),
+                ("gains then", self._applied()),
+            )
+        ]
+        lines += [ChecklistLine(Mark.NOTE, *note) for note in self._notes()]
+        return list(map(str, lines))
+
+    def show(self) -> None:
+        """Print the plan."""
+        print("\n".join(check_lines(self.plan(), width())), file=sys.stderr, flush=True)
+
+    def _moves(self) -> Iterator[tuple[str, str]]:
+        loop = self._loop
+        low, high = self._within
+        limits = f"{low:g} to {high:g} ({self._within_from})"
+        others = [each for each in loop.joints if each != loop.joint]
+        if self._forward is None:
+            yield "moves", f"the reference of {loop.joint} about {loop.state.reference:.6g}"
+            yield "within", f"{limits}, for reference and {loop.measured}"
+            if others:
+                yield "holds", f"{', '.join(others)}: the references that they have"
+            return
+        off = ", ".join(self._former)
+        yield (
+            "switches",
+            f"{off} off and {self._forward.name} on, in one strict request; back after it",
+        )
+        yield "moves", f"the {loop.commanded} of {loop.joint} itself, about {self._baseline:.6g}"
+        yield "within", f"{limits}, for {loop.measured}"
+        beside = [
+            f"{name} {value:.6g}"
+            for name, value in zip(self._forward.needs, self._held, strict=True)
+            if name != loop.interface
+        ]
+        if beside:
+            yield "holds", ", ".join(beside)
+
+    def _applied(self) -> str:
+        if self._options.keep_gains:
+            return "stay, whatever is found (--keep-gains)"
+        first, *others = self._loop.parameters
+        return (
+            f"{'/'.join([first, *(name[-1] for name in others)])} at once, verified by a step of "
+            f"the reference; those of now come back where that fails"
+        )
+
+    def _notes(self) -> Iterator[tuple[str, str]]:
+        """Say what the controller's settings do to the gains."""
+        loop = self._loop
+        limited = " (no u_clamp is set, so that this never acts)" * (
+            not any(map(math.isfinite, loop.clamps))
+        )
+        yield (
+            "antiwindup",
+            {
+                "back_calculation": "back_calculation: at a u_clamp the integral gives way within "
+                + (
+                    f"tracking_time_constant {loop.tracking_time_constant:g} s, which stays"
+                    if loop.tracking_time_constant
+                    else "a time that follows from the new gains"
+                )
+                + limited,
+                "conditional_integration": "conditional_integration: no integration at a u_clamp"
+                + limited,
+                "none": "none: the integral winds up at a limit of the command",
+                "legacy": "legacy: the integral is added before the output, and limited by "
+                "i_clamp alone; the design is for that",
+            }[loop.strategy],
+        )
+        yield (
+            "derivative",
+            f"of the second interface, without a filter; the design takes the difference of "
+            f"{loop.measured}"
+            if loop.has_rate
+            else "the plain difference of the error: noise passes, and PI is chosen where that "
+            "is too much",
+        )
+        if loop.feedforward:
+            yield (
+                "feed-forward",
+                f"{loop.feedforward:g} times the reference is added: the gains are right with it, "
+                f"but the step of the verification also moves it",
+            )
+        if loop.wraps:
+            yield "wraparound", "the error is wrapped to half a turn: keep the limits within one"
+        if self._forward is None:
+            return
+        yield (
+            "save_i_term",
+            "true: the integral goes on where it was when the controller is active again"
+            if loop.save_i_term
+            else "false: the integral begins at 0 when the controller is active again",
+        )
+        without = sorted(
+            set(loop.dofs) - {name.rpartition("/")[0] for name in self._forward.needs}
+        )
+        if without:
+            told = ", ".join(without)
+            yield "no control", f"{told} keeps its last command, with no controller meanwhile"
+        typed = self._manager.command_for(self._former, [self._forward.name])
+        yield "if killed", f"only kill -9 of this command leaves that; then type: {typed}"
+
+    # The loop while it is tuned.
+
+    def nodes(self) -> OwnNodes:
+        """Return the nodes that tune it."""
+        loop, options = self._loop, self._options
+        topics, values = self._opened_ends() if options.open else self._closed_ends()
+        values |= {
+            "amplitude": options.amplitude,
+            "measurement_min": self._within[0],
+            "measurement_max": self._within[1],
+        }
+        nodes = {"relay_node": ros_arguments(self._space, topics, values)}
+        if not options.record_only:
+            design = {"law": loop.law, "sample_period": loop.period}
+            nodes["identifier_node"] = ros_arguments(self._space, {}, design)
+        return OwnNodes(nodes)
+
+    def _closed_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
+        from relay_autotune.nodes.joint_loop import COMMAND_TYPE
+
+        loop = self._loop
+        topics = {"measurement": loop.state_topic, "setpoint": loop.reference_topic}
+        return topics, self._of_state() | {
+            "relay_on": "setpoint",
+            "setpoint": loop.state.reference,
+            "command_type": COMMAND_TYPE,
+            "command_field": loop.reference_field,
+            "command_message": json.dumps(loop.reference_alone),
+            # The levels are references, which have the limits of the measurement.
+            "command_min": self._within[0],
+            "command_max": self._within[1],
+        }
+
+    def _of_state(self) -> dict[str, Any]:
+        from relay_autotune.nodes.joint_loop import STATE_TYPE
+
+        return {
+            "measurement_type": STATE_TYPE,
+            "measurement_field": f"{self._loop.state_field}.feedback",
+            "controller_command_field": f"{self._loop.state_field}.output",
+        }
+
+    def _opened_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
+        assert self._forward is not None
+        loop, options, client = self._loop, self._options, self._client
+        kind, field = _JOINT_STATE, f"{loop.measured}[{loop.joint}]"
+        topic = options.measurement or _JOINT_STATES
+        found = client.kind_of(topic, options.wait, published=True)
+        if options.measurement and options.field != "data":
+            kind, field = found, options.field
+        topics = {
+            "measurement": topic,
+            "command": f"{self._manager.node_of(self._forward.name)}/commands",
+        }
+        held = json.dumps([0.0 if math.isnan(value) else value for value in self._held])
+        place = self._forward.needs.index(loop.interface)
+        low, high = self._command_within or (-math.inf, math.inf)
+        values = {
+            "measurement_type": kind,
+            "measurement_field": field,
+            "command_type": _FLOATS,
+            "command_field": f"data[{place}]",
+            "command_message": json.dumps(f"{{data: {held}}}"),
+            "baseline": self._baseline,
+            "command_min": low,
+            "command_max": high,
+        }
+        if loop.measured == "position" and loop.commanded != "position":
+            # It drifts at a constant command, but its controllers come back at once.
+            values |= {"process_type": "integrating", "start_without_hold": True}
+        return topics, values
+
+    def _range(self) -> list[float] | None:
+        """Return the limits of the command, asked for where the amplitude is found by them."""
+        loop, options = self._loop, self._options
+        given = options.command_within
+        if given is None and all(map(math.isfinite, loop.clamps)):
+            given = list(loop.clamps)
+        if given is None and loop.command_within is not None:
+            given = list(loop.command_within)
+        if given is None and not options.amplitude:
+            what = f"lowest and highest {loop.commanded} of {loop.joint} [u]"
+            given = asked(what, "--command-within", "", "-2 2", pair_of)
+        return given
+
+    def _commands_beside(self, forward: ManagedController) -> list[float]:
+        """Return what each interface of the forwarding controller is told; NaN: the joint."""
+        loop = self._loop
+        outputs = {
+            f"{dof}/{loop.commanded}": state.output
+            for dof, state in zip(loop.dofs, loop.states, strict=True)
+        }
+        others = [name for name in forward.needs if name != loop.interface]
+        if self._options.command_message and others:
+            return self._given_beside(forward)
+        told = {loop.interface: math.nan}
+        for name in others:
+            value = outputs.get(name, math.nan)
+            joint, _, kind = name.rpartition("/")
+            if math.isnan(value) and kind == "position":
+                value = self._position_of(joint)
+            if math.isnan(value) and kind == "velocity":
+                value = 0.0
+            if math.isnan(value):
+                raise LoopError(
+                    f"{forward.name} also commands {name}, and nothing tells what holds it: give "
+                    f"--command-message '{{data: [...]}}' with {len(forward.needs)} numbers, "
+                    f"those of {', '.join(forward.needs)}"
+                )
+            told[name] = value
+        return [told[name] for name in forward.needs]
+
+    def _given_beside(self, forward: ManagedController) -> list[float]:
+        import yaml
+
+        with suppress(yaml.YAMLError, TypeError, ValueError, KeyError):
+            data = [float(v) for v in yaml.safe_load(self._options.command_message)["data"]]
+            if len(data) == len(forward.needs):
+                return data
+        raise SelectionError(
+            f"--command-message is {self._options.command_message}, expected "
+            f"'{{data: [...]}}' with {len(forward.needs)} numbers: {', '.join(forward.needs)}"
+        )
+
+    def _position_of(self, joint: str) -> float:
+        from relay_autotune.nodes.live_types import message_class
+
+        kind = message_class(_JOINT_STATE, "measurement_type")
+        for message in self._client.heard(kind, _JOINT_STATES, 0.0):
+            if joint in message.name:
+                return float(message.position[list(message.name).index(joint)])
+        return math.nan
+
+    @contextmanager
+    def opened(self) -> Iterator[Callable[[], str]]:
+        """Open the loop for a tune if that is asked for, and close it however the tune ends.
+
+        :return: what tells why the tune has to end; empty: it goes on.
+        """
+        from relay_autotune.nodes.controller_manager import Opened
+
+        if self._forward is None:
+            yield self._manager.still_active(self._loop.controller)
+            return
+        try:
+            with Opened(self._manager, self._forward.name, self._former):
+                yield self._manager.still_active(self._forward.name)
+        finally:
+            self._give_references_back()
+
+    def _give_references_back(self) -> None:
+        """Publish the references of before, which the controller forgets when it is switched."""
+        from relay_autotune.nodes.command_message import CommandMessage
+        from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE
+        from relay_autotune.nodes.live_types import message_class
+
+        loop = self._loop
+        with suppress(LoopError):
+            listed = {each.name: each for each in self._manager.controllers()}
+            if loop.is_chained or not listed[loop.controller].is_active:
+                return
+        reference = loop.state.reference
+        commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
+        states = message_class(STATE_TYPE, "measurement_type")
+
+        def is_back(message: Any) -> bool:
+            told = {dof.name: dof.reference for dof in message.dof_states}
+            return bool(told.get(loop.joint) == reference)
+
+        if math.isfinite(reference) and not self._client.publish(
+            commands.written(reference), loop.reference_topic, states, loop.state_topic, is_back
+        ):
+            raise LoopError(
+                f"{loop.controller} is active again, but does not take its former reference "
+                f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}"
+            )
+
+    # The gains.
+
+    @property
+    def target(self) -> Target:
+        """Where exported gains go."""
+        return Target(self._loop.node, self._loop.dof)
+
+    @property
+    def applies(self) -> bool:
+        """Whether the gains go to the controller."""
+        return not self._options.keep_gains
+
+    def apply(self, nodes: OwnNodes, doubt: str) -> int:
+        """Offer the gains to the controller, verify them, and return the exit status.
+
+        :param nodes: of this command.
+        :param doubt: why they are doubtful; empty: they are trusted.
+        """
+        from relay_autotune.nodes.joint_loop import COMMAND_TYPE, GAINS
+
+        if doubt and self._options.yes:
+            raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
+        loop = self._loop
+        places = ",".join(map("{}:{}".format, GAINS, loop.parameters))
+        values = self._of_state() | {
+            "apply_to": loop.node,
+            "apply_parameters": places,
+            "initial_setpoint": loop.state.reference,
+            "command_type": COMMAND_TYPE,
+            "command_field": loop.reference_field,
+            "command_message": json.dumps(loop.reference_alone),
+            "measurement_min": self._within[0],
+            "measurement_max": self._within[1],
+        }
+        for name, clamp in zip(("command_min", "command_max"), loop.clamps, strict=True):
+            if math.isfinite(clamp):
+                values[name] = clamp
+        topics = {"measurement": loop.state_topic, "setpoint": loop.reference_topic}
+        # Not before, since relay_node refuses a second publisher of the reference.
+        nodes.start("controller_node", ros_arguments(self._space, topics, values))
+        name = f"/{self._space.strip('/')}/controller_node"
+        return apply_at(name, doubtful=bool(doubt), yes=self._options.yes, patience=START_WITHIN)

@@ -1,0 +1,338 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A joint under a pid_controller of ros2_control: topics, types, fields, gains and limits."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+
+from rcl_interfaces.srv import ListParameters
+from std_msgs.msg import String
+
+from relay_autotune.errors import LoopError
+from relay_autotune.nodes.controller_manager import (
+    ControllerManager,
+    ManagedController,
+    interface_class,
+)
+from relay_autotune.nodes.loop_client import LoopClient
+
+PID_CONTROLLER = "pid_controller/PidController"
+STATE_TYPE = "control_msgs/msg/MultiDOFStateStamped"
+COMMAND_TYPE = "control_msgs/msg/MultiDOFCommand"
+GAINS = ("p", "i", "d")
+
+# For how long the controller's state is looked at, and how many messages are needed [s].
+_LOOK, _LEAST = 0.3, 5
+_DESCRIPTION_WITHIN = 2.0
+_LAWS = {
+    "back_calculation": "pid_controller",
+    "conditional_integration": "control_toolbox_conditional_integration",
+    "none": "control_toolbox_none",
+    "legacy": "control_toolbox_legacy",
+}
+# What is read of each degree of freedom, with the value that it has where it is not declared.
+_OPTIONAL: dict[str, Any] = {
+    "antiwindup_strategy": "legacy",
+    "tracking_time_constant": 0.0,
+    "save_i_term": False,
+    "feedforward_gain": 0.0,
+    "angle_wraparound": False,
+    "u_clamp_min": -math.inf,
+    "u_clamp_max": math.inf,
+}
+
+
+@dataclass(frozen=True)
+class DofState:
+    """What the controller last told of one degree of freedom.
+
+    :param reference: its set-point [y]; NaN: none was given.
+    :param feedback: its measurement [y].
+    :param output: its command [u].
+    """
+
+    reference: float
+    feedback: float
+    output: float
+
+
+@dataclass(frozen=True)
+class JointLoop:
+    """A joint, its controller, and what the controller computes from its gains.
+
+    :param controller: name of the controller.
+    :param node: full name of its node.
+    :param joint: name of the joint, as the controller's state and reference have it.
+    :param dof: its name in the parameter gains.
+    :param joints: all that the controller has, in its own order.
+    :param dofs: the names that these have in the command interfaces.
+    :param interface: the command interface, such as ``left_wheel/effort``.
+    :param measured: what is controlled, such as ``velocity``.
+    :param has_rate: True if the derivative comes from a second state interface.
+    :param period: of the controller's updates [s].
+    :param gains: p, i and d in force.
+    :param strategy: against windup.
+    :param tracking_time_constant: of that strategy [s]; 0: control_toolbox's own.
+    :param save_i_term: True if the integral outlives a deactivation.
+    :param feedforward: gain from the reference to the command; 0: none.
+    :param wraps: True if the error is wrapped to half a turn.
+    :param clamps: limits of the command [u].
+    :param is_chained: True if another controller writes its references.
+    :param states: of all joints, in the same order.
+    :param within: limits of the measurement in robot_description [y]; None: not told.
+    :param command_within: likewise of the command [u].
+    """
+
+    controller: str
+    node: str
+    joint: str
+    dof: str
+    joints: tuple[str, ...]
+    dofs: tuple[str, ...]
+    interface: str
+    measured: str
+    has_rate: bool
+    period: float
+    gains: tuple[float, float, float]
+    strategy: str
+    tracking_time_constant: float
+    save_i_term: bool
+    feedforward: float
+    wraps: bool
+    clamps: tuple[float, float]
+    is_chained: bool
+    states: tuple[DofState, ...]
+    within: tuple[float, float] | None
+    command_within: tuple[float, float] | None
+
+    @property
+    def state(self) -> DofState:
+        """That of the joint."""
+        return self.states[self.joints.index(self.joint)]
+
+    @property
+    def commanded(self) -> str:
+        """What is commanded, such as ``effort``."""
+        return self.interface.rpartition("/")[2]
+
+    @property
+    def law(self) -> str:
+        """The law that the gains are for."""
+        return _LAWS[self.strategy]
+
+    @property
+    def state_topic(self) -> str:
+        """Topic of the controller's state."""
+        return f"{self.node}/controller_state"
+
+    @property
+    def reference_topic(self) -> str:
+        """Topic of the controller's references."""
+        return f"{self.node}/reference"
+
+    @property
+    def state_field(self) -> str:
+        """The joint's state within a message of that topic."""
+        return f"dof_states[name={self.joint}]"
+
+    @property
+    def reference_field(self) -> str:
+        """The joint's reference within a message."""
+        return f"values[{self.joint}]"
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The controller's parameters that hold p, i and d."""
+        return tuple(f"gains.{self.dof}.{name}" for name in GAINS)
+
+    @property
+    def reference_alone(self) -> str:
+        """What stands beside the joint's reference: NaN leaves the others as they are.
+
+        With a second interface the joint's rate is 0, as it is at a constant reference.
+        """
+        return self._references([0.0 if each == self.joint else math.nan for each in self.joints])
+
+    @property
+    def references(self) -> str:
+        """The references of all joints, as they were; NaN leaves those that had none."""
+        return self._references([state.reference for state in self.states])
+
+    def _references(self, values: Sequence[float]) -> str:
+        rates = [0.0 if math.isfinite(v) and self.has_rate else math.nan for v in values]
+        told = (f"[{', '.join(map(_yaml, numbers))}]" for numbers in (values, rates))
+        names = json.dumps(list(self.joints))
+        return "{{dof_names: {}, values: {}, values_dot: {}}}".format(names, *told)
+
+
+def joint_loop(
+    client: LoopClient, manager: ControllerManager, controller: str, joint: str
+) -> JointLoop:
+    """Find the loop of a joint.
+
+    :param client: a node of the graph.
+    :param manager: the controller's manager.
+    :param controller: name of the controller.
+    :param joint: name of the joint.
+    :raises LoopError: with what to type, if it cannot be tuned.
+    """
+    loaded = manager.controllers()
+    found = next((each for each in loaded if each.name == controller), None)
+    if found is None:
+        there = ", ".join(f"{each.name} ({each.type_name})" for each in loaded) or "none"
+        raise LoopError(f"{manager.name} has no controller {controller}: found {there}")
+    if found.type_name != PID_CONTROLLER:
+        raise LoopError(
+            f"{controller} is a {found.type_name}, expected a {PID_CONTROLLER}: for another "
+            f"controller type tune_loop --measurement TOPIC --command TOPIC instead"
+        )
+    if not found.is_active:
+        typed = manager.command_for([controller], [])
+        raise LoopError(f"{controller} is {found.state}, expected active; type: {typed}")
+    node = manager.node_of(controller)
+    wide = client.values(
+        node,
+        (
+            "dof_names",
+            "reference_and_state_dof_names",
+            "command_interface",
+            "reference_and_state_interfaces",
+            "enable_feedforward",
+        ),
+    )
+    dofs = tuple(wide["dof_names"])
+    joints = tuple(wide["reference_and_state_dof_names"] or dofs)
+    if joint not in (*joints, *dofs):
+        raise LoopError(f"{controller} has no joint {joint}: expected one of {', '.join(joints)}")
+    place = joints.index(joint) if joint in joints else dofs.index(joint)
+    interface = f"{dofs[place]}/{wide['command_interface']}"
+    if interface not in manager.command_interfaces() and interface not in found.claims:
+        raise LoopError(
+            f"{manager.name} lists no command interface {interface}: type: ros2 control "
+            f"list_hardware_interfaces -c {manager.name}"
+        )
+    own = _of_dof(client, node, dofs[place])
+    states = _states(client, node, joints)
+    description = _description(client, manager.namespace)
+    measured = wide["reference_and_state_interfaces"][0]
+    return JointLoop(
+        controller,
+        node,
+        joints[place],
+        dofs[place],
+        joints,
+        dofs,
+        interface,
+        measured,
+        len(wide["reference_and_state_interfaces"]) > 1,
+        1.0 / _rate(client, manager, found),
+        (own["p"], own["i"], own["d"]),
+        own["antiwindup_strategy"],
+        own["tracking_time_constant"],
+        own["save_i_term"],
+        own["feedforward_gain"] if wide["enable_feedforward"] else 0.0,
+        own["angle_wraparound"],
+        (own["u_clamp_min"], own["u_clamp_max"]),
+        found.is_chained,
+        states,
+        limits_in(description, joints[place], measured),
+        limits_in(description, dofs[place], wide["command_interface"]),
+    )
+
+
+def _rate(client: LoopClient, manager: ControllerManager, found: ManagedController) -> float:
+    """Return the rate of a controller's updates [Hz]."""
+    return found.rate or float(client.values(manager.name, ["update_rate"])["update_rate"])
+
+
+def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:
+    """Return the parameters of a degree of freedom, without their prefix."""
+    prefix = f"gains.{dof}"
+    request = ListParameters.Request(prefixes=[prefix])
+    there = set(client.call(ListParameters, f"{node}/list_parameters", request).result.names)
+    names = [n for n in (*GAINS, *_OPTIONAL) if n in GAINS or f"{prefix}.{n}" in there]
+    values = client.values(node, [f"{prefix}.{name}" for name in names])
+    return _OPTIONAL | {name: values[f"{prefix}.{name}"] for name in names}
+
+
+def _states(client: LoopClient, node: str, joints: tuple[str, ...]) -> tuple[DofState, ...]:
+    """Return the state of all joints: the mean of some messages, and the newest reference."""
+    topic = f"{node}/controller_state"
+    kind = interface_class("control_msgs", "msg", "MultiDOFStateStamped")
+    came = client.heard(kind, topic, _LOOK, _LEAST)
+    if len(came) < _LEAST:
+        raise LoopError(
+            f"{topic} has told {len(came)} states within some seconds, expected one for each "
+            f"update; type: ros2 topic hz {topic}"
+        )
+    found = []
+    for joint in joints:
+        told = [dof for message in came for dof in message.dof_states if dof.name == joint]
+        if not told:
+            raise LoopError(f"{topic} does not tell the state of {joint}")
+        found.append(
+            DofState(
+                told[-1].reference,
+                sum(dof.feedback for dof in told) / len(told),
+                sum(dof.output for dof in told) / len(told),
+            )
+        )
+    return tuple(found)
+
+
+def _description(client: LoopClient, namespace: str) -> str:
+    """Return the robot's description; empty: none is published."""
+    for topic in dict.fromkeys((f"{namespace}/robot_description", "/robot_description")):
+        if client.has_publisher(topic):
+            found = client.latched(String, topic, lambda m: m.data, _DESCRIPTION_WITHIN)
+            if found is not None:
+                return str(found.data)
+    return ""
+
+
+def limits_in(description: str, joint: str, interface: str) -> tuple[float, float] | None:
+    """Return the limits of a joint's position, velocity or effort; None: not told.
+
+    :param description: the robot's description, URDF with or without a part of ros2_control.
+    :param joint: name of the joint.
+    :param interface: what is limited.
+    """
+    try:
+        root = ElementTree.fromstring(description) if description else None
+    except ElementTree.ParseError:
+        return None
+    if root is None:
+        return None
+    low, high = -math.inf, math.inf
+    for limit in root.iterfind(f"./joint[@name='{joint}']/limit"):
+        if interface == "position":
+            low, high = (_number(limit.get(name), 0.0) for name in ("lower", "upper"))
+        elif limit.get(interface):
+            high = abs(_number(limit.get(interface), math.inf))
+            low = -high
+    path = f"./ros2_control/joint[@name='{joint}']/command_interface[@name='{interface}']/param"
+    for parameter in root.iterfind(path):
+        value = _number(parameter.text, math.nan)
+        if parameter.get("name") == "min" and value > low:
+            low = value
+        if parameter.get("name") == "max" and value < high:
+            high = value
+    return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None
+
+
+def _yaml(value: float) -> str:
+    return repr(float(value)) if math.isfinite(value) else ".nan"
+
+
+def _number(text: str | None, otherwise: float) -> float:
+    try:
+        return float(text) if text is not None else otherwise
+    except ValueError:
+        return otherwise

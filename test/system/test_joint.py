@@ -1,0 +1,126 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""tune_loop on a joint under a stand-in for ros2_control: from two names to verified gains."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from loop_rig import LATCHED, Process, Rig
+from robot_interfaces import interfaces
+from std_msgs.msg import String
+
+ROBOT = Path(__file__).parents[1] / "support" / "robot.py"
+WORDS = (
+    "--controller", "wheel_controller", "--joint", "left_wheel", "--within", "0", "4", "--yes",
+    "--wait", "30",
+)  # fmt: skip
+GAINS = tuple(f"gains.left_wheel.{name}" for name in "pid")
+
+
+class Robot:
+    """A robot, and tune_loop beside it."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        rig.environment |= interfaces() | {"HOME": str(rig.folder)}
+        self.active = rig.listen("/active", String, LATCHED)
+        self.process = rig._begin("robot", [sys.executable, str(ROBOT)], None)
+        rig.until(lambda: self.active, "the robot")
+
+    def gains(self) -> list[float]:
+        return self.rig.values("wheel_controller", *GAINS)
+
+    def history(self) -> list[str]:
+        """Return who was active, from the start to now."""
+        return [message.data for message in self.active]
+
+    def order(self, trouble: str) -> None:
+        mouth = self.rig.node.create_publisher(String, "/trouble", LATCHED)
+        self.rig.until(mouth.get_subscription_count, "the robot")
+        mouth.publish(String(data=trouble))
+
+    def tune(self, *words: str) -> Process:
+        return self.rig.start_command("tune_loop", *WORDS, *words)
+
+
+@pytest.fixture
+def robot(rig: Rig) -> Robot:
+    return Robot(rig)
+
+
+def test_a_wheel_gets_verified_gains_while_its_controller_stays_active(robot: Robot) -> None:
+    before = robot.gains()
+    done = robot.tune()
+    assert done.wait(120.0) == 0, done.log
+    assert "passed: the loop does what the model predicts" in done.log
+    after = robot.gains()
+    assert after != before and after[0] > 0.5
+    assert robot.history() == ["wheel_controller"]
+
+
+def test_an_opened_joint_gets_verified_gains_and_its_controller_back(robot: Robot) -> None:
+    before = robot.gains()
+    done = robot.tune("--open")
+    assert done.wait(120.0) == 0, done.log
+    assert "passed: the loop does what the model predicts" in done.log
+    assert robot.gains() != before
+    assert robot.history() == ["wheel_controller", "forward_left", "wheel_controller"]
+
+
+def test_a_dry_run_switches_nothing_and_says_what_would_move(robot: Robot) -> None:
+    done = robot.tune("--open", "--dry-run")
+    assert done.wait(60.0) == 0, done.log
+    assert "wheel_controller off and forward_left on, in one strict request" in done.log
+    assert "right_wheel keeps its last command, with no controller meanwhile" in done.log
+    assert "switch_controllers --strict -c /controller_manager --activate" in done.log
+    assert robot.history() == ["wheel_controller"]
+
+
+def children_of(pid: int, name: str) -> int:
+    """Return the process of a node that a process has started."""
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        if name in Path(f"/proc/{child}/cmdline").read_text():
+            return int(child)
+    raise AssertionError(f"{name} does not run")
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "Ctrl-C",
+        *(
+            pytest.param(fault, marks=pytest.mark.nightly)
+            for fault in ("SIGTERM", "SIGHUP", "relay killed", "forwarding dies", "refused")
+        ),
+    ],
+)
+def test_whatever_ends_an_opened_tune_the_former_controller_is_active_again(
+    robot: Robot, what: str
+) -> None:
+    if what == "refused":
+        robot.order("refuse")
+    tune = robot.tune("--open")
+    if what != "refused":
+        robot.rig.until(lambda: "stepped to" in tune.log, "the kick", 120.0)
+        assert robot.history()[-1] == "forward_left"
+    if what == "relay killed":
+        os.kill(children_of(tune.pid, "relay_node"), signal.SIGKILL)
+    elif what == "forwarding dies":
+        robot.order("die forward_left")
+    elif what != "refused":
+        tune.signal(signal.SIGINT if what == "Ctrl-C" else getattr(signal, what))
+    assert tune.wait(60.0) != 0
+    robot.rig.until(lambda: robot.history()[-1] == "wheel_controller", "the controller")
+    said = {
+        "relay killed": "relay_node has gone",
+        "forwarding dies": "forward_left is inactive",
+        "refused": "refuses to switch controllers: the hardware does not allow that",
+    }.get(what, "cancelling")
+    assert said in tune.log
+    assert "gains then" in tune.log and "passed" not in tune.log
