@@ -47,8 +47,7 @@ from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
 from relay_autotune.nodes.results import ResultCheck
 from relay_autotune.nodes.silence import Repeater, require_own_time
-from relay_autotune.nodes.verifier import NotVerifiable, Verifiable, Verifier
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.nodes.verifier import NotVerifiable, Predictors, Verifiable, Verifier
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
@@ -84,8 +83,7 @@ class ControllerNode(ServedNode):
         # Why the waiting gains are doubtful; empty: they are trusted.
         self._doubt = ""
         self._applying = False
-        self._model: TransferFunction | None = None
-        self._model_doubt = ""
+        self._predictors = Predictors()
         self._limits = limits_from(values)
         self._range = range_from(values)
         self._pid = PidController(
@@ -361,7 +359,7 @@ class ControllerNode(ServedNode):
             return
         model = self._results.model(message)
         if model is not None:
-            self._model, self._model_doubt = model, why_doubtful(message)
+            self._predictors.know(message.experiment_id, model, why_doubtful(message))
             self._apply_by_itself()
 
     def _on_experiment(self, message: Any) -> None:
@@ -409,6 +407,7 @@ class ControllerNode(ServedNode):
             done = await self._keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
             return False, f"the gains of {name} are not in force: {error}"
+        self._predictors.applied(self._place.set_of(gains), name)
         # Newer gains may have arrived meanwhile.
         if self._pending is pending:
             self._pending = None
@@ -455,15 +454,7 @@ class ControllerNode(ServedNode):
         if self._held:
             raise NotVerifiable("a tune is running")
         self._verifier.require_samples()
-        if self._model is None:
-            raise NotVerifiable(
-                "no model has come, so the step cannot be predicted; run a tune first"
-            )
-        if self._model_doubt and not self.get_parameter("accept_doubtful").value:
-            raise NotVerifiable(
-                f"the model that would predict the step is {self._model_doubt}; set the parameter "
-                "accept_doubtful to true to step all the same"
-            )
+        self._predictors.require_any()
         if self._remote is None and self._untaken:
             raise NotVerifiable(f"nobody subscribes to {self._commands.topic_name}")
         if self._remote is not None:
@@ -473,7 +464,13 @@ class ControllerNode(ServedNode):
             kept = self._keeper.gains
         if kept is None or (self._remote is None and not self._pid.is_automatic):
             raise NotVerifiable("the controller is not in automatic, or has no gains")
-        return Verifiable(self._place.controller_of(kept), self._model, self._limits)
+        model, doubt = self._predictors.of(kept)
+        if doubt and not self.get_parameter("accept_doubtful").value:
+            raise NotVerifiable(
+                f"the model that would predict the step is {doubt}; set the parameter "
+                "accept_doubtful to true to step all the same"
+            )
+        return Verifiable(self._place.controller_of(kept), model, self._limits)
 
     async def _begin_verification(self) -> None:
         await self._keeper.begin_verification()

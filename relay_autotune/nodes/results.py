@@ -95,7 +95,7 @@ class ResultCheck:
         :param experiment: its record.
         """
         if experiment.experiment_id not in self._evidence:
-            _keep(self._evidence, experiment.experiment_id, ExperimentFacts.of(experiment))
+            keep(self._evidence, experiment.experiment_id, ExperimentFacts.of(experiment))
 
     def experiment(self, message: Any) -> None:
         """Remember the facts of an experiment's record, if the message holds a valid one.
@@ -121,7 +121,7 @@ class ResultCheck:
             self.refusals.say("the model", name, error)
             return None
         if message.final:
-            _keep(self._models, name, model)
+            keep(self._models, name, model)
         return model
 
     def gains(self, message: Any) -> Gains | None:
@@ -242,7 +242,8 @@ class OwnResults(ResultCheck):
         return None
 
 
-def _keep(known: dict[str, Any], name: str, value: Any) -> None:
+def keep(known: dict[Any, Any], name: Any, value: Any) -> None:
+    """Put a value last among a limited number of them; the oldest ones go."""
     known.pop(name, None)
     known[name] = value
     while len(known) > _MOST:

@@ -20,6 +20,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 
+from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
@@ -30,6 +31,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import conclude
 from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune.nodes.narrator import Narrator
+from relay_autotune.nodes.results import keep
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Verify
@@ -73,6 +75,60 @@ class Verifiable:
     gains: Controller
     model: TransferFunction
     limits: Limits
+
+
+class Predictors:
+    """The models that can predict a step, and the experiments of the gains that were applied.
+
+    Gains are proved on the model of their own experiment. Messages of several experiments may
+    arrive late and out of order, and a prediction by another one's model proves nothing.
+    """
+
+    def __init__(self) -> None:
+        # Model and doubt by experiment, the newest last.
+        self._models: dict[str, tuple[TransferFunction, str]] = {}
+        self._experiments: dict[GainSet, str] = {}
+
+    def know(self, experiment_id: str, model: TransferFunction, doubt: str) -> None:
+        """Remember a model.
+
+        :param experiment_id: its experiment; "": it was published without one.
+        :param model: the process.
+        :param doubt: why it is doubtful; "": it is trusted.
+        """
+        keep(self._models, experiment_id, (model, doubt))
+
+    def applied(self, gains: GainSet, experiment_id: str) -> None:
+        """Remember of which experiment gains are."""
+        keep(self._experiments, gains, experiment_id)
+
+    def require_any(self) -> None:
+        """Refuse a verification without any model.
+
+        :raises NotVerifiable: if no model has come.
+        """
+        if not self._models:
+            raise NotVerifiable(
+                "no model has come, so the step cannot be predicted; run a tune first"
+            )
+
+    def of(self, gains: GainSet) -> tuple[TransferFunction, str]:
+        """Return the model that predicts a step with some gains, and why it is doubtful.
+
+        Gains without a known experiment, such as those of the parameters, take the newest model.
+
+        :param gains: the gains in force.
+        :raises NotVerifiable: if there are only models of other experiments.
+        """
+        self.require_any()
+        name = next((n for known, n in self._experiments.items() if known.is_near(gains)), "")
+        newest = next(reversed(self._models))
+        if name not in self._models and name and newest:
+            raise NotVerifiable(
+                f"the gains are of the experiment {name}, and its model has not come; the newest "
+                f"one is of {newest}: try again when the model has come, or run a tune"
+            )
+        return self._models[name if name in self._models else newest]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,44 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which model predicts the step that proves gains."""
+
+from __future__ import annotations
+
+import pytest
+
+from relay_autotune.control.gains_history import GainSet
+from relay_autotune.nodes.verifier import NotVerifiable, Predictors
+from relay_autotune.process.transfer_function import TransferFunction
+
+GOOD, WILD, BY_HAND = (GainSet.of({"kc": kc, "ti": 0.3}) for kc in (0.5, 0.9, 0.7))
+TRUE, WRONG = (TransferFunction.fopdt(gain, 0.5, 0.2) for gain in (2.0, 0.7))
+
+
+def test_gains_are_proved_on_the_model_of_their_own_experiment() -> None:
+    models = Predictors()
+    with pytest.raises(NotVerifiable, match="no model has come"):
+        models.of(GOOD)
+    models.know("first", TRUE, "")
+    models.applied(GOOD, "first")
+    models.applied(WILD, "second")
+    # The model of the second is late: with that of the first, any gains do what is predicted.
+    with pytest.raises(NotVerifiable, match=r"of the experiment second.*newest one is of first"):
+        models.of(WILD)
+    models.know("second", WRONG, "doubtful")
+    assert models.of(WILD) == (WRONG, "doubtful")
+    assert models.of(GOOD) == (TRUE, "")
+    # A message that is repeated changes nothing.
+    models.know("first", TRUE, "")
+    assert models.of(WILD) == (WRONG, "doubtful")
+
+
+def test_gains_without_an_experiment_take_the_newest_model() -> None:
+    models = Predictors()
+    models.know("first", TRUE, "")
+    models.know("second", WRONG, "")
+    assert models.of(BY_HAND) == (WRONG, "")
+    # So do those of an experiment where the newest model names none.
+    models.know("", TRUE, "")
+    models.applied(GOOD, "third")
+    assert models.of(GOOD) == (TRUE, "")
