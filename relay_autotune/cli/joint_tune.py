@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.apply_gains import apply_at
+from relay_autotune.cli.arguments import say
 from relay_autotune.cli.asking import asked, number_of, pair_of
 from relay_autotune.cli.export import Target
 from relay_autotune.cli.layout import width
@@ -337,15 +338,16 @@ class JointTune:
     def _range(self) -> list[float] | None:
         """Return the limits of the command, asked for where the amplitude is found by them."""
         loop, options = self._loop, self._options
-        given = options.command_within
-        if given is None and all(map(math.isfinite, loop.clamps)):
-            given = list(loop.clamps)
-        if given is None and loop.command_within is not None:
-            given = list(loop.command_within)
-        if given is None and not options.amplitude:
-            what = f"lowest and highest {loop.commanded} of {loop.joint} [u]"
-            given = asked(what, "--command-within", "", "-2 2", pair_of)
-        return given
+        if options.command_within is not None:
+            return list(options.command_within)
+        told = [loop.clamps, loop.command_within or (-math.inf, math.inf)]
+        found = [max(low for low, _ in told), min(high for _, high in told)]
+        if all(map(math.isfinite, found)):
+            return found
+        if options.amplitude:
+            return None
+        what = f"lowest and highest {loop.commanded} of {loop.joint} [u]"
+        return list(asked(what, "--command-within", "", "-2 2", pair_of))
 
     def _commands_beside(self, forward: ManagedController) -> list[float]:
         """Return what each interface of the forwarding controller is told; NaN: the joint."""
@@ -390,7 +392,7 @@ class JointTune:
         from relay_autotune.nodes.live_types import message_class
 
         kind = message_class(_JOINT_STATE, "measurement_type")
-        for message in self._client.heard(kind, _JOINT_STATES, 0.0):
+        for message in self._client.heard(kind, _JOINT_STATES, 0.0, 1):
             if joint in message.name:
                 return float(message.position[list(message.name).index(joint)])
         return math.nan
@@ -410,19 +412,25 @@ class JointTune:
             with Opened(self._manager, self._forward.name, self._former):
                 yield self._manager.still_active(self._forward.name)
         finally:
-            self._give_references_back()
+            if why := self._why_no_references():
+                say("tune_loop", why)
 
-    def _give_references_back(self) -> None:
-        """Publish the references of before, which the controller forgets when it is switched."""
+    def _why_no_references(self) -> str:
+        """Publish the references of before, which the controller forgets when it is switched.
+
+        :return: why it does not have them; empty: it has, or it cannot.
+        """
         from relay_autotune.nodes.command_message import CommandMessage
         from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE
         from relay_autotune.nodes.live_types import message_class
 
         loop = self._loop
+        active = False
         with suppress(LoopError):
-            listed = {each.name: each for each in self._manager.controllers()}
-            if loop.is_chained or not listed[loop.controller].is_active:
-                return
+            listed = self._manager.controllers()
+            active = any(each.name == loop.controller and each.is_active for each in listed)
+        if loop.is_chained or not active:
+            return ""
         reference = loop.state.reference
         commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
         states = message_class(STATE_TYPE, "measurement_type")
@@ -434,10 +442,11 @@ class JointTune:
         if math.isfinite(reference) and not self._client.publish(
             commands.written(reference), loop.reference_topic, states, loop.state_topic, is_back
         ):
-            raise LoopError(
+            return (
                 f"{loop.controller} is active again, but does not take its former reference "
                 f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}"
             )
+        return ""
 
     # The gains.
 

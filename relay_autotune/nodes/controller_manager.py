@@ -20,7 +20,7 @@ from relay_autotune.nodes.loop_client import LoopClient
 _SWITCH_WITHIN = 5
 _BACK_WITHIN = 15.0
 # Interval of the looks at the controllers while a joint is tuned [s].
-_LOOK_EVERY = 1.0
+_LOOK_EVERY, _LOST_AFTER = 1.0, 5.0
 # Pause after a switch back that failed [s].
 _AGAIN = 0.2
 _ACTIVE, _INACTIVE = "active", "inactive"
@@ -200,7 +200,8 @@ class StillActive:
             state = states.get(self._name, "not loaded")
             if state != _ACTIVE:
                 return f"{self._name} is {state}: its manager has ended it, and its log says why"
-        if time.monotonic() >= self._next:
+        # An answer that does not come is not waited for.
+        if time.monotonic() >= self._next + (_LOST_AFTER if self._answer is not None else 0.0):
             self._next = time.monotonic() + _LOOK_EVERY
             self._answer = self._client.begin(self._kind, self._service, self._kind.Request())
         return ""

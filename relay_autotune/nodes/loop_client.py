@@ -162,20 +162,19 @@ class LoopClient:
         """
         self._wait(lambda: False, time.monotonic() + seconds)
 
-    def heard(self, kind: Any, topic: str, seconds: float, least: int = 1) -> list[Any]:
+    def heard(self, kind: Any, topic: str, seconds: float, least: int = 0) -> list[Any]:
         """Return the messages of a topic that come within a time.
 
         :param kind: the message class.
         :param topic: its full name.
-        :param seconds: the time, from the first message on [s].
-        :param least: how many are waited for, at most `ANSWER_WITHIN`.
+        :param seconds: the time [s].
+        :param least: how many are waited for before it, for `ANSWER_WITHIN` at most.
         """
         came: list[Any] = []
         # Best effort, so that nobody waits for this client.
         ear = self._node.create_subscription(kind, topic, came.append, qos_profile_sensor_data)
         self._wait(lambda: len(came) >= least, time.monotonic() + ANSWER_WITHIN)
-        if came:
-            self.rest(seconds)
+        self.rest(seconds)
         self._node.destroy_subscription(ear)
         return came
 
@@ -309,14 +308,9 @@ class LoopClient:
         if not self._node.count_publishers(name):
             return math.nan
         heard: list[float] = []
-
-        def hear(message: Any) -> None:
+        for message in self.heard(commands.kind, name, _LISTEN):
             with suppress(FieldError):
                 heard.append(commands.value(message))
-
-        ear = self._node.create_subscription(commands.kind, name, hear, qos_profile_sensor_data)
-        self.rest(_LISTEN)
-        self._node.destroy_subscription(ear)
         return sum(heard) / len(heard) if heard else math.nan
 
     def _is_here(self, name: str) -> bool:

@@ -124,3 +124,13 @@ def test_whatever_ends_an_opened_tune_the_former_controller_is_active_again(
     }.get(what, "cancelling")
     assert said in tune.log
     assert "gains then" in tune.log and "passed" not in tune.log
+
+
+@pytest.mark.nightly
+def test_a_controller_that_dies_during_its_tune_is_told_and_left_as_it_is(robot: Robot) -> None:
+    tune = robot.tune()
+    robot.rig.until(lambda: "stepped to" in tune.log, "the step", 120.0)
+    robot.order("die wheel_controller")
+    assert tune.wait(60.0) == 1
+    assert "wheel_controller is inactive: its manager has ended it" in tune.log
+    assert robot.history() == ["wheel_controller", ""]
