@@ -38,7 +38,8 @@ GROUPS = {
             "bag_reading",
             "joint_reading",
         ),
-        *("fleet_time", "lockstep", "latency", "endurance", "back_to_back", "page_latency"),
+        *("fleet_time", "lockstep", "latency", "joint_tune", "endurance", "back_to_back"),
+        "page_latency",
     ),
     "papers": ("chang_studies", "thyagarajan_studies", "paper_designs"),
     "faults": (

@@ -50,6 +50,7 @@ QUICK = {
     "design_time": ("--quick",),
     "bag_reading": ("--quick",),
     "joint_reading": ("--quick",),
+    "joint_tune": ("--quick",),
     "fuzz_bags": ("--quick",),
     "fleet_time": ("--quick",),
     "paper_designs": ("--quick",),
