@@ -125,15 +125,16 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
 
     :param gains: what they are for.
     :param law: the law.
-    :param target: with clamps of the command, which such a file has no place for.
-    :raises SelectionError: if there are clamps.
+    :param target: with the clamps of the command, which become a remark.
     """
-    if math.isfinite(target.command_min) or math.isfinite(target.command_max):
-        raise SelectionError(
-            f"a file for {law.name} has no place for clamps of the command: set its own limits "
-            "there, and leave out --command-min and --command-max"
-        )
-    told = (f"For {law.program}.", f"Command: {law.command}. At its limit: {law.limits}.")
+    limits = (target.command_min, target.command_max)
+    low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
+    set_there = f"; set them to {low} and {high}" if any(map(math.isfinite, limits)) else ""
+    told = (
+        f"For {law.program}.",
+        f"Command: {law.command}.",
+        f"Limits of the command are set in the program{set_there}. At them: {law.limits}.",
+    )
     lines = _comments(gains, told, law.remark)
     lines += [law.line.format(name=name, value=value) for name, value in _values(gains, law)]
     return "\n".join(lines) + "\n"

@@ -142,7 +142,7 @@ class Recordings:
         if recording is None or recording.timer is None:
             return
         if not working:
-            recording.reason = lacking
+            recording.reason = lacking or recording.reason
             period = min(recording.timer.timer_period_ns, round(ON_THE_WAY * 1e9))
             recording.timer.timer_period_ns = period
             recording.timer.reset()

@@ -67,7 +67,7 @@ from relay_autotune.nodes.reports import (
     losses,
     state_values,
 )
-from relay_autotune.nodes.results import OwnResults
+from relay_autotune.nodes.results import MODEL, OwnResults
 from relay_autotune.nodes.session import Session
 from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint, reported_by
 from relay_autotune.nodes.signs_of_life import said_by
@@ -438,6 +438,9 @@ class RelayNode(ServedNode):
         for topic, found in taken:
             self._action.note(topic, found)
             self._recordings.message(found.experiment_id, topic, now, found)
+        if name == MODEL and message.final and not taken:
+            # Gains without a model are no result: waiting longer brings nothing.
+            self._recordings.told(message.experiment_id, False, self._results.refusals.last)
         if running is None or not taken:
             return
         self._tell(running.experiment.status)

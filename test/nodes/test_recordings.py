@@ -52,11 +52,15 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
                 recordings.message(experiment, name, 2, kind(final=True))
         closed: list[str] = []
         recordings.close_with_results(experiment, 0.05, closed.append)
+        # The identifier has sent all, of which the model was refused.
+        recordings.told(experiment, False, "the model was refused")
+        recordings.told(experiment, False, "")
         for _ in range(PATIENCE):
             if closed:
                 break
             executor.spin_once(timeout_sec=0.02)
         assert ("no transfer_function and no pi_gains" in closed[0]) is not complete
+        assert ("the model was refused" in closed[0]) is not complete
         recordings.close_all("", 10.0)
         assert recordings.problem() == ""
     executor.shutdown()
