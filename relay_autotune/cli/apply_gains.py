@@ -6,8 +6,8 @@
 The gains are those of the last tune, and go to the loop's controller_node; with --file they are
 written instead, for ros2_controllers' pid_controller or the law that they are for. Nothing is
 changed before you answer yes, or give --yes. The height of the step is --step, else verify_step
-of the node, else half of the swing that the tune made. If the step fails, the node takes the gains
-before back by itself.
+of the node, else half of the swing that the tune made and at least twenty times the noise, as far
+as the limits of the node allow. If the step fails, the node takes the gains before back by itself.
 
 Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
 command line is wrong.
@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
-from relay_autotune.cli.asking import agrees
+from relay_autotune.cli.asking import agreed_step, agrees
 from relay_autotune.cli.layout import Help, in_columns, labelled, width
 from relay_autotune.cli.progress import StatusLine, Working
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
@@ -179,7 +179,12 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model)))
     step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
-    if not agrees(_question(options, step), yes=options.yes):
+    question = _question(options, step)
+    if step and not options.yes:
+        agreed = bool(step := agreed_step(question, step))
+    else:
+        agreed = agrees(question, yes=options.yes)
+    if not agreed:
         say(PROGRAM, "nothing was changed")
         return NOTHING_FOUND
     if options.accept_doubtful:
@@ -263,7 +268,25 @@ def verdict_lines(
     :param columns: that a line may have.
     :param stays: True if the controller_node goes on running.
     """
+    now = "none, the command is held"
+    if present is not None:
+        now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
+    after = f"; {PROGRAM} --revert takes those before" if result.passed and stays else ""
+    return found_lines(result, columns) + labelled("gains in force", f"{now}{after}", columns)
+
+
+def found_lines(result: Any, columns: int) -> list[str]:
+    """Return verdict, response to each step and process of a verification.
+
+    :param result: the `Verify.Result`.
+    :param columns: that a line may have.
+    """
+    from relay_autotune.control.verification import NARROWLY
+
     told = "passed: the loop does what the model predicts" if result.passed else result.reason
+    reasons = [step.reason.partition("; ")[0] for step in result.steps]
+    if narrow := [r.removeprefix(NARROWLY) for r in reasons if r.startswith(NARROWLY)]:
+        told = f"passed, {NARROWLY}{'; '.join(narrow)}" if result.passed else told
     lines = labelled("verdict", told, columns)
     for step in result.steps:
         setpoint = step.kind == step.SETPOINT
@@ -282,11 +305,7 @@ def verdict_lines(
         predicted = result.steps[0].ms_predicted
         told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
         lines += labelled("process", told, columns)
-    now = "none, the command is held"
-    if present is not None:
-        now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
-    after = f"; {PROGRAM} --revert takes those before" if result.passed and stays else ""
-    return lines + labelled("gains in force", f"{now}{after}", columns)
+    return lines
 
 
 if __name__ == "__main__":

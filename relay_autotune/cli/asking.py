@@ -38,6 +38,29 @@ def agrees(question: str, *, yes: bool) -> bool:
     return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
 
 
+def agreed_step(
+    question: str, step: float, low: float = -math.inf, high: float = math.inf
+) -> float:
+    """Ask whether to make a step; return its height, 0 for none.
+
+    :param question: with its question mark.
+    :param step: the height that yes takes [y].
+    :param low: lowest height that may be typed in its place [y].
+    :param high: highest one [y].
+    :raises LoopError: if nobody can be asked.
+    """
+    _require_somebody("--yes")
+    while True:
+        answer = _input(f"\n{question} [y/N, or another step, such as {0.5 * step:.2g}] ").lower()
+        if answer in ("", "n", "no", "y", "yes"):
+            return step if answer.startswith("y") else 0.0
+        other = number_of(answer)
+        if other and low <= other <= high:
+            return other
+        told = f"from {low:g} to {high:g}" if math.isfinite(high - low) else "other than 0"
+        print(f"expected y, n, or the height of the step, {told}", file=sys.stderr)
+
+
 def asked(what: str, flag: str, known: str, example: str, read: Callable[[str], Any]) -> Any:
     """Ask for a value until it can be read.
 

@@ -33,7 +33,7 @@ _JOINT_STATE = "sensor_msgs/msg/JointState"
 _FLOATS = "std_msgs/msg/Float64MultiArray"
 # Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
 _OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
-_OF_TOPICS = ("command", "command_field", "command_period")
+_OF_TOPICS = ("command", "command_field", "command_period", "verify", "step")
 
 
 def add_joint(parser: argparse.ArgumentParser) -> None:

@@ -78,7 +78,20 @@ def add_new_loop(parser: argparse.ArgumentParser) -> None:
         "--command-within", type=finite, nargs=2, metavar=("LOW", "HIGH"),
         help="no command beyond these is sent [u]",
     )  # fmt: skip
-    group.add_argument("--yes", action="store_true", help="do not ask, for scripts")
+    group.add_argument(
+        "--verify", action=argparse.BooleanOptionalAction,
+        help="prove the gains with a step of the set-point, by a controller_node of its own; "
+        "without either flag it asks, with --yes it does not",
+    )  # fmt: skip
+    group.add_argument(
+        "--step", type=finite, metavar="Y",
+        help="height of that step [y]; default: half of the swing of the tune, at least twenty "
+        "times the noise, as far as --within and --command-within allow",
+    )  # fmt: skip
+    group.add_argument(
+        "--yes", action="store_true",
+        help="do not ask, for scripts; gains are then proven with --verify alone",
+    )  # fmt: skip
     group.add_argument(
         "--export", metavar="FILE", help="write the gains for ros2_controllers' pid_controller"
     )
@@ -94,7 +107,7 @@ def is_new_loop(options: argparse.Namespace) -> bool:
         return True
     for flag in (
         "measurement", "command", "command_field", "command_message", "command_period", "at",
-        "within", "command_within", "export",
+        "within", "command_within", "verify", "step", "export",
     ):  # fmt: skip
         if getattr(options, flag) is not None:
             raise SelectionError(
@@ -120,6 +133,8 @@ def own_namespace(options: argparse.Namespace) -> str:
 def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     """Look at the loop, ask for what is not given, and return the nodes to start.
 
+    The answers become options.
+
     :param client: a node of the graph.
     :param options: with the flags of `add_new_loop`.
     :raises LoopError: if a topic is not there, or something is not known and nobody can be asked.
@@ -136,21 +151,21 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
             raise SelectionError(_as_flags(str(error))) from None
         client.require_uncontrolled()
     told = "" if math.isnan(present) else f"{present:.6g}"
-    at = options.at
-    if at is None:
+    if options.at is None:
         what = "present command, at which the process rests [u]"
-        at = asked(what, "--at", told, told or "2.5", number_of)
+        options.at = asked(what, "--at", told, told or "2.5", number_of)
     what = "lowest and highest measurement that the process may see [y]"
-    within = options.within or asked(what, "--within", "", "30 50", pair_of)
-    command_within = options.command_within
-    if command_within is None and not options.amplitude:
+    options.within = options.within or asked(what, "--within", "", "30 50", pair_of)
+    if options.command_within is None and not options.amplitude:
         # The amplitude is found between these.
         what = "lowest and highest command of the actuator [u]"
-        command_within = asked(what, "--command-within", "", "0 5", pair_of)
+        options.command_within = asked(what, "--command-within", "", "0 5", pair_of)
     values: dict[str, Any] = {
-        "baseline": at,
-        "measurement_min": within[0],
-        "measurement_max": within[1],
+        "baseline": options.at,
+        # Also where a controller_node in front of it has ended.
+        "safe_command": options.at,
+        "measurement_min": options.within[0],
+        "measurement_max": options.within[1],
         "measurement_type": kind,
         "measurement_field": options.field,
         "command_type": command_kind,
@@ -162,8 +177,9 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         values["command_message"] = json.dumps(others)
     if options.command_period is not None:
         values["command_period"] = options.command_period
-    if command_within is not None:
-        values |= {"command_min": command_within[0], "command_max": command_within[1]}
+    if options.command_within is not None:
+        low, high = options.command_within
+        values |= {"command_min": low, "command_max": high}
     space = own_namespace(options)
     topics = {"measurement": options.measurement, "command": options.command}
     nodes = {"relay_node": ros_arguments(space, topics, values)}

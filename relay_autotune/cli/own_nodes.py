@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import TracebackType
 
 from relay_autotune.cli.progress import Working
@@ -62,6 +62,14 @@ class OwnNodes:
             preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
         )
 
+    def end(self, name: str) -> None:
+        """End one node before the others, if it was started.
+
+        :param name: of its executable.
+        """
+        if (process := self._running.pop(name, None)) is not None:
+            _end([process])
+
     def require_alive(self) -> None:
         """Refuse to go on without a node.
 
@@ -80,13 +88,17 @@ class OwnNodes:
         trace: TracebackType | None,
     ) -> None:
         with Working("ending the nodes"):
-            for process in self._running.values():
-                process.terminate()
-            deadline = time.monotonic() + _END_WITHIN
-            for process in self._running.values():
-                try:
-                    process.wait(max(deadline - time.monotonic(), 0.0))
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            _end(self._running.values())
         self._log.close()
+
+
+def _end(processes: Collection[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        process.terminate()
+    deadline = time.monotonic() + _END_WITHIN
+    for process in processes:
+        try:
+            process.wait(max(deadline - time.monotonic(), 0.0))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

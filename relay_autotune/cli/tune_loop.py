@@ -10,7 +10,7 @@ for each cycle goes to standard error. The result goes to standard output.
 
 Exit status: 0 the tune completed, with gains (of a dry run: it could start); 1 it did not, or no
 node is there to do it, or the report was not written; 2 the command line is wrong; 3 the gains are
-doubtful.
+doubtful. With --verify it is 1, too, where the gains did not pass.
 """
 
 from __future__ import annotations
@@ -25,15 +25,22 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from functools import partial
 from typing import TYPE_CHECKING, Any, TextIO
 
-from relay_autotune.cli.apply_gains import apply_at
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.arguments import (
+    DONE,
+    DOUBTFUL,
+    NOTHING_FOUND,
+    USAGE,
+    as_typed,
+    finite,
+    guarded,
+    say,
+)
 from relay_autotune.cli.asking import agrees, asked_for_file
-from relay_autotune.cli.export import Target, exported, exports_of, write
+from relay_autotune.cli.export import EXPORTS, Target, exported, exports_of, write
 from relay_autotune.cli.joint_tune import JointTune, add_joint, is_of_joint
-from relay_autotune.cli.layout import Help, width
+from relay_autotune.cli.layout import Help, labelled, width
 from relay_autotune.cli.new_loop import (
     START_WITHIN,
     add_new_loop,
@@ -60,6 +67,7 @@ from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
+    from relay_autotune.cli.own_nodes import OwnNodes
     from relay_autotune.nodes.tune_client import TuneClient
 
 PROGRAM = "tune_loop"
@@ -84,6 +92,11 @@ def main(args: Sequence[str] | None = None) -> int:
         parser.error(
             "--web has check, result, report and exports on its page: leave out --dry-run, "
             "--json, --report and --export"
+        )
+    if options.verify and (options.web or options.json or options.record_only or options.dry_run):
+        parser.error(
+            "--verify proves the gains of a tune that prints them: leave out --web, --json, "
+            "--record-only and --dry-run"
         )
     options.typed = given
     if (options.measurement and options.command) or options.joint:
@@ -171,7 +184,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         return USAGE
     with ExitStack() as stack:
         stack.enter_context(client)
-        patience, joint = options.wait, None
+        patience, joint, nodes = options.wait, None, None
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -181,7 +194,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         deadline = time.monotonic() + patience
 
         def leave() -> bool:
-            if new:
+            if nodes is not None:
                 nodes.require_alive()
             return bool(interrupted)
 
@@ -229,10 +242,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
-            apply = None
-            if joint and joint.applies:
-                apply = partial(joint.apply, nodes)
-            return _conclude(client, options, joint.target if joint else Target(), apply)
+            return _conclude(client, options, nodes, joint)
         except OSError:
             # The terminal is closed.
             if signal.SIGHUP in interrupted:
@@ -303,15 +313,15 @@ def _follow(
 def _conclude(
     client: TuneClient,
     options: argparse.Namespace,
-    target: Target,
-    apply: Callable[[str], int] | None,
+    nodes: OwnNodes | None,
+    joint: JointTune | None,
 ) -> int:
     """Show the result, and hand the gains over; return the exit status.
 
     :param client: with the result.
     :param options: of the command line.
-    :param target: where exported gains go.
-    :param apply: offers the gains to a joint's controller; None: there is none.
+    :param nodes: of this command; None: they were there.
+    :param joint: to whose controller the gains go; None: it is a loop of two topics.
     """
     result, cancelled = client.result, client.cancelled
     for refused in sorted(client.refused):
@@ -320,56 +330,81 @@ def _conclude(
         return _nothing_started(client, options)
     if not options.json:
         paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-        print("\n".join(result_lines(result, cancelled, paint, width())), flush=True)
+        new = nodes is not None and joint is None
+        safe = f" {options.at:.6g} u" if new else ""
+        print("\n".join(result_lines(result, cancelled, paint, width(), safe)), flush=True)
     flags, report = _afterwards(client, options)
     # Gains of nodes that end with this command cannot be asked for later.
-    new = bool(options.joint) or is_new_loop(options)
-    controllers = [] if new else client.controllers()
-    in_force = True
+    controllers = client.controllers() if nodes is None else []
+    proven = None
     if options.json:
         print(json.dumps(document(result, client.name, cancelled, report)))
     else:
-        if new and result.gains.experiment_id:
-            in_force = _hand_over(client, options, target, apply)
+        if nodes is not None and result.gains.experiment_id:
+            proven = _hand_over(client, options, nodes, joint)
         steps = next_commands(result, controllers, _prefix(), flags, report)
+        steps += _repeated(result, options, proven)
         if steps:
             print("\nNext:")
         for what, command in steps:
             print(f"  {what:<26} {command}")
     complete = result.gains.experiment_id or options.record_only
     written = report or not options.report
-    if not (client.succeeded and complete and written and in_force):
+    if not (client.succeeded and complete and written) or proven is False:
         return NOTHING_FOUND
     return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
 
 
 def _hand_over(
-    client: TuneClient,
-    options: argparse.Namespace,
-    target: Target,
-    apply: Callable[[str], int] | None,
-) -> bool:
-    """Offer to apply and verify the gains, and write them for another controller.
+    client: TuneClient, options: argparse.Namespace, nodes: OwnNodes, joint: JointTune | None
+) -> bool | None:
+    """Offer to apply or to prove the gains, and to write them for another controller.
 
-    :return: False if they were to be in force with the controller of a joint, and are not.
+    :return: whether they passed, or are in force with a joint; None: that was not wanted.
     """
-    result, file = client.result, options.export
+    result, proven = client.result, None
     doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
-    how = exports_of(result.gains.law)[0]
-    if not (options.yes or options.joint):
-        there = client.controllers() if sys.stdin.isatty() else []
-        for name in there:
-            print()
-            apply_at(name, doubtful=bool(doubt))
-        file = file or ("" if there else asked_for_file(f"\nWrite the gains for {how}"))
+    if joint is None:
+        # Imported here, because it loads slowly and must not delay a tune.
+        from relay_autotune.cli.proof import prove
+
+        proven = prove(client, nodes, options)
+    how, file = exports_of(result.gains.law)[0], options.export
+    if not (file or joint or options.yes) and sys.stdin.isatty():
+        others = ", ".join(name for name in EXPORTS if name != how)
+        told = f"for another program: {_prefix()}replay BAG --export NAME, with NAME {others}"
+        print("\n" + "\n".join(labelled("gains", told, width())))
+        file = asked_for_file(f"Write the gains for {how} of ros2_controllers")
     if file:
-        gains = gains_from_message(result.gains)
-        write(exported(gains, how, target, doubt=doubt), file)
+        target = joint.target if joint else Target()
+        write(exported(gains_from_message(result.gains), how, target, doubt=doubt), file)
         print(f"  {'gains for':<16} {how}: {file}")
-    if apply is None:
-        return True
-    print()
-    return apply(doubt) == DONE
+    if joint is not None and joint.applies:
+        print()
+        return joint.apply(nodes, doubt) == DONE
+    return proven
+
+
+def _repeated(
+    result: Any, options: argparse.Namespace, proven: bool | None
+) -> list[tuple[str, str]]:
+    """Return the commands that repeat the tune, with its answers as flags, or prove its gains."""
+    words = options.typed
+    new = not options.joint and is_new_loop(options)
+    if new:
+        words = shlex.split(as_typed(PROGRAM, _parser(), options, verify=None))[1:]
+    again = _prefix() + shlex.join([PROGRAM, *words])
+    if result.gains.experiment_id:
+        # Nodes that end with this command cannot prove them later.
+        return [("prove the gains", f"{again} --verify")] if new and proven is None else []
+    if result.outcome == result.COMPLETED:
+        return []
+    steps = [("run it again", again)]
+    if result.reason.startswith("no measurement on "):
+        topic = result.reason.split()[3]
+        told = f"look at the sensor (ros2 topic hz {topic}) and the load of the machine (uptime)"
+        steps.append(("if it happens again", told))
+    return steps
 
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:

@@ -158,13 +158,16 @@ def check_lines(checks: Sequence[str], width: int) -> list[str]:
     ]
 
 
-def result_lines(result: Any, cancelled: bool, paint: Paint, columns: int = WIDEST) -> list[str]:
+def result_lines(
+    result: Any, cancelled: bool, paint: Paint, columns: int = WIDEST, safe: str = ""
+) -> list[str]:
     """Return the result of a tune.
 
     :param result: a `Tune.Result` with an experiment.
     :param cancelled: True if this command cancelled it.
     :param paint: the look of text.
     :param columns: that a line may have.
+    :param safe: the safe command, where it is known.
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
@@ -173,7 +176,7 @@ def result_lines(result: Any, cancelled: bool, paint: Paint, columns: int = WIDE
     first, *rest = labelled("tune", told, columns)
     lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]
     if outcome != "completed":
-        left = "the plant is left at the safe command; no gains are given"
+        left = f"the plant is left at the safe command{safe}; no gains are given"
         lines += labelled("", left, columns)
     if result.transfer_function.experiment_id:
         lines += ["", *model_lines(result.transfer_function, paint, columns)]

@@ -17,7 +17,7 @@ from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_pea
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import FloatArray
+from relay_autotune.record.record import FloatArray, Record
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05
@@ -36,6 +36,18 @@ MS_RATIO = 1.3
 _NOISE = 3.0
 # A deviation this many times the largest predicted one ends the step at once.
 RUNAWAY = 3.0
+
+# A comparison that takes more than this part of its tolerance passes narrowly.
+_NARROW = 0.75
+NARROWLY = "narrowly: "
+
+# The step that proves most: multiples of the tune's swing and of the noise, whichever is larger.
+_OF_SWING = 0.5
+_OF_NOISE = 20.0
+# With a step of fewer standard deviations of the noise, the comparison is loose.
+LEAST_OF_NOISE = 10.0
+# Part of the way to a limit that a step may go, for its overshoot.
+_OF_ROOM = 0.8
 
 _GAIN_SEARCH = (0.3, 3.0)
 _PREDICTED_SAMPLES = 4000
@@ -111,6 +123,36 @@ class Plan:
     step: Step
     duration: float
     runaway: float
+
+
+def proving_step(
+    record: Record, model: TransferFunction, measurement: Limits, command: Limits
+) -> float:
+    """Return the step of the set-point that proves gains best [y], in two digits; 0: not known.
+
+    It is half of the swing that the tune made, at least twenty times the noise, upward if the
+    limits allow. The process then rests at most at 0.8 of the way to a limit.
+
+    :param record: of the tune, about whose set-point and mean command the loop rests.
+    :param model: the process.
+    :param measurement: its range [y].
+    :param command: its range [u].
+    """
+    if record.settings is None or len(record.cycle_start) < 2:
+        return 0.0
+    first, stop = record.cycle_start[-2:]
+    swing = 0.5 * float(np.ptp(record.measurement[first : stop + 1]))
+    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
+    wanted = max(_OF_SWING * swing, _OF_NOISE * noise)
+    setpoint = record.settings.setpoint
+    baseline = float(np.mean(record.command[first:stop]))
+    up, down = measurement.high - setpoint, setpoint - measurement.low
+    if model.integrators == 0:
+        ends = sorted(model.gain * (end - baseline) for end in (command.low, command.high))
+        up, down = min(up, ends[1]), min(down, -ends[0])
+    sign = 1.0 if _OF_ROOM * up >= wanted or up >= down else -1.0
+    room = max(_OF_ROOM * (up if sign > 0.0 else down), 0.0)
+    return sign * float(f"{min(wanted, room):.2g}")
 
 
 def plan(
@@ -219,7 +261,12 @@ def compare(
     measured = describe(time, deviation, step, noise_std)
     expected = describe(time, predicted, step)
     ms, ms_predicted = _ms(gains, scaled(model, ratio)), _ms(gains, model)
-    problems = _problems(measured, expected, ratio, ms, ms_predicted, time)
+    compared = _comparisons(measured, expected, ratio, ms, ms_predicted, time)
+    # Written so that NaN does not pass.
+    told = problems = [c.problem for c in compared if not c.taken <= 1.0]
+    narrow = [c.numbers for c in compared if c.taken > _NARROW]
+    if narrow and not problems:
+        told = [NARROWLY + ", ".join(narrow)]
     numbers = (
         f"overshoot {measured.overshoot:.0%} (predicted {expected.overshoot:.0%}), "
         f"settling {measured.settling_time:.3g} s ({expected.settling_time:.3g} s), "
@@ -229,7 +276,7 @@ def compare(
     return Comparison(
         step=step,
         passed=not problems,
-        reason="; ".join((*problems, numbers)),
+        reason="; ".join((*told, numbers)),
         measured=measured,
         expected=expected,
         predicted=predicted,
@@ -247,26 +294,63 @@ def _ms(gains: Controller, model: TransferFunction) -> float:
     return sensitivity_peaks(loop, frequencies(loop))[0]
 
 
-def _problems(
+@dataclass(frozen=True)
+class _Compared:
+    """A comparison with the prediction.
+
+    :param taken: part of its tolerance that was needed; above 1 it fails.
+    :param problem: what is wrong then.
+    :param numbers: what was measured, and what passes.
+    """
+
+    taken: float
+    problem: str
+    numbers: str
+
+
+def _comparisons(
     measured: Response,
     expected: Response,
     ratio: float,
     ms: float,
     ms_predicted: float,
     time: FloatArray,
-) -> list[str]:
-    interval = float(np.median(np.diff(time)))
-    problems = []
-    if measured.overshoot > expected.overshoot + OVERSHOOT_MARGIN:
-        problems.append("the overshoot is larger than predicted")
-    if measured.settling_time > SETTLING_RATIO * expected.settling_time + 2.0 * interval or (
-        measured.settling_time >= float(time[-1] - time[0])
-    ):
-        problems.append("it settles later than predicted, or not at all")
-    if measured.iae > IAE_RATIO * expected.iae:
-        problems.append("the error lasts longer than predicted")
-    if not GAIN_RANGE[0] <= ratio <= GAIN_RANGE[1]:
-        problems.append("the process has another gain than the model")
-    if not ms <= MS_RATIO * ms_predicted:
-        problems.append("the loop is less robust than predicted")
-    return problems
+) -> tuple[_Compared, ...]:
+    overshoot = expected.overshoot + OVERSHOOT_MARGIN
+    settling = SETTLING_RATIO * expected.settling_time + 2.0 * float(np.median(np.diff(time)))
+    settled = measured.settling_time < float(time[-1] - time[0])
+    iae, least, most = IAE_RATIO * expected.iae, *GAIN_RANGE
+    return (
+        _Compared(
+            _taken(measured.overshoot, expected.overshoot, overshoot),
+            "the overshoot is larger than predicted",
+            f"the overshoot is {measured.overshoot:.0%}, at most {overshoot:.0%} passes",
+        ),
+        _Compared(
+            _taken(measured.settling_time, expected.settling_time, settling)
+            if settled
+            else math.inf,
+            "it settles later than predicted, or not at all",
+            f"it settles after {measured.settling_time:.3g} s, at most {settling:.3g} s passes",
+        ),
+        _Compared(
+            _taken(measured.iae, expected.iae, iae),
+            "the error lasts longer than predicted",
+            f"the IAE is {measured.iae:.3g}, at most {iae:.3g} passes",
+        ),
+        _Compared(
+            math.log(ratio) / math.log(least if ratio < 1.0 else most),
+            "the process has another gain than the model",
+            f"the gain is {ratio:.2f} times the model's, {least:g} to {most:g} passes",
+        ),
+        _Compared(
+            _taken(ms, ms_predicted, MS_RATIO * ms_predicted),
+            "the loop is less robust than predicted",
+            f"Ms is {ms:.2f}, at most {MS_RATIO * ms_predicted:.2f} passes",
+        ),
+    )
+
+
+def _taken(measured: float, expected: float, limit: float) -> float:
+    """Return which part of the way from the prediction to its limit was taken."""
+    return (measured - expected) / (limit - expected) if limit > expected else math.inf

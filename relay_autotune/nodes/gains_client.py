@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
+from relay_autotune.control.verification import proving_step
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -23,6 +23,7 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
 )
 from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import GAINS, NONE_WAIT
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
@@ -49,6 +50,7 @@ _NOT_YET = (
     "nobody takes a set-point",
     "has been heard",
     "have come with a command",
+    "nobody subscribes to",
 )
 
 
@@ -131,17 +133,6 @@ class GainsClient(LoopClient):
         found = self.values(self.name, [entry.name for entry in GAINS])
         return Controller(**found) if found["kc"] else None
 
-    def swing(self) -> float | None:
-        """Return half the swing of the measurement in the last cycle of the newest tune [y]."""
-        found = self.latched(
-            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
-        )
-        if found is None:
-            return None
-        record = record_from_message(found)
-        first, stop = record.cycle_start[-2:]
-        return 0.5 * float(np.ptp(record.measurement[first : stop + 1]))
-
     def ask(self, service: str) -> str:
         """Call ~/apply, ~/revert or ~/discard, and return its answer.
 
@@ -209,14 +200,21 @@ class GainsClient(LoopClient):
             self.set_values(self.name, before)
 
     def usual_step(self) -> float | None:
-        """Return the step of the node, else half of the swing of the tune, in two digits [y].
+        """Return the step of the node, else the one that proves most within its limits [y].
 
         None: neither is known.
         """
-        if given := self.values(self.name, ["verify_step"])["verify_step"]:
+        names = "measurement_min", "measurement_max", "command_min", "command_max", "verify_step"
+        low, high, least, most, given = self.values(self.name, names).values()
+        if given:
             return float(given)
-        swing = self.swing()
-        return float(f"{0.5 * swing:.2g}") if swing else None
+        found = self.latched(
+            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
+        )
+        if found is None:
+            return None
+        within, commands = Limits(low, high), Limits(least, most)
+        return proving_step(record_from_message(found), self.model(), within, commands) or None
 
     def prove(
         self,
@@ -243,7 +241,7 @@ class GainsClient(LoopClient):
         if more:
             self.set_values(self.name, {"verify_step_max": abs(setpoint)})
         try:
-            self._let_settle(settles, tell, leave)
+            self.let_settle(settles, tell, leave=leave)
             return self._verified(setpoint, load, patience, tell, leave)
         finally:
             if more:
@@ -266,12 +264,23 @@ class GainsClient(LoopClient):
         self.latched(Verification, "verification", take, _RESULT_WITHIN)
         return [found[key] for key in stamps if key in found]
 
-    def _let_settle(
-        self, seconds: float, tell: Callable[[str], None], leave: Callable[[], bool]
+    def let_settle(
+        self,
+        seconds: float,
+        tell: Callable[[str], None],
+        what: str = "the loop settles with the new gains",
+        leave: Callable[[], bool] = lambda: False,
     ) -> None:
+        """Let the loop run.
+
+        :param seconds: how long [s].
+        :param tell: called each second with what is waited for.
+        :param what: is waited for.
+        :param leave: returns True to stop waiting.
+        """
         begun = time.monotonic()
         while (waited := time.monotonic() - begun) < seconds and not leave():
-            tell(f"the loop settles with the new gains, {duration(waited)} of {duration(seconds)}")
+            tell(f"{what}, {duration(waited)} of {duration(seconds)}")
             self._wait(leave, time.monotonic() + min(TOLD_EVERY, seconds - waited))
 
     def _verified(

@@ -67,6 +67,7 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
         "measurement": "/tank/level",
         "command": "/tank/valve",
         "baseline": "2.0",
+        "safe_command": "2.0",
         "measurement_min": "30.0",
         "measurement_max": "50.0",
         "command_min": "0.0",

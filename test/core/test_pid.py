@@ -14,11 +14,20 @@ from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
 from relay_autotune.control.controller import GainBounds, PidController, run_loop
-from relay_autotune.control.verification import Step, compare, describe, plan
+from relay_autotune.control.verification import (
+    NARROWLY,
+    Step,
+    compare,
+    describe,
+    plan,
+    proving_step,
+)
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.process.structures import structure_named
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record, RelaySettings
 
 GAINS = Controller(kc=1.2, ti=2.0)
 PROCESS = structure_named("fopdt").of_fields(gain=1.5, time_constants=[2.0], dead_time=0.4)
@@ -162,6 +171,41 @@ def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
     assert found.gain_ratio == pytest.approx(factor, rel=0.05)
     assert "another gain than the model" in found.reason
     assert f"{found.gain_ratio:.2f} times the model's" in found.reason
+
+
+@pytest.mark.parametrize(("factor", "step"), [(0.64, Step(load=0.4)), (1.5, Step(setpoint=0.5))])
+def test_what_is_close_to_its_limit_passes_narrowly_with_the_limit(factor, step):
+    other = replace(PROCESS, gain=factor * PROCESS.gain)
+    found = compare(GAINS, PROCESS, step, *measured(other, step))
+    assert found.passed
+    assert found.reason.startswith(NARROWLY)
+    assert f"the gain is {factor:.2f} times the model's, 0.6 to 1.7 passes" in found.reason
+    assert not compare(GAINS, PROCESS, step, *measured(PROCESS, step)).reason.startswith(NARROWLY)
+
+
+@pytest.mark.parametrize(
+    ("noise_std", "high", "command_high", "height"),
+    [
+        (0.001, 50.0, 5.0, 0.15),  # half of the swing of 0.3
+        (0.02, 50.0, 5.0, 0.4),  # twenty times the noise
+        (0.02, 40.25, 5.0, -0.4),  # more room below
+        (0.02, 50.0, 2.1, -0.4),  # the command would not reach it above
+    ],
+)
+def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
+    noise_std, high, command_high, height
+):
+    swing = 40.0 + 0.3 * np.sin(np.linspace(0.0, 4.0 * math.pi, 401))
+    record = Record(
+        time=np.arange(401.0), measurement=swing, command=np.full(401, 2.0),
+        settings=RelaySettings(40.0, 2.0, 1.0), noise_std=noise_std, cycle_start=(0, 200, 400),
+    )  # fmt: skip
+    model = TransferFunction.fopdt(1.65, 1.0, 0.5)
+    room = Limits(30.0, high)
+    assert proving_step(record, model, room, Limits(0.0, command_high)) == height
+    # Without room on either side it goes as far as it can.
+    tight = proving_step(record, model, Limits(39.9, 40.1), Limits(0.0, command_high))
+    assert abs(tight) == pytest.approx(0.08)
 
 
 def test_a_longer_dead_time_fails():

@@ -1,0 +1,222 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The proof that tune_loop offers: its own controller_node makes a step with the new gains."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from relay_autotune.cli.apply_gains import found_lines
+from relay_autotune.cli.arguments import say
+from relay_autotune.cli.asking import agreed_step
+from relay_autotune.cli.layout import labelled, width
+from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes
+from relay_autotune.cli.progress import StatusLine, Working
+from relay_autotune.control.verification import LEAST_OF_NOISE, Step, plan, proving_step
+from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
+from relay_autotune.loop.sampled import Limits
+from relay_autotune.nodes.gains_client import GainsClient
+from relay_autotune.nodes.tune_client import TuneClient
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune.text import duration
+from relay_autotune.verdict import Verdict
+
+PROGRAM = "tune_loop"
+_CONTROLLER = "controller_node"
+# How long to wait for the record of the tune [s].
+_RECORD_WITHIN = 5.0
+# A loop may take this many settling times to come to rest, and at least a time [s].
+_TIMES_SETTLING, _REST_WITHIN = 5.0, 60.0
+
+
+@dataclass(frozen=True)
+class _Proof:
+    """What is to be done.
+
+    :param step: of the set-point [y].
+    :param takes: about how long all of it takes [s].
+    :param settles: how long the loop takes to settle with the gains [s].
+    :param rest: set-point and baseline of the tune.
+    :param within: range of the measurement [y].
+    :param commands: range of the command [u].
+    :param noise_std: of the measurement [y]; NaN: not known.
+    """
+
+    step: float
+    takes: float
+    settles: float
+    rest: RelaySettings
+    within: Limits
+    commands: Limits
+    noise_std: float
+
+    def question(self, options: argparse.Namespace, doubt: str) -> str:
+        """Say what will move, how far and how long."""
+        rest = self.rest
+        told = (
+            f"Prove the gains now? A controller_node of this command takes the loop at "
+            f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
+            f"{options.measurement} by {self.step:+g} y and back, with {options.command} from "
+            f"{self.commands.low:g} to {self.commands.high:g} u, and ends at "
+            f"{rest.baseline:.6g} u after about {duration(self.takes)}. Ctrl-C ends it at once, "
+            f"likewise."
+        )
+        if abs(self.step) < LEAST_OF_NOISE * self.noise_std:
+            told += (
+                f" The limits allow a step of {abs(self.step) / self.noise_std:.1f} times the "
+                f"noise, expected {LEAST_OF_NOISE:g}: it will prove little."
+            )
+        return told + (f" The gains are doubtful: {doubt}." if doubt else "")
+
+
+def prove(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> bool | None:
+    """Offer to prove the gains of a tune; return whether they passed, None if it is not wanted.
+
+    However it ends, the command is then that at which the process rested before the tune.
+
+    :param client: of the tune that has ended.
+    :param nodes: the nodes of this command.
+    :param options: of the command line, with all answers.
+    """
+    asks = options.verify is None and not options.yes and sys.stdin.isatty()
+    if not (asks or options.verify):
+        return None
+    result = client.result
+    doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
+    try:
+        with Working("choosing the step"):
+            proof = _planned(client.record(_RECORD_WITHIN), result, options)
+        if asks:
+            middle = proof.rest.setpoint
+            low, high = proof.within.low - middle, proof.within.high - middle
+            step = agreed_step(proof.question(options, doubt), proof.step, low, high)
+            if not step:
+                return None
+        else:
+            step = proof.step
+            if doubt:
+                raise TuningError(f"doubtful gains are not proven unasked: {doubt}")
+        try:
+            return _made(client, nodes, options, proof, step, bool(doubt))
+        finally:
+            nodes.end(_CONTROLLER)
+            _say_what_is_left(nodes, proof.rest.baseline)
+    except RelayAutotuneError as error:
+        say(PROGRAM, f"the gains are not proven: {error}")
+        return False
+
+
+def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof:
+    gains = gains_from_message(result.gains)
+    model: TransferFunction = transfer_function_from_message(result.transfer_function)
+    rest = record.settings
+    assert rest is not None, "gains come of a whole experiment"
+    within = Limits(*options.within)
+    # Without limits the process has seen the levels of the relay.
+    commands = Limits(*(options.command_within or (rest.low, rest.high)))
+    step = options.step or proving_step(record, model, within, commands)
+    if not step or not within.low <= rest.setpoint + step <= within.high:
+        raise TuningError(
+            f"a step of {step:g} y leads from {rest.setpoint:.6g} out of {within.low:g} to "
+            f"{within.high:g} y: give another --step"
+        )
+    interval = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    wanted = plan(gains, model, Step(setpoint=step), interval)
+    settles = gains.settling_time
+    if not math.isfinite(settles):
+        settles = wanted.duration
+    takes = wanted.duration + 2.0 * settles
+    return _Proof(step, takes, settles, rest, within, commands, record.noise_std)
+
+
+def _made(
+    client: TuneClient,
+    nodes: OwnNodes,
+    options: argparse.Namespace,
+    proof: _Proof,
+    step: float,
+    doubtful: bool,
+) -> bool:
+    """Put the gains in force in a controller_node in front of relay_node, and make the step."""
+    name = f"/{own_namespace(options).strip('/')}/{_CONTROLLER}"
+    kind = client.values(client.name, ["measurement_type"])["measurement_type"]
+    shown = StatusLine()
+    # The journal of proven and failed gains is that of this controller_node alone.
+    with tempfile.TemporaryDirectory() as journal, GainsClient("", name, beside=client) as loop:
+        values = {
+            "initial_setpoint": proof.rest.setpoint,
+            "initial_command": proof.rest.baseline,
+            "safe_command": proof.rest.baseline,
+            "measurement_min": proof.within.low,
+            "measurement_max": proof.within.high,
+            "command_min": proof.commands.low,
+            "command_max": proof.commands.high,
+            "verify_step_max": abs(step),
+            "measurement_type": kind,
+            "measurement_field": options.field,
+            "accept_doubtful": str(doubtful).lower(),
+            "record_directory": journal,
+        }
+        topics = {"measurement": options.measurement}
+        nodes.start(_CONTROLLER, ros_arguments(own_namespace(options), topics, values))
+        try:
+            with Working(f"starting {name}"):
+                loop.find(START_WITHIN)
+                nodes.require_alive()
+                loop.put_in_force(client.result.gains)
+            patience = max(_TIMES_SETTLING * proof.settles, _REST_WITHIN)
+            with _noted() as leave:
+                found = loop.prove(step, 0.0, proof.settles, patience, shown, leave)
+                loop.let_settle(proof.settles, shown, "the loop goes back", leave)
+        finally:
+            shown.clear()
+        print("\n" + "\n".join(found_lines(found, width())), flush=True)
+        return bool(found.passed)
+
+
+@contextmanager
+def _noted() -> Iterator[Callable[[], bool]]:
+    """Only note signals in the block, and obey them after it.
+
+    An exception could be lost in a callback of rclpy.
+
+    :return: what tells whether one has come.
+    """
+    came: list[int] = []
+    before = {
+        number: signal.signal(number, lambda n, _: came.append(n))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            raise KeyboardInterrupt if came[0] == signal.SIGINT else SystemExit(128 + came[0])
+
+
+def _say_what_is_left(nodes: OwnNodes, command: float) -> None:
+    """Say in which state the plant is, now that the controller has ended."""
+    try:
+        nodes.require_alive()
+    except RelayAutotuneError as error:
+        say(PROGRAM, f"{error}: the last command stays in force; see to the plant")
+        return
+    told = (
+        f"the command stands at {command:.6g} u, as before the tune, and nobody controls the loop "
+        f"any more: start your own controller with these gains"
+    )
+    print("\n".join(labelled("left", told, width())), flush=True)
