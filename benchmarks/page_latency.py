@@ -118,7 +118,9 @@ def main() -> int:
                 tab.go(f"{url}#ms=1.2&controller=pid&rule=robust")
                 tab.wait("document.body.dataset.settled === 'yes'")
                 if ahead and not options.quick:
-                    tab.until(lambda s=subject: len(s.trade_off()) >= 123, "all positions", 600.0)
+                    tab.until(
+                        lambda s=subject: len(s.trade_off(s.first)) >= 123, "all positions", 600.0
+                    )
                 tab.eval(WATCH)
                 moves = options.moves if ahead else min(options.moves, 40)
                 what = "slider, computed ahead" if ahead else "slider, computed when asked"

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import LOOP_CHECKS
-from relay_autotune.tuning import DesignTask, Gains
+from relay_autotune.tuning import DesignOptions, DesignTask, Gains
 from relay_autotune.tuning.ensemble import ensemble_peaks
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, judge
 
@@ -27,10 +27,17 @@ class Shaping:
     evidence: Evidence | None = None
     findings: tuple[Finding, ...] = ()
 
+    def asking(self, options: DesignOptions) -> Shaping:
+        """Return the same with other options; those given decide how gains are judged, too.
+
+        :param options: what is asked of the gains.
+        """
+        return replace(self, task=replace(self.task, options=options))
+
     def judgement(self, gains: Gains) -> Judgement:
         """Return the judgement of an experiment with some gains.
 
-        :param gains: designed for the task, with any options of the same added delay.
+        :param gains: designed for the task, with any set-point weight.
         """
         if self.evidence is None:
             return NOT_JUDGED

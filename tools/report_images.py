@@ -103,8 +103,10 @@ def page_in_browser(found: Analysis) -> None:
     from relay_autotune.web.shape import Asked, Subject
 
     case = case_of(found, "demo_output/bag")
-    subject = Subject(case, found.shaping, Asked(), lambda _: "replay demo_output/bag")
-    page = Page([subject], (), lambda *_: "", Address())
+    assert found.shaping is not None
+    first = Asked.of("robust", found.shaping.task.options)
+    subject = Subject(case, found.shaping, first, lambda _: "replay demo_output/bag")
+    page = Page([subject], lambda _: (), lambda *_: "", Address())
     with (
         tempfile.TemporaryDirectory() as folder,
         in_background(page) as url,
@@ -113,7 +115,11 @@ def page_in_browser(found: Analysis) -> None:
         tab = browser.tab()
         tab.size(1280, 1080)
         tab.go(url)
-        tab.until(lambda: len(subject.trade_off()) >= len(list(subject.positions())), "all", 600)
+        tab.until(
+            lambda: len(subject.trade_off(first)) >= len(list(subject.positions(first))),
+            "all",
+            600,
+        )
         tab.wait("document.querySelectorAll('#plot-trade .curve').length === 2")
         tab.picture(IMAGES / "web_page.png")
 

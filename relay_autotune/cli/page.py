@@ -78,24 +78,23 @@ def show(
     from relay_autotune.web.server import Page, run
     from relay_autotune.web.shape import Asked, Subject
 
-    asked = DesignOptions(controller=options.controller or "auto")
-    first = Asked(
-        rule=options.rule or Asked.rule,
-        controller=asked.controller,
-        ms=asked.ms if options.ms is None else options.ms,
-        setpoint_weight=options.setpoint_weight,
-    )
-    target = export_target(options)
+    rule, target = options.rule or Asked.rule, export_target(options)
 
-    def command(asked: Asked) -> str:
-        return as_typed(
-            program, parser, options, web=None, web_address=None, export=None, **vars(asked)
-        )
+    def subject(case: Case, shaping: Shaping | None) -> Subject:
+        first = Asked.of(rule, shaping.task.options if shaping else DesignOptions())
 
-    subjects = [Subject(case, shaping, first, command) for case, shaping in models]
+        def command(asked: Asked) -> str:
+            changed = asked.changed_from(first) | ({"law": None} if asked.law == "" else {})
+            return as_typed(
+                program, parser, options, web=None, web_address=None, export=None, **changed
+            )
+
+        return Subject(case, shaping, first, command)
+
+    subjects = [subject(case, shaping) for case, shaping in models]
 
     def written(gains: Gains, how: str, doubt: str) -> str:
         return exported(gains, how, target, doubt=doubt)
 
-    page = Page(subjects, exports_of(options.law or ""), written, address_of(options.web_address))
+    page = Page(subjects, exports_of, written, address_of(options.web_address))
     run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))

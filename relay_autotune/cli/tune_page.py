@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
 import signal
 from collections.abc import Callable, Iterator
@@ -158,7 +159,7 @@ class TunePage:
             return exported(gains, how, Target(), doubt=doubt)
 
         address = address_of(options.web_address)
-        self._page = Page((), exports_of(""), written, address, self._live)
+        self._page = Page((), exports_of, written, address, self._live)
         self._interrupted: list[int] = []
         # Messages of the cycles of the running tune.
         self._cycles: list[Any] = []
@@ -294,6 +295,8 @@ class TunePage:
 
     def _add_subject(self, result: Any) -> None:
         """Show the model of the tune, and let its gains be shaped."""
+        from relay_autotune.nodes.identifier_parameters import options_from
+
         try:
             record = self._client.record(_PATIENCE)
             values = self._client.identifier_values(_PATIENCE) or defaults()
@@ -303,20 +306,16 @@ class TunePage:
             return
         bag = result.bag
 
+        options = found.shaping.task.options if found.shaping else options_from(values)
+        first = Asked.of(values["rule"], options)
+
         def command(asked: Asked) -> str:
             if not bag:
                 return ""
-            wanted = {name: v for name, v in vars(asked).items() if v is not None}
+            changed = asked.changed_from(first)
+            wanted = {name: math.nan if v is None else v for name, v in changed.items()}
             return f"replay {shlex.quote(bag)} {flags_of({**values, **wanted})}".rstrip()
 
-        weight = values["setpoint_weight"]
-        first = Asked(
-            values["rule"],
-            values["controller"],
-            values["ms"],
-            weight if weight == weight else None,
-        )
         case = case_of(found, bag or self._client.name)
         subject = Subject(replace(case, command=command(first)), found.shaping, first, command)
-        self._page.exports = exports_of(values["law"])
         self._page.add(subject)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from relay_autotune.errors import TuningError, look_up
 from relay_autotune.identification.result import Identification
@@ -35,11 +35,13 @@ __all__ = [
     "Controller",
     "DesignOptions",
     "DesignTask",
+    "Designed",
     "Gains",
     "Performance",
     "Rule",
     "analyse_loop",
     "design",
+    "designed",
     "ensemble",
     "is_stable",
     "judged",
@@ -131,22 +133,65 @@ def design(task: DesignTask, rule: str) -> Gains:
     :param rule: one of ``RULES``.
     :raises TuningError: as :func:`tune`.
     """
-    return judged(task, rule, *rule_named(rule)(task))
+    return judged(task, designed(task, rule))
 
 
-def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> Gains:
+@dataclass(frozen=True)
+class Designed:
+    """What a rule gives, whatever the set-point weight that is asked for.
+
+    :param rule: its name.
+    :param controller: the gains, with the rule's own weight.
+    :param reason: why, a sentence.
+    :param own: what it gives for our own law at the same period; None: no other law was named, or
+        the rule gives nothing for ours.
+    """
+
+    rule: str
+    controller: Controller
+    reason: str
+    own: Controller | None = None
+
+
+def designed(task: DesignTask, rule: str) -> Designed:
+    """Return what a rule gives, before it is judged.
+
+    :param task: the process and what is asked of the controller.
+    :param rule: one of ``RULES``.
+    :raises TuningError: if the rule does not apply.
+    """
+    controller, reason = rule_named(rule)(task)
+    if task.options.law in ("", OWN_LAW):
+        return Designed(rule, controller, reason)
+    if rule != DEFAULT_RULE:
+        # No other rule looks at the law.
+        return Designed(rule, controller, reason, controller)
+    try:
+        own, _ = robust(_with_own_law(task))
+    except TuningError:
+        return Designed(rule, controller, reason)
+    return Designed(rule, controller, reason, own)
+
+
+def _with_own_law(task: DesignTask) -> DesignTask:
+    return replace(task, options=replace(task.options, law=OWN_LAW))
+
+
+def judged(task: DesignTask, found: Designed) -> Gains:
     """Return what a rule's controller does, with the set-point weight that the options ask for.
 
     Where a law was named, it is what that law can do of the controller, with its exact loop.
 
     :param task: the process and what is asked of the controller.
-    :param rule: the rule's name.
-    :param controller: what it gives.
-    :param reason: why, a sentence.
+    :param found: what the rule gives, with any weight asked for.
     :raises TuningError: if the loop is unstable on the model or on more than 5 % of those around.
     """
-    if not math.isnan(task.options.setpoint_weight):
-        controller = replace(controller, b=task.options.setpoint_weight)
+    weight, rule, reason = task.options.setpoint_weight, found.rule, found.reason
+
+    def weighted(controller: Controller) -> Controller:
+        return controller if math.isnan(weight) else replace(controller, b=weight)
+
+    controller = weighted(found.controller)
     law = task.runs(controller)
     if law is None:
         period = task.options.sample_period
@@ -155,7 +200,8 @@ def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> 
     else:
         performance = analyse_sampled(law, task.held(task.model))
         reason += f"; for {law.law.name} every {law.period:g} s"
-        cost = cost_of(law, performance, _with_own_law(task, rule, controller))
+        own = None if found.own is None else _on_own_law(task, weighted(found.own))
+        cost = cost_of(law, performance, own)
         warnings = (*cautions(performance, task), *cost)
         controller = law.gains
     if not task.models:
@@ -174,17 +220,12 @@ def judged(task: DesignTask, rule: str, controller: Controller, reason: str) -> 
     )
 
 
-def _with_own_law(task: DesignTask, rule: str, controller: Controller) -> Performance | None:
-    """Return what the rule attains with our own law at the same period; None: nothing.
-
-    :param controller: what it gives for the law that was named; no other rule looks at the law.
-    """
-    own = replace(task, options=replace(task.options, law=OWN_LAW))
+def _on_own_law(task: DesignTask, controller: Controller) -> Performance | None:
+    """Return what a controller attains with our own law at the same period; None: nothing."""
+    task = _with_own_law(task)
+    law = task.runs(controller)
+    assert law is not None
     try:
-        if rule == DEFAULT_RULE:
-            controller, _ = robust(own)
-        law = own.runs(controller)
-        assert law is not None
-        return analyse_sampled(law, own.held(own.model))
+        return analyse_sampled(law, task.held(task.model))
     except TuningError:
         return None

@@ -29,6 +29,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
 from relay_autotune.escape import visible
 from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
 from relay_autotune.tuning import RULES
@@ -54,7 +55,7 @@ _ENDS_WITHIN = 5.0
 _EVERY = 0.5
 # Interval of samples [s]; the eye sees no more, and relay_node needs the processor.
 _LIVE_EVERY = 0.025
-# Answers that are kept beside those of the slider's positions.
+# Answers that are kept; the oldest is dropped first.
 _MOST_KEPT = 2000
 
 
@@ -62,7 +63,7 @@ class Page:
     """All that a page shows, with the answers that are known.
 
     :param subjects: the models, at least one.
-    :param exports: the kinds of files that gains can be written into.
+    :param exports: returns the kinds of files that gains for a law can be written into.
     :param export: returns gains as such a file, with its kind and what makes them doubtful.
     :param address: where it is served.
     :param live: the loop that is watched; None: the page is of what there is.
@@ -71,22 +72,24 @@ class Page:
     def __init__(
         self,
         subjects: Sequence[Subject],
-        exports: Sequence[str],
+        exports: Callable[[str], Sequence[str]],
         export: Export,
         address: Address,
         live: Live | None = None,
     ) -> None:
         self.subjects: list[Subject] = []
-        self.exports = tuple(exports)
+        self.exports = exports
         self.export = export
         self.address = address
         self.live = live
-        self.worker = Worker()
-        """Computes what is asked; what the page shows first, at once."""
+        self.computes_ahead = True
+        """Whether what the slider may ask for is computed while nothing is asked."""
         self._known: dict[tuple[int, Asked], str] = {}
-        self._foreseen: set[int] = set()
+        self._last: dict[int, Asked] = {}
         self.open: set[_Socket] = set()
         """Connections of the pages that are open."""
+        self.worker = Worker(self._next_ahead)
+        """Computes what is asked; what the page shows first, at once."""
         for subject in subjects:
             self.add(subject)
 
@@ -97,18 +100,17 @@ class Page:
         """
         self.subjects.append(subject)
         if subject.shaping is not None:
-            self.worker.later(partial(self._answer, len(self.subjects) - 1, subject.first))
+            self.worker.ask(partial(self._answer, len(self.subjects) - 1, subject.first))
 
-    def foresee(self, number: int) -> None:
-        """Compute in between what the slider can ask for, once somebody has asked.
-
-        :param number: of the model.
-        """
-        if number in self._foreseen or self.subjects[number].shaping is None:
-            return
-        self._foreseen.add(number)
-        for asked in self.subjects[number].positions():
-            self.worker.later(partial(self._answer, number, asked))
+    def _next_ahead(self) -> Callable[[], object] | None:
+        """Return what to compute ahead: what the slider can ask for next, once somebody asked."""
+        if not self.computes_ahead or (self.live is not None and self.live.told.phase != "idle"):
+            return None
+        for number, last in list(self._last.items()):
+            for asked in self.subjects[number].positions(last):
+                if (number, asked) not in self._known:
+                    return partial(self._answer, number, asked)
+        return None
 
     def question(self, number: object, given: object) -> tuple[int, Asked]:
         """Return the model and what is asked for, from what a page has sent.
@@ -121,17 +123,35 @@ class Page:
             raise TuningError("there is no such experiment")
         return number, asked_of(given, tuple(RULES))
 
-    async def answer(self, number: int, asked: Asked) -> str:
-        """Return the answer to what a page asks, as JSON.
+    def known(self, number: int, asked: Asked) -> str | None:
+        """Return the answer to what a page asks, as JSON; None: it has to be computed.
 
         :param number: of the model.
         :param asked: what is asked for.
         """
-        self.foresee(number)
-        known = self._known.get((number, asked))
-        if known is not None:
-            return known
-        return await asyncio.wrap_future(self.worker.ask(partial(self._answer, number, asked)))
+        if self.subjects[number].shaping is not None:
+            self._last[number] = asked
+        return self._known.get((number, asked))
+
+    def ask(self, number: int, asked: Asked) -> Future[str]:
+        """Compute the answer to what a page asks.
+
+        :param number: of the model.
+        :param asked: what is asked for.
+        """
+        return self.worker.ask(partial(self._answer, number, asked))
+
+    def sketch(self, number: int, asked: Asked) -> str | None:
+        """Return gains that come near to what is asked for; None: too little is known.
+
+        :param number: of the model.
+        :param asked: what is asked for.
+        """
+        subject = self.subjects[number]
+        shaped = subject.sketched(asked)
+        if shaped is None:
+            return None
+        return wire.to_text({"sketched": wire.of_shaped(subject, shaped)})
 
     def _answer(self, number: int, asked: Asked) -> str:
         known = self._known.get((number, asked))
@@ -139,19 +159,22 @@ class Page:
             return known
         subject = self.subjects[number]
         try:
-            told = wire.to_text({"shaped": wire.of_shaped(subject, subject.shaped(asked))})
+            shaped = subject.shaped(asked)
+            exports = {"exports": list(self.exports(shaped.gains.law))}
+            told = wire.to_text({"shaped": wire.of_shaped(subject, shaped) | exports})
         except RelayAutotuneError as error:
             told = wire.to_text({"refused": visible(str(error))})
         except Exception as error:  # noqa: BLE001  a defect must not leave the page waiting
             told = wire.to_text({"refused": defect(error)})
-        if len(self._known) < _MOST_KEPT:
-            self._known[number, asked] = told
+        if len(self._known) >= _MOST_KEPT:
+            self._known.pop(next(iter(self._known)))
+        self._known[number, asked] = told
         return told
 
     def everything(self) -> str:
         """Return what a page shows whatever is asked, as JSON."""
         subjects = [wire.of_subject(subject) for subject in self.subjects]
-        return wire.to_text({"subjects": subjects, "exports": list(self.exports)})
+        return wire.to_text({"subjects": subjects, "laws": ["", *LAWS]})
 
     def tell_news(self) -> None:
         """Tell all open pages what is new of the loop that is watched."""
@@ -266,14 +289,14 @@ class _Export(_Guarded):
 
     async def get(self, name: str) -> None:
         """Answer with the file."""
-        if name not in self.page.exports:
-            raise HTTPError(HTTPStatus.NOT_FOUND)
         number, asked = self.subject_and_asked()
         subject = self.page.subjects[number]
         try:
             shaped = await asyncio.wrap_future(
                 self.page.worker.ask(partial(subject.shaped, asked))
             )
+            if name not in self.page.exports(shaped.gains.law):
+                raise HTTPError(HTTPStatus.NOT_FOUND)
             judgement = shaped.judgement
             doubt = judgement.reason if judgement.verdict is Verdict.DOUBTFUL else ""
             if doubt and self.get_query_argument("accept_doubtful", "") != "yes":
@@ -292,7 +315,9 @@ class _Socket(_Guarded, WebSocketHandler):
     def open(self, *_: str, **__: str) -> None:
         """Tell the page everything, and from then on what is new."""
         self.set_nodelay(True)
-        self._told: dict[int, int] = {}
+        self._told: dict[int, tuple[Asked, int]] = {}
+        self._asked: dict[int, Asked] = {}
+        self._pending: Future[str] | None = None
         self._present: dict[int, Controller | None] = {}
         self._shown = 0
         if self.page.live is not None:
@@ -331,14 +356,34 @@ class _Socket(_Guarded, WebSocketHandler):
                 return
             count = question["n"]
             number, asked = self.page.question(question["of"], question["asked"])
-            answer = await self.page.answer(number, asked)
         except (TuningError, KeyError, TypeError, ValueError, RecursionError):
             self.close(1008, "not understood")
             return
-        took = 1000.0 * (time.perf_counter() - begun)
-        head = wire.to_text({"of": number, "n": count if isinstance(count, int) else 0,
-                             "took": round(took, 3)})  # fmt: skip
-        self.tell(f'{head[:-1]},"answer":{answer}}}')
+        head = {"of": number, "n": count if isinstance(count, int) else 0}
+        self._asked[number] = asked
+        if self._pending is not None:
+            # The page shows the newest answer alone.
+            self._pending.cancel()
+        known = self.page.known(number, asked)
+        if known is not None:
+            self._tell_answer(head, known, begun)
+            return
+        self._pending = answer = self.page.ask(number, asked)
+        self._waits = asyncio.create_task(self._sketch_and_answer(head, asked, answer, begun))
+
+    async def _sketch_and_answer(
+        self, head: dict[str, int], asked: Asked, answer: Future[str], begun: float
+    ) -> None:
+        """Tell gains that come near, then the exact ones, unless something newer is asked."""
+        sketch = await asyncio.to_thread(self.page.sketch, head["of"], asked)
+        if sketch is not None and answer is self._pending and not answer.done():
+            self._tell_answer(head, sketch, begun)
+        with suppress(asyncio.CancelledError):
+            self._tell_answer(head, await asyncio.wrap_future(answer), begun)
+
+    def _tell_answer(self, head: dict[str, int], answer: str, begun: float) -> None:
+        took = round(1000.0 * (time.perf_counter() - begun), 3)
+        self.tell(f'{wire.to_text(head | {"took": took})[:-1]},"answer":{answer}}}')
 
     def _wish(self, question: dict[str, Any]) -> Wish:
         what, of, step = question["do"], question.get("of", 0), question.get("step", 0.0)
@@ -359,9 +404,10 @@ class _Socket(_Guarded, WebSocketHandler):
         if self._shown != len(self.page.subjects):
             self._tell_subjects()
         for number, subject in enumerate(self.page.subjects):
-            known = wire.of_trade_off(subject)
-            if len(known) != self._told.get(number):
-                self._told[number] = len(known)
+            asked = self._asked.get(number, subject.first).apart_from_ms
+            known = wire.of_trade_off(subject, asked)
+            if (asked, len(known)) != self._told.get(number):
+                self._told[number] = asked, len(known)
                 self.tell(wire.to_text({"of": number, "trade_off": known}))
             if subject.case.present != self._present.get(number):
                 self._present[number] = subject.case.present

@@ -12,6 +12,7 @@ import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +25,19 @@ from relay_autotune.report.case import Case
 from relay_autotune.report.frequency import loop_frequencies, swept_parts
 from relay_autotune.report.loops import shown_load, step_duration
 from relay_autotune.shaping import Shaping
-from relay_autotune.tuning import DEFAULT_RULE, design, judged
+from relay_autotune.tuning import DEFAULT_RULE, Designed, DesignOptions, designed, judged
 from relay_autotune.tuning.ensemble import ensemble_peaks
-from relay_autotune.verdict import Judgement, Verdict
+from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
 FloatArray = NDArray[np.floating]
 ComplexArray = NDArray[np.complexfloating]
 
 # What the slider asks for: from calm to fast.
 CALM, FAST, STEP = 1.2, 2.0, 0.02
+# Every so many of its positions are computed first, between which gains are sketched.
+_ROUGH = 8
+# Ms that are farther than this from one that is asked for tell too little of its gains.
+_NEAR = 0.2
 # Instants of a response that is drawn, and frequencies of the band about a Nyquist curve.
 _POINTS = 512
 _BAND = 60
@@ -44,16 +49,62 @@ _FAR = 6.0
 class Asked:
     """What the page asks of the gains; everything else is as the command line says.
 
+    The fields but the rule are those of `DesignOptions`.
+
     :param rule: name of the rule.
     :param controller: "auto", "pi" or "pid".
     :param ms: largest Ms.
     :param setpoint_weight: b; None: the rule's own.
+    :param noise_share: largest noise in the command, as a fraction of the amplitude; None: as the
+        command line says.
+    :param law: name of the law that the gains are for; empty: none in particular; None: likewise.
+    :param sample_period: at which it runs [s]; 0: not known; None: likewise.
     """
 
     rule: str = DEFAULT_RULE
     controller: str = "auto"
     ms: float = 1.4
     setpoint_weight: float | None = None
+    noise_share: float | None = None
+    law: str | None = None
+    sample_period: float | None = None
+
+    @classmethod
+    def of(cls, rule: str, options: DesignOptions) -> Asked:
+        """Return what some options ask for.
+
+        :param rule: name of the rule.
+        :param options: what is asked of the controller.
+        """
+        values = {name: getattr(options, name) for name in _OPTIONS}
+        weight = options.setpoint_weight
+        return cls(rule, **values | {"setpoint_weight": None if math.isnan(weight) else weight})
+
+    def options(self, others: DesignOptions) -> DesignOptions:
+        """Return the options of a design.
+
+        :param others: those that the page does not ask for.
+        :raises TuningError: if a value is out of its range.
+        """
+        values = {name: getattr(self, name) for name in _OPTIONS}
+        given = {name: value for name, value in values.items() if value is not None}
+        return replace(others, **{"setpoint_weight": math.nan} | given)
+
+    @property
+    def apart_from_ms(self) -> Asked:
+        """The same for all positions of the slider; the weight changes no other gain."""
+        return replace(self, ms=FAST, setpoint_weight=None)
+
+    def changed_from(self, first: Asked) -> dict[str, Any]:
+        """Return what differs from what was asked for first, by name.
+
+        :param first: as the command line asks.
+        """
+        names = (each.name for each in fields(Asked))
+        return {n: getattr(self, n) for n in names if getattr(self, n) != getattr(first, n)}
+
+
+_OPTIONS = tuple(each.name for each in fields(Asked) if each.name != "rule")
 
 
 @dataclass(frozen=True)
@@ -98,6 +149,7 @@ class Shaped:
     :param steps: responses of the closed loop.
     :param curve: the loop.
     :param unstable: number of models around on which the loop is unstable.
+    :param options: with which they were designed.
     """
 
     asked: Asked
@@ -106,6 +158,7 @@ class Shaped:
     steps: Steps
     curve: LoopCurve
     unstable: int
+    options: DesignOptions
 
 
 @dataclass
@@ -122,30 +175,39 @@ class Subject:
     shaping: Shaping | None
     first: Asked
     command: Callable[[Asked], str]
-    _designed: dict[Asked, Gains | TuningError] = field(default_factory=dict, repr=False)
+    _found: dict[Asked, tuple[Designed, Gains] | TuningError] = field(
+        default_factory=dict, repr=False
+    )
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _shown: tuple[float, float] | None = None
 
-    def positions(self) -> Iterator[Asked]:
-        """Yield what the slider can ask for, first from end to end roughly, then ever finer."""
-        count = round((FAST - CALM) / STEP)
-        kinds = (self.first.controller, *({"auto", "pi", "pid"} - {self.first.controller}))
-        for kind in kinds:
-            seen: set[int] = set()
-            for stride in (8, 4, 2, 1):
-                for k in range(0, count + 1, stride):
-                    if k not in seen:
-                        seen.add(k)
-                        yield Asked(DEFAULT_RULE, kind, round(CALM + k * STEP, 6))
+    def positions(self, near: Asked) -> Iterator[Asked]:
+        """Yield what the slider can ask for: from end to end roughly, then what is near first.
 
-    def trade_off(self) -> list[tuple[str, Gains]]:
-        """Return the controllers of the rule robust that are known so far, by what was asked."""
+        :param near: what was asked for last.
+        """
+        count = round((FAST - CALM) / STEP)
+        steps = sorted(range(count + 1), key=lambda k: (k % _ROUGH != 0, abs(_ms(k) - near.ms)))
+        others = {"auto", "pi", "pid"} - {near.controller}
+        for kind in (near.controller, *sorted(others)):
+            for k in steps:
+                yield replace(
+                    near, rule=DEFAULT_RULE, controller=kind, ms=_ms(k), setpoint_weight=None
+                )
+
+    def trade_off(self, of: Asked) -> list[Gains]:
+        """Return the controllers of the rule robust that are known so far.
+
+        :param of: for the same law, rate and noise.
+        """
         with self._lock:
-            known = list(self._designed.items())
+            known = list(self._found.items())
+        wanted = replace(of.apart_from_ms, rule=DEFAULT_RULE, controller="")
         return [
-            (asked.controller, gains)
-            for asked, gains in known
-            if isinstance(gains, Gains) and asked.rule == DEFAULT_RULE
+            found[1]
+            for asked, found in known
+            if not isinstance(found, TuningError)
+            and replace(asked.apart_from_ms, controller="") == wanted
         ]
 
     def shaped(self, asked: Asked) -> Shaped:
@@ -156,11 +218,49 @@ class Subject:
         """
         if self.shaping is None:
             raise TuningError(self.case.reason or "there are no gains for this experiment")
-        gains = self._gains(self.shaping, asked)
-        judgement = self.shaping.judgement(gains)
+        shaping = self.shaping.asking(asked.options(self.shaping.task.options))
+        gains = self._gains(shaping, asked)
+        judgement = shaping.judgement(gains)
         if judgement.verdict is Verdict.NONE:
             raise TuningError(f"no gains: {judgement.reason}")
-        return _shaped(self.shaping, asked, gains, judgement, self._scale(gains))
+        return _shaped(shaping, asked, gains, judgement, self._scale(gains))
+
+    def sketched(self, asked: Asked) -> Shaped | None:
+        """Return gains between those that are known for Ms nearby, while the exact ones are found.
+
+        They are judged on the model alone, and carry no verdict.
+
+        :param asked: what is asked for.
+        :return: None: too little is known, or the exact ones are known.
+        """
+        if self.shaping is None or asked.rule != DEFAULT_RULE:
+            return None
+        base = asked.apart_from_ms
+        with self._lock:
+            near = sorted(
+                (abs(each.ms - asked.ms), each.ms, found[0].controller)
+                for each, found in self._found.items()
+                if not isinstance(found, TuningError) and each.apart_from_ms == base
+            )[:2]
+        if len(near) < 2 or near[0][0] == 0.0 or near[1][0] > _NEAR:
+            return None
+        (_, low, one), (_, high, other) = near
+        if (one.td > 0.0) != (other.td > 0.0):
+            return None
+        part = (asked.ms - low) / (high - low)
+        names = [each.name for each in fields(Controller)]
+        between = {n: (1.0 - part) * getattr(one, n) + part * getattr(other, n) for n in names}
+        # Beyond both a straight line may leave what can be.
+        between |= {n: max(between[n], 0.0) for n in ("ti", "td", "tf")}
+        between["b"] = min(max(between["b"], 0.0), 1.0)
+        shaping = self.shaping.asking(asked.options(self.shaping.task.options))
+        alone = replace(shaping, task=replace(shaping.task, models=()), evidence=None)
+        sketch = Designed(asked.rule, Controller(**between), "the exact gains are being computed")
+        try:
+            gains = judged(alone.task, sketch)
+        except TuningError:
+            return None
+        return _shaped(alone, asked, gains, NOT_JUDGED, self._scale(gains))
 
     def case_with(self, shaped: Shaped) -> Case:
         """Return the experiment with other recommended gains, as the report shows it.
@@ -174,6 +274,7 @@ class Subject:
             recommended=0,
             judgement=shaped.judgement,
             reason="",
+            added_delay=shaped.options.added_delay,
             command=self.command(shaped.asked),
         )
 
@@ -181,27 +282,20 @@ class Subject:
         """Return the gains; the search is not repeated for another set-point weight."""
         plain = replace(asked, setpoint_weight=None)
         with self._lock:
-            found = self._designed.get(plain)
+            found = self._found.get(plain)
         if found is None:
-            options = replace(shaping.task.options, ms=asked.ms, controller=asked.controller)
+            task = shaping.asking(plain.options(shaping.task.options)).task
             try:
-                found = design(replace(shaping.task, options=options), asked.rule)
+                design = designed(task, asked.rule)
+                found = design, judged(task, design)
             except TuningError as error:
                 found = error
             with self._lock:
-                self._designed[plain] = found
+                self._found[plain] = found
         if isinstance(found, TuningError):
             raise TuningError(str(found))
-        if asked.setpoint_weight is None:
-            return found
-        options = replace(
-            shaping.task.options,
-            ms=asked.ms,
-            controller=asked.controller,
-            setpoint_weight=asked.setpoint_weight,
-        )
-        law = Controller(**{each.name: getattr(found, each.name) for each in fields(Controller)})
-        return judged(replace(shaping.task, options=options), asked.rule, law, found.reason)
+        design, gains = found
+        return gains if asked == plain else judged(shaping.task, design)
 
     def _scale(self, gains: Gains) -> tuple[float, float]:
         """Return duration and load of the steps, which stay the same while gains change."""
@@ -232,7 +326,12 @@ def _shaped(
         _steps(gains, model, around, *scale),
         _curve(gains, model, shaping),
         unstable,
+        task.options,
     )
+
+
+def _ms(k: int) -> float:
+    return round(CALM + k * STEP, 6)
 
 
 def _steps(
@@ -267,24 +366,29 @@ def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> LoopCurve
     return LoopCurve(values, band)
 
 
-def asked_of(fields: object, rules: tuple[str, ...]) -> Asked:
+def asked_of(given: object, rules: tuple[str, ...]) -> Asked:
     """Return what a page asks for, from the fields of its message.
 
-    :param fields: as JSON was read; what is missing has its default.
+    :param given: as JSON was read; what is missing has its default.
     :param rules: the names of the rules that it may name.
     :raises TuningError: if a value cannot be.
     """
-    if not isinstance(fields, dict):
+    if not isinstance(given, dict):
         raise TuningError("expected what is asked for as an object of names and values")
-    rule, controller = fields.get("rule", DEFAULT_RULE), fields.get("controller", "auto")
-    ms, weight = fields.get("ms", 1.4), fields.get("setpoint_weight")
-    if rule not in rules:
+    values = {each.name: given.get(each.name, each.default) for each in fields(Asked)}
+    for name in ("rule", "controller", "law"):
+        if not (isinstance(values[name], str) or (name == "law" and values[name] is None)):
+            raise TuningError(f"expected a name for {name}")
+    if values["rule"] not in rules:
         raise TuningError("expected the name of a rule")
-    if controller not in ("auto", "pi", "pid"):
-        raise TuningError("expected auto, pi or pid for the controller")
-    for value in (ms, *(() if weight is None else (weight,))):
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise TuningError("expected numbers for ms and setpoint_weight")
-    if not 1.2 <= ms <= 4.0 or not (weight is None or 0.0 <= weight <= 1.0):
-        raise TuningError("expected an ms from 1.2 to 4 and a setpoint_weight from 0 to 1")
-    return Asked(rule, controller, float(ms), None if weight is None else float(weight))
+    for name in ("ms", "setpoint_weight", "noise_share", "sample_period"):
+        value = values[name]
+        if value is None and name != "ms":
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
+            raise TuningError(f"expected a number for {name}")
+        values[name] = float(value)
+    asked = Asked(**values)
+    # It refuses what is out of its range.
+    asked.options(DesignOptions())
+    return asked

@@ -30,6 +30,7 @@ from relay_autotune.report.findings import (
 )
 from relay_autotune.report.style import in_steps, thinned
 from relay_autotune.text import digits, process_text
+from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.shape import CALM, FAST, STEP, Asked, Shaped, Subject
 
@@ -95,6 +96,7 @@ def of_subject(subject: Subject) -> dict[str, Any]:
         "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
         "first": of_asked(subject.first),
         "slider": [CALM, FAST, STEP],
+        "noisy": subject.shaping is not None and _knows_noise(subject.shaping.task.options),
     }
 
 
@@ -127,6 +129,10 @@ def of_running(
         rest = float(np.mean(record.measurement[few] - moved))
         found["data"] = [curve(record.time, record.measurement), curve(time, rest + moved)]
     return found
+
+
+def _knows_noise(options: DesignOptions) -> bool:
+    return options.noise_std > 0.0 and options.amplitude > 0.0
 
 
 def of_present(case: Case) -> list[list[str]]:
@@ -175,7 +181,7 @@ def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
         "warnings": notes,
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
-        "effects": _effects(subject, shaped),
+        "effects": _effects(shaped),
         "beside": [value for _, value, _ in told_of(gains, gains)],
         "at": short(np.array([gains.ms, gains.iae_load])),
         "b": gains.b,
@@ -197,15 +203,19 @@ def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
     }
 
 
-def of_trade_off(subject: Subject) -> list[list[Any]]:
-    """Return Ms and IAE of the controllers that are known so far, each with its kind."""
+def of_trade_off(subject: Subject, asked: Asked) -> list[list[Any]]:
+    """Return Ms and IAE of the controllers that are known so far, each with its kind.
+
+    :param subject: the model.
+    :param asked: for the same law, rate and noise.
+    """
     return [
         ["pid" if gains.td > 0.0 else "pi", *short(np.array([gains.ms, gains.iae_load]))]
-        for _, gains in subject.trade_off()
+        for gains in subject.trade_off(asked)
     ]
 
 
-def _effects(subject: Subject, shaped: Shaped) -> list[list[str]]:
+def _effects(shaped: Shaped) -> list[list[str]]:
     gains = shaped.gains
     rows = [
         ["Ms", digits(gains.ms, 3), "below 1.4 careful, above 2 risky"],
@@ -218,9 +228,7 @@ def _effects(subject: Subject, shaped: Shaped) -> list[list[str]]:
         ["overshoot", f"{digits(100.0 * gains.overshoot, 2)} %", "after a step of the set-point"],
         ["settles in", f"{digits(gains.settling_time, 3)} s", "to within 2 %"],
     ]
-    noise = math.nan
-    if subject.shaping is not None:
-        noise = gains.noise_gain * subject.shaping.task.options.noise_std
+    noise = gains.noise_gain * shaped.options.noise_std
     if math.isfinite(noise):
         rows.append(["noise", f"{digits(noise, 2)} u", "standard deviation in the command"])
     return rows

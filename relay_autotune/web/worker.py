@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 import queue
 import threading
 from collections.abc import Callable
@@ -13,22 +12,26 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 _Result = TypeVar("_Result")
-_Entry = tuple[int, int, Callable[[], object]]
-_NOW, _LATER = 0, 1
+_Work = Callable[[], object]
+# How long to wait for a question where nothing is worth computing ahead [s].
+_PAUSE = 0.25
 
 
 class Worker:
-    """Compute one thing after the other: first what is asked for, then what may be asked."""
+    """Compute one thing after the other: first what is asked for, then what may be asked.
 
-    def __init__(self) -> None:
-        self._queue: queue.PriorityQueue[_Entry] = queue.PriorityQueue()
-        self._order = itertools.count()
+    :param ahead: returns what to compute while nothing is asked for; None: nothing.
+    """
+
+    def __init__(self, ahead: Callable[[], _Work | None]) -> None:
+        self._queue: queue.SimpleQueue[_Work] = queue.SimpleQueue()
+        self._ahead = ahead
         self._open = True
         # It holds nothing that would have to be put in order, so it may end with the process.
         threading.Thread(target=self._run, name="page", daemon=True).start()
 
     def ask(self, work: Callable[[], _Result]) -> Future[_Result]:
-        """Compute something before all that may wait.
+        """Compute something before all that may wait; it is left out if it is cancelled before.
 
         :param work: computes it.
         """
@@ -42,24 +45,24 @@ class Worker:
             except BaseException as error:  # noqa: BLE001  it belongs to whoever asked
                 future.set_exception(error)
 
-        self._queue.put((_NOW, next(self._order), done))
+        self._queue.put(done)
         return future
-
-    def later(self, work: Callable[[], object]) -> None:
-        """Compute something once nothing is asked for.
-
-        :param work: computes it, and keeps it.
-        """
-        self._queue.put((_LATER, next(self._order), work))
 
     def close(self) -> None:
         """Compute nothing more; what is computed right now is finished."""
         self._open = False
-        self._queue.put((_NOW, -1, lambda: None))
+        self._queue.put(lambda: None)
 
     def _run(self) -> None:
-        while True:
-            work = self._queue.get()[2]
-            if not self._open:
-                return
-            work()
+        while self._open:
+            try:
+                work: _Work | None = self._queue.get_nowait()
+            except queue.Empty:
+                work = self._ahead()
+            if work is None:
+                try:
+                    work = self._queue.get(timeout=_PAUSE)
+                except queue.Empty:
+                    continue
+            if self._open:
+                work()

@@ -20,6 +20,7 @@ from tornado.websocket import websocket_connect
 from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.report.case import case_of
+from relay_autotune.tuning import DesignOptions
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import Live
 from relay_autotune.web.server import Page, in_background
@@ -38,7 +39,9 @@ def analysed(name: str = "unbiased_relay_with_noise") -> Analysis:
 
 def subject_of(analysis: Analysis, name: str = "a bag") -> Subject:
     """Return what a page shows of an analysis."""
-    return Subject(case_of(analysis, name), analysis.shaping, Asked(), lambda a: f"replay {a.ms}")
+    shaping = analysis.shaping
+    first = Asked.of("robust", shaping.task.options if shaping else DesignOptions())
+    return Subject(case_of(analysis, name), shaping, first, lambda a: f"replay {a.ms}")
 
 
 def hostile(subject: Subject) -> Subject:
@@ -64,13 +67,12 @@ def served(
     """
     page = Page(
         subjects,
-        ("yaml",),
+        lambda law: ("yaml",),
         lambda gains, how, doubt: f"{how} {gains.kc:.6g} {doubt}\n",
         address or Address(),
         live,
     )
-    if not ahead:
-        page.foresee = lambda number: None  # type: ignore[method-assign]
+    page.computes_ahead = ahead
     with in_background(page) as url:
         yield url
 
@@ -97,7 +99,7 @@ def conversation(url: str, *questions: object, headers: dict[str, str] | None = 
                 if message is None:
                     return [*heard, None]
                 document = json.loads(message)
-                if "answer" in document:
+                if "answer" in document and "sketched" not in document["answer"]:
                     heard.append(document)
                     break
         socket.close()

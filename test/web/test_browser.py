@@ -74,6 +74,10 @@ def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     expected = told(subject, Asked("simc", "pi"))
     tab.until(lambda: shown(tab).startswith(expected), expected)
     assert tab.eval("document.querySelectorAll('.mark.chosen').length") == 1
+    tab.eval("law = document.querySelector('#law'), law.value = 'pid_controller',"
+             "law.dispatchEvent(new Event('change'))")  # fmt: skip
+    tab.until(lambda: shown(tab) and "for pid_controller every" in tab.text("#why"), "the law")
+    assert "law=pid_controller" in tab.eval("location.hash")
     assert tab.said == []
 
 

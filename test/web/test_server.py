@@ -16,7 +16,7 @@ from relay_autotune.errors import SelectionError
 from relay_autotune.verdict import Judgement
 from relay_autotune.web.address import Address, address_of
 from relay_autotune.web.server import Page, serve
-from relay_autotune.web.shape import Subject
+from relay_autotune.web.shape import Asked, Subject
 
 
 def get(url: str, **headers: str):
@@ -82,9 +82,7 @@ def test_the_socket_tells_everything_and_answers(url, subject):
     assert first["subjects"][0]["name"] == "a bag"
     assert first["subjects"][0]["around"] == 100
     assert answer["n"] == 7
-    shaped = subject.shaped(
-        next(a for a in subject.positions() if (a.controller, a.ms) == ("pi", 1.6))
-    )
+    shaped = subject.shaped(Asked(controller="pi", ms=1.6))
     assert answer["answer"]["shaped"]["isa"][0][1] == f"{shaped.gains.kc:.4f}"
     assert "unstable" in refused["answer"]["refused"]
 
@@ -99,7 +97,9 @@ def test_a_question_that_cannot_be_ends_the_connection(url, question):
 
 def test_five_pages_at_once_have_answers_of_their_own(url):
     async def all_of_them():
-        asked = [{"of": 0, "n": k, "asked": {"ms": 1.3 + 0.1 * k}} for k in range(5)]
+        asked = [
+            {"of": 0, "n": k, "asked": {"ms": 1.3 + 0.1 * k, "controller": "pi"}} for k in range(5)
+        ]
         return await asyncio.gather(*(asyncio.to_thread(conversation, url, a) for a in asked))
 
     found = [heard[1]["answer"]["shaped"]["ms"] for heard in asyncio.run(all_of_them())]

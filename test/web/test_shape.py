@@ -8,24 +8,27 @@ import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from served import REPOSITORY, analysed, subject_of
 
+from relay_autotune import tuning
 from relay_autotune.analysis import analyse
 from relay_autotune.cli import page, replay
 from relay_autotune.cli.arguments import as_typed
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import FitReport
 from relay_autotune.loop.closed_loop import simulate_closed_loop
+from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, ModelCase
 from relay_autotune.report.loops import shown_load
 from relay_autotune.shaping import Shaping
-from relay_autotune.tuning import DesignOptions, task_of_model
-from relay_autotune.verdict import Verdict
+from relay_autotune.tuning import Designed, DesignOptions, designed, judged, task_of_model
+from relay_autotune.verdict import NOT_JUDGED, Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.shape import Asked, Subject, asked_of
 
@@ -42,13 +45,16 @@ def subject(analysis):
 
 @pytest.mark.parametrize(
     "asked",
-    [Asked(controller="pi", ms=1.7), Asked("simc", setpoint_weight=0.25)],
+    [
+        Asked("simc", setpoint_weight=0.25),
+        Asked(controller="pi", law="pid_controller", sample_period=0.5, setpoint_weight=0.5),
+        Asked(controller="pid", ms=1.7, noise_share=0.02),
+    ],
 )
 def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
     analysis, subject, asked
 ):
-    weight = {} if asked.setpoint_weight is None else {"setpoint_weight": asked.setpoint_weight}
-    options = DesignOptions(controller=asked.controller, ms=asked.ms, **weight)
+    options = asked.options(DesignOptions())
     expected = analyse(analysis.record, rule=asked.rule, options=options)
     found = subject.shaped(asked)
     assert found.gains == expected.best_gains
@@ -101,14 +107,56 @@ def test_calmer_gains_are_slower_and_all_positions_are_asked_once(subject):
     calm, fast = subject.shaped(Asked(ms=1.2)), subject.shaped(Asked(ms=2.0))
     assert calm.gains.ms < fast.gains.ms
     assert calm.gains.iae_load > fast.gains.iae_load
-    positions = list(subject.positions())
+    positions = list(subject.positions(Asked(ms=1.6)))
     assert len(set(positions)) == len(positions) == 3 * 41
-    assert {kind for kind, _ in subject.trade_off()} <= {"auto", "pi", "pid"}
+    # from end to end first, then what is near
+    assert {p.ms for p in positions[:6]} == {1.2, 1.36, 1.52, 1.68, 1.84, 2.0}
+    assert positions[6].ms == 1.6
+    assert {p.ms for p in positions[7:9]} == {1.58, 1.62}
+    known = subject.trade_off(Asked())
+    assert {calm.gains.ms, fast.gains.ms} <= {gains.ms for gains in known}
+    assert subject.trade_off(Asked(law="px4_rate")) == []
+
+
+def test_a_sketch_comes_near_to_the_gains_that_are_then_found(analysis):
+    subject = subject_of(analysis)
+    asked = [Asked(controller="pi", ms=ms) for ms in (1.3, 1.46, 1.38)]
+    assert subject.sketched(asked[2]) is None
+    ends = [subject.shaped(each).gains.kc for each in asked[:2]]
+    sketch = subject.sketched(asked[2])
+    assert sketch.judgement == NOT_JUDGED
+    assert ends[0] < sketch.gains.kc < ends[1]
+    exact = subject.shaped(asked[2]).gains
+    assert sketch.gains.kc == pytest.approx(exact.kc, rel=0.03)
+    assert sketch.gains.ti == pytest.approx(exact.ti, rel=0.03)
+    assert subject.sketched(asked[2]) is None
+    assert subject.sketched(replace(asked[2], law="pid_controller", sample_period=0.5)) is None
+    assert subject.sketched(replace(asked[2], rule="simc", ms=1.4)) is None
+
+
+def test_our_own_law_is_compared_with_the_weight_that_is_asked_for(analysis):
+    task = analysis.shaping.task
+    options = replace(task.options, law="pid_controller", controller="pi", setpoint_weight=0.3)
+    task = replace(task, options=options, models=())
+    found = designed(task, "robust")
+    own = judged(replace(task, options=replace(options, law=OWN_LAW)), Designed(
+        "robust", found.own, "", None))  # fmt: skip
+    seen = []
+
+    def look(law, performance, attained):
+        seen.append(attained)
+        return ()
+
+    tuning.cost_of, before = look, tuning.cost_of
+    try:
+        judged(task, found)
+    finally:
+        tuning.cost_of = before
+    assert seen[0].overshoot == own.overshoot
+    assert own.b == 0.3
 
 
 def test_an_aborted_experiment_gives_no_gains(analysis):
-    from dataclasses import replace
-
     aborted = analyse(replace(analysis.record, outcome=Outcome.ABORTED, reason="a button"))
     assert aborted.shaping is None
     shown = subject_of(aborted)
@@ -138,7 +186,8 @@ def test_no_number_that_json_does_not_know_goes_out():
 @pytest.mark.parametrize(
     "fields",
     [None, [], {"rule": "none"}, {"rule": ["simc"]}, {"controller": {}}, {"ms": "1"},
-     {"ms": True}, {"ms": float("nan")}, {"ms": 9}, {"setpoint_weight": -1}],
+     {"ms": True}, {"ms": float("nan")}, {"ms": 9}, {"setpoint_weight": -1}, {"law": "none"},
+     {"law": 3}, {"sample_period": -1}, {"noise_share": "1"}, {"noise_share": float("nan")}],
 )  # fmt: skip
 def test_what_cannot_be_asked_is_refused(fields):
     with pytest.raises(TuningError):

@@ -19,7 +19,8 @@ const plots = {
 };
 
 let subjects = [];
-let exports_ = [];
+let laws = [];
+let keeps = ""; // the kinds of files that are offered
 let chosen = 0;
 let asked = null; // what the controls say
 let shaped = null; // what was answered last
@@ -52,11 +53,12 @@ function remembered(subject) {
   for (const name of Object.keys(found)) {
     if (!words.has(name)) continue;
     const text = words.get(name);
-    found[name] = name === "ms" || name === "setpoint_weight" ? Number(text) : text;
+    found[name] = ["rule", "controller", "law"].includes(name) ? text : Number(text);
   }
   const weight = found.setpoint_weight;
   const known = [subject.first.rule, ...subject.rules.map((each) => each.rule)];
-  const fine = known.includes(found.rule) && (weight === null || (weight >= 0 && weight <= 1)) && found.ms >= 1.2 && found.ms <= 4 && ["auto", "pi", "pid"].includes(found.controller);
+  const fine = known.includes(found.rule) && (weight === null || (weight >= 0 && weight <= 1)) && found.ms >= 1.2 && found.ms <= 4 && ["auto", "pi", "pid"].includes(found.controller)
+    && laws.includes(found.law) && found.sample_period >= 0 && found.noise_share >= 0;
   return fine ? found : { ...subject.first };
 }
 
@@ -95,6 +97,17 @@ function showControls() {
   $("own-weight").checked = own;
   $("weight").disabled = own;
   if (!own) $("weight").value = asked.setpoint_weight;
+  $("noise").hidden = !subject.noisy;
+  Object.assign($("noise-share"), { max: Math.max(0.5, asked.noise_share) });
+  $("noise-share").value = asked.noise_share;
+  $("noise-value").textContent = `${(100 * asked.noise_share).toFixed(0)} %`;
+  $("law").replaceChildren();
+  for (const law of laws) {
+    const option = put($("law"), "option", law || "none in particular");
+    option.value = law;
+    option.selected = law === asked.law;
+  }
+  $("rate").value = asked.sample_period || "";
 }
 
 let saidChecks = "";
@@ -149,21 +162,26 @@ function showBeside() {
   if (live) live.showForce();
 }
 
-function showShaped() {
-  const s = shaped;
-  showVerdict(s.verdict, s.checks);
-  $("gains").textContent = gainsWords(s, "   ");
+// s: gains and what they do; of a sketch the exact ones follow, with their verdict
+function showShaped(s, sketched) {
+  document.body.classList.toggle("sketched", sketched);
+  if (!sketched) {
+    showVerdict(s.verdict, s.checks);
+    $("command").textContent = s.command;
+    showKeep(s.exports);
+    showTrade();
+  }
+  $("gains").textContent = (sketched ? "about " : "") + gainsWords(s, "   ");
   table($("isa"), s.isa, ["", "number", "unit", "meaning"]);
   table($("parallel"), s.parallel, ["", "number", "unit"]);
   table($("effects"), s.effects, ["", "", "interval"]);
-  showBeside();
+  if (!sketched) showBeside();
   $("why").textContent = `Rule ${s.rule}: ${s.reason}`;
   $("notes").hidden = !s.warnings.length;
   $("warnings").replaceChildren();
   for (const text of s.warnings) put($("warnings"), "li", text);
   $("weight-value").textContent = s.b.toFixed(2);
   if (asked.setpoint_weight === null) $("weight").value = s.b;
-  $("command").textContent = s.command;
   const t = s.steps;
   const end = t.time[t.time.length - 1];
   const load = [{ x: t.load_time, kind: "load" }];
@@ -188,10 +206,24 @@ function showShaped() {
     marks: [{ x: -1, y: 0, kind: "point", name: "-1" }],
     said: `it comes as near to -1 as ${(1 / s.ms).toFixed(2)}`,
   });
-  showTrade();
+}
+
+// The files that the gains can be written into, which depend on their law.
+function showKeep(exports) {
+  if (keeps === String(exports)) return;
+  keeps = String(exports);
+  $("keep").replaceChildren();
+  const keep = (words, work) => {
+    const button = put($("keep"), "button", words);
+    button.type = "button";
+    button.addEventListener("click", work);
+  };
+  keep("Report as one file", () => download("report.html", "tune.html", {}));
+  for (const name of exports) keep(`Gains for ${name}`, () => exportGains(name));
 }
 
 function showRefused(text) {
+  document.body.classList.remove("sketched");
   $("refused").hidden = false;
   $("refused").textContent = text;
   $("gains").textContent = "no gains";
@@ -225,14 +257,6 @@ function showSubject() {
     plots.record.draw({ curves });
     plots.relay.draw({ curves: [{ x: r.command[0], y: r.command[1], kind: "command" }] });
   }
-  $("keep").replaceChildren();
-  const keep = (words, work) => {
-    const button = put($("keep"), "button", words);
-    button.type = "button";
-    button.addEventListener("click", work);
-  };
-  keep("Report as one file", () => download("report.html", "tune.html", {}));
-  for (const name of exports_) keep(`Gains for ${name}`, () => exportGains(name));
   $("tabs").hidden = subjects.length < 2;
   $("tabs").replaceChildren();
   subjects.forEach((each, k) => {
@@ -319,7 +343,7 @@ function take(message) {
     $("data").hidden = false;
     const added = live && subjects.length && message.subjects.length > subjects.length;
     subjects = message.subjects;
-    exports_ = message.exports;
+    laws = message.laws;
     // After a tune its own result is shown, else what the address says.
     const of = Number(new URLSearchParams(location.hash.slice(1)).get("of") ?? -1);
     choose(of >= 0 && of < subjects.length && !added ? of : added ? subjects.length - 1 : 0);
@@ -335,12 +359,20 @@ function take(message) {
     if (message.of === chosen) showBeside();
     return;
   }
+  const { sketched } = message.answer;
+  // Once gains that come near are shown, the next question need not wait for the exact ones.
   if (message.n === waiting) waiting = 0;
+  if (message.n !== number) return;
   if (message.of === chosen) {
-    if (message.answer.shaped) {
+    if (sketched) {
+      shaped = null;
+      $("refused").hidden = true;
+      showShaped(sketched, true);
+      if (live) live.showForce();
+    } else if (message.answer.shaped) {
       shaped = message.answer.shaped;
       $("refused").hidden = true;
-      showShaped();
+      showShaped(shaped, false);
     } else {
       shaped = null;
       showRefused(message.answer.refused);
@@ -349,7 +381,7 @@ function take(message) {
     document.body.dataset.took = (performance.now() - begun).toFixed(1);
   }
   if (changed) ask();
-  else if (!waiting) document.body.dataset.settled = "yes";
+  else if (!sketched) document.body.dataset.settled = "yes";
 }
 
 function connect() {
@@ -371,6 +403,13 @@ $("ms").addEventListener("input", () => {
 for (const input of document.querySelectorAll("input[name=controller]")) {
   input.addEventListener("change", () => { asked.controller = input.value; ask(); });
 }
+$("noise-share").addEventListener("input", () => {
+  asked.noise_share = Number($("noise-share").value);
+  $("noise-value").textContent = `${(100 * asked.noise_share).toFixed(0)} %`;
+  ask();
+});
+$("law").addEventListener("change", () => { asked.law = $("law").value; ask(); });
+$("rate").addEventListener("change", () => { asked.sample_period = Math.max(0, Number($("rate").value)); ask(); });
 $("rule").addEventListener("change", () => { asked.rule = $("rule").value; ask(); });
 $("own-weight").addEventListener("change", () => {
   asked.setpoint_weight = $("own-weight").checked ? null : Number($("weight").value);
