@@ -20,10 +20,11 @@ from functools import partial
 from importlib import import_module
 
 
-def start(module: str) -> int:
+def start(module: str, told_for: tuple[str, ...] = ()) -> int:
     """Load an executable's module and run it.
 
     :param module: name of a module with a function main.
+    :param told_for: arguments with which it says first that it loads, for people wait for it.
     :return: the exit status.
     """
     # If an output is closed, the next opened file would get its number and all its text. So
@@ -33,6 +34,10 @@ def start(module: str) -> int:
     os.close(number)
     sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
+    if set(told_for) & set(sys.argv):
+        name = module.rpartition(".")[2]
+        sys.stderr.write(f"{name} is loading; nothing is commanded yet\n")
+        sys.stderr.flush()
     # A process that was started with SIGINT ignored, as by nohup, keeps ignoring it.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # Block SIGINT during the change: a signal noted for the old handler would be lost.
@@ -59,7 +64,7 @@ relay_node = partial(start, "relay_autotune.nodes.relay")
 identifier_node = partial(start, "relay_autotune.nodes.identifier")
 plant_node = partial(start, "relay_autotune.nodes.plant")
 controller_node = partial(start, "relay_autotune.nodes.controller")
-tune_loop = partial(start, "relay_autotune.cli.tune_loop")
+tune_loop = partial(start, "relay_autotune.cli.tune_loop", told_for=("--measurement", "--joint"))
 apply_gains = partial(start, "relay_autotune.cli.apply_gains")
 replay = partial(command, "relay_autotune.cli.replay")
 identify = partial(command, "relay_autotune.cli.identify")

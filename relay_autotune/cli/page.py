@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from relay_autotune.cli.arguments import as_typed, say
-from relay_autotune.cli.design_arguments import export_target
 from relay_autotune.errors import MissingPackageError
-from relay_autotune.tuning.task import DesignOptions
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Gains
@@ -73,7 +71,10 @@ def show(
     :param models: the experiments, each with what the design of its gains takes.
     :raises SelectionError: if the address cannot be used.
     """
+    # Imported here, because it loads slowly and must not delay a tune.
+    from relay_autotune.cli.design_arguments import export_target
     from relay_autotune.cli.export import exported, exports_of
+    from relay_autotune.tuning.task import DesignOptions
     from relay_autotune.web.address import address_of
     from relay_autotune.web.server import Page, run
     from relay_autotune.web.shape import Asked, Subject

@@ -193,7 +193,14 @@ def _verdict_lines(result: Any, paint: Paint, columns: int) -> list[str]:
     verdict = Verdict(result.verdict)
     colour = {Verdict.TRUSTED: _GREEN, Verdict.DOUBTFUL: _YELLOW}.get(verdict, _RED)
     lines = [f"  {'verdict':<16} {paint(verdict.name.lower(), f'{_BOLD};{colour}')}"]
-    return lines + (labelled("", result.verdict_reason, columns) if result.verdict_reason else [])
+    told, model = result.verdict_reason, result.transfer_function
+    known = verdict is Verdict.TRUSTED and math.isfinite(result.gains.ms_95)
+    if known and (model.undetermined or model.warnings):
+        told = (
+            f"all the same: with these gains Ms stays below {digits(result.gains.ms_95, 3)} on "
+            f"95 % of the models that the data allow, whatever is not determined or warned of here"
+        )
+    return lines + (labelled("", told, columns) if told else [])
 
 
 def model_lines(message: Any, paint: Paint, columns: int = WIDEST) -> list[str]:

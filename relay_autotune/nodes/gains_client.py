@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -25,7 +26,7 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.controller_parameters import GAINS, NONE_WAIT
+from relay_autotune.nodes.controller_parameters import FIXED, GAINS, NONE_WAIT
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.nodes.remote_gains import controller_of, mapping_of
 from relay_autotune.process.transfer_function import TransferFunction
@@ -39,6 +40,8 @@ _RESULT_WITHIN = 5.0
 # How long the node may take to hear gains that are offered [s].
 _TAKEN_WITHIN = 5.0
 _TURN = 0.1
+# Limits that relay_node and controller_node both have.
+LIMITS = ("measurement_min", "measurement_max", "command_min", "command_max")
 # Relative difference of equal gains, since another node may round them.
 _SAME = 1e-9
 # Beginning of the refusal of ~/verify that time cures.
@@ -90,8 +93,29 @@ class GainsClient(LoopClient):
             there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
             raise LoopError(
                 f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
-                f"{there}. Start it, or name another with --namespace and --node"
+                f"{there}. Start it{self._start()}, or name another with --namespace and --node"
             )
+
+    def _start(self) -> str:
+        """Return what starts a controller_node for the relay_node of this namespace, if it can."""
+        space, _, own = self.name.rpartition("/")
+        relay = next((name for name in self.owners("/tune") if self._is_here(name)), "")
+        names = ("measurement_type", "measurement_field", "baseline", *LIMITS)
+        if not relay:
+            return ""
+        with suppress(LoopError):
+            kind, field, *numbers = self.values(relay, names).values()
+            measurement = self._topic_of(relay, "measurement", kind, published=False)
+            given = dict(zip(("initial_command", *LIMITS), numbers, strict=True))
+            values = [f"{n}:={float(v)}" for n, v in given.items() if math.isfinite(v)]
+            others = {"measurement_type": kind, "measurement_field": field}
+            default = {entry.name: entry.default for entry in FIXED}
+            values += [f"{name}:={v}" for name, v in others.items() if v != default[name]]
+            topics = [f"__ns:={space}"] * bool(space) + [f"measurement:={measurement}"]
+            topics += [f"__node:={own}"] * (own != "controller_node")
+            words = [f"-r {name}" for name in topics] + [f"-p {shlex.quote(v)}" for v in values]
+            return f": ros2 run relay_autotune controller_node --ros-args {' '.join(words)}"
+        return ""
 
     def waiting(self) -> tuple[Gains, str]:
         """Return the newest gains of the loop, and why they are doubtful; empty: they are not.
@@ -204,7 +228,7 @@ class GainsClient(LoopClient):
 
         None: neither is known.
         """
-        names = "measurement_min", "measurement_max", "command_min", "command_max", "verify_step"
+        names = (*LIMITS, "verify_step")
         low, high, least, most, given = self.values(self.name, names).values()
         if given:
             return float(given)

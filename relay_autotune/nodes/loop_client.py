@@ -18,7 +18,7 @@ from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
@@ -36,6 +36,15 @@ _LISTEN = 1.0
 ANSWER_WITHIN = 10.0
 # Interval in which a message is published until it has arrived [s].
 _AGAIN = 0.2
+
+# Topics of relay_node that may have the type of measurement and command.
+_OTHER_ENDS = (
+    "controller_command",
+    "command_feedback",
+    "other_commands",
+    "setpoint",
+    "hold_request",
+)
 
 
 class LoopClient:
@@ -312,6 +321,42 @@ class LoopClient:
             with suppress(FieldError):
                 heard.append(commands.value(message))
         return sum(heard) / len(heard) if heard else math.nan
+
+    def _topic_of(self, relay: str, topic: str, type_name: str, *, published: bool) -> str:
+        """Return the name that a topic of a relay_node has, which may be remapped.
+
+        :param relay: full name of the relay_node.
+        :param topic: its name without a remapping.
+        :param type_name: its message type.
+        :param published: whether the relay_node publishes it.
+        :raises LoopError: if it cannot be told from others.
+        """
+        space, _, name = relay.rpartition("/")
+        ends = (
+            self._node.get_publisher_names_and_types_by_node
+            if published
+            else self._node.get_subscriber_names_and_types_by_node
+        )
+        others = {self._resolved(other) for other in _OTHER_ENDS}
+
+        there: list[tuple[str, list[str]]] = []
+
+        def is_known() -> bool:
+            # Its services may be known before its name is.
+            with suppress(NodeNameNonExistentError):
+                there[:] = ends(name, space or "/")
+            return bool(there)
+
+        self._wait(is_known, time.monotonic() + ANSWER_WITHIN)
+        found = [end for end, types in there if type_name in types and end not in others]
+        own = self._resolved(topic)
+        if own in found or len(found) == 1:
+            return own if own in found else found[0]
+        told = ", ".join(found) or "none"
+        raise LoopError(
+            f"the {topic} cannot be shown: {relay} has {told} of {type_name} for it, expected "
+            f"one; give this command the same -r {topic}:=TOPIC"
+        )
 
     def _is_here(self, name: str) -> bool:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]

@@ -13,7 +13,6 @@ from typing import Any
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import NodeNameNonExistentError
 from rclpy.qos import qos_profile_sensor_data
 
 from relay_autotune.errors import FieldError, LoopError
@@ -21,7 +20,7 @@ from relay_autotune.exchange.messages import record_from_message, without_imposs
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
+from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
@@ -29,14 +28,6 @@ from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 # Silence after which relay_node counts as lost during a tune [s], in addition to the middleware's
 # liveliness lease.
 _GONE = 1.0
-# Topics of relay_node that may have the type of measurement and command.
-_OTHER_ENDS = (
-    "controller_command",
-    "command_feedback",
-    "other_commands",
-    "setpoint",
-    "hold_request",
-)
 # States of an ended goal; the safe command was sent before.
 _ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 # Parts of the refusals that nodes give after their start, until discovery is complete.
@@ -225,7 +216,7 @@ class TuneClient(LoopClient):
             with suppress(FieldError):
                 take(reader.value(message))
 
-        name = self._topic_of("measurement", reader.type_name, published=False)
+        name = self._topic_of(self.name, "measurement", reader.type_name, published=False)
         # Best effort, so that nobody waits for this client.
         self._node.create_subscription(reader.kind, name, hear, qos_profile_sensor_data)
 
@@ -243,7 +234,7 @@ class TuneClient(LoopClient):
         """
         kind, field = self.values(self.name, ["command_type", "command_field"]).values()
         commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)
-        name = self._topic_of("command", commands.type_name, published=True)
+        name = self._topic_of(self.name, "command", commands.type_name, published=True)
 
         def hear(message: Any) -> None:
             with suppress(FieldError):
@@ -267,35 +258,6 @@ class TuneClient(LoopClient):
             return end
 
         return begin
-
-    def _topic_of(self, topic: str, type_name: str, *, published: bool) -> str:
-        """Return the name that a topic of relay_node has, which may be remapped."""
-        space, _, name = self.name.rpartition("/")
-        ends = (
-            self._node.get_publisher_names_and_types_by_node
-            if published
-            else self._node.get_subscriber_names_and_types_by_node
-        )
-        others = {self._resolved(other) for other in _OTHER_ENDS}
-
-        there: list[tuple[str, list[str]]] = []
-
-        def is_known() -> bool:
-            # Its services may be known before its name is.
-            with suppress(NodeNameNonExistentError):
-                there[:] = ends(name, space or "/")
-            return bool(there)
-
-        self._wait(is_known, time.monotonic() + ANSWER_WITHIN)
-        found = [end for end, types in there if type_name in types and end not in others]
-        own = self._resolved(topic)
-        if own in found or len(found) == 1:
-            return own if own in found else found[0]
-        told = ", ".join(found) or "none"
-        raise LoopError(
-            f"the {topic} cannot be shown: {self.name} has {told} of {type_name} for it, expected "
-            f"one; give this command the same -r {topic}:=TOPIC"
-        )
 
     def identifier_values(self, patience: float) -> dict[str, Any] | None:
         """Return the parameters of the identifier_node by name; None: it did not answer.

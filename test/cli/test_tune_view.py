@@ -122,6 +122,16 @@ def test_doubtful_gains_are_marked_and_need_a_parameter_to_be_applied() -> None:
     assert not any("accept" in c for _, c in next_commands(completed(), ["/controller_node"]))
 
 
+def test_trusted_gains_of_a_model_with_doubts_say_why() -> None:
+    found = completed()
+    found.gains.ms_95 = 1.47
+    text = "\n".join(result_lines(found, False, Paint(), 200))
+    assert "not determined" in text and "look twice" in text
+    assert "all the same: with these gains Ms stays below 1.47 on 95 % of the models" in text
+    found.transfer_function.undetermined, found.transfer_function.warnings = [], []
+    assert "all the same" not in "\n".join(result_lines(found, False, Paint()))
+
+
 def test_states_and_outcomes_have_the_names_of_the_constants() -> None:
     for number, name in enumerate(STATES):
         assert getattr(Tune.Feedback, f"STATE_{name.upper()}") == number

@@ -38,3 +38,19 @@ def test_a_first_model_and_first_gains_load_nothing(node: str) -> None:
         capture_output=True, text=True, timeout=120.0, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_tune_loop_says_that_it_loads_and_does_not_load_what_it_needs_later() -> None:
+    code = (
+        "import sys; from relay_autotune import start; load = start.import_module\n"
+        "def told(name): print('LOADING', file=sys.stderr); return load(name)\n"
+        "start.import_module = told; sys.argv = ['tune_loop', '--measurement', 'y', '--help']\n"
+        "import atexit; atexit.register(lambda: print('scipy' in sys.modules, file=sys.stderr))\n"
+        "start.tune_loop()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, timeout=120.0, check=False,
+    )  # fmt: skip
+    said = ["tune_loop is loading; nothing is commanded yet", "LOADING", "False"]
+    assert done.stderr.splitlines() == said

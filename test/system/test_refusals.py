@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import math
+import shutil
 import signal
+import subprocess
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -36,6 +38,18 @@ def idle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
             yield rig
         finally:
             rig.close()
+
+
+def test_apply_gains_without_a_controller_node_says_how_to_start_one(idle: Rig) -> None:
+    done = subprocess.run(
+        [shutil.which("apply_gains"), "--yes"], env=idle.environment,
+        capture_output=True, text=True, timeout=60.0, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert (
+        "Start it: ros2 run relay_autotune controller_node --ros-args "
+        "-r measurement:=/measurement -p initial_command:=0.0 -p command_min:=-2.0 -p command_max:=2.0, or name another"
+    ) in done.stderr
 
 
 class Ends:
