@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from relay_autotune.cli.layout import broken, width
 from relay_autotune.errors import LoopError
 
 # What people type between two numbers; a single point belongs to a number.
@@ -50,8 +51,9 @@ def agreed_step(
     :raises LoopError: if nobody can be asked.
     """
     _require_somebody("--yes")
+    print("\n" + "\n".join(broken(question, width())))
     while True:
-        answer = _input(f"\n{question} [y/N, or another step, such as {0.5 * step:.2g}] ").lower()
+        answer = _input(f"[y/N, or another step, such as {0.5 * step:.2g}] ").lower()
         if answer in ("", "n", "no", "y", "yes"):
             return step if answer.startswith("y") else 0.0
         other = number_of(answer)

@@ -372,8 +372,8 @@ def _hand_over(
     how, file = exports_of(result.gains.law)[0], options.export
     if not (file or joint or options.yes) and sys.stdin.isatty():
         others = ", ".join(name for name in EXPORTS if name != how)
-        told = f"for another program: {_prefix()}replay BAG --export NAME, with NAME {others}"
-        print("\n" + "\n".join(labelled("gains", told, width())))
+        told = f"{_prefix()}replay {shlex.quote(result.bag)} --export NAME, with NAME {others}"
+        print("\n" + "\n".join(labelled("other programs", told, width())))
         file = asked_for_file(f"Write the gains for {how} of ros2_controllers")
     if file:
         target = joint.target if joint else Target()

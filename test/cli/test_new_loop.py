@@ -13,9 +13,12 @@ from typing import Any
 import pytest
 import yaml
 
+from relay_autotune.cli import tune_loop
 from relay_autotune.cli.asking import agrees, pair_of
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
+from relay_autotune_msgs.action import Tune
+from relay_autotune_msgs.msg import PidGains
 
 
 class Looker:
@@ -156,3 +159,26 @@ def test_commands_within_messages_become_parameters() -> None:
 def test_a_field_that_is_not_there_is_named_by_its_flag() -> None:
     with pytest.raises(SelectionError, match="--field: std_msgs/msg/Float32 has no field"):
         arguments(Looker(), options("--within", "0", "1", "--at", "0", "--field", "nothing"))
+
+
+def ended(reason: str, **values: Any) -> Any:
+    return Tune.Result(outcome=Tune.Result.ABORTED, reason=reason, **values)
+
+
+def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
+    words = ["--measurement", "/tank/level", "--command", "/tank/valve"]
+    given = tune_loop._parser().parse_args(words)
+    given.typed = words
+    given.at, given.within, given.command_within = 2.0, [30.0, 50.0], [0.0, 5.0]
+    again = (
+        f"{tune_loop._prefix()}tune_loop --measurement /tank/level --command /tank/valve "
+        f"--at 2 --within 30 50 --command-within 0 5"
+    )
+    silent = ended("no measurement on /tank/level for 1.01 s")
+    (what, command), (then, told) = tune_loop._repeated(silent, given, None)
+    assert (what, command, then) == ("run it again", again, "if it happens again")
+    assert "ros2 topic hz /tank/level" in told and "the load of the machine" in told
+    assert tune_loop._repeated(ended("cancelled"), given, None) == [("run it again", again)]
+    found = ended("", gains=PidGains(experiment_id="x"))
+    assert tune_loop._repeated(found, given, None) == [("prove the gains", f"{again} --verify")]
+    assert tune_loop._repeated(found, given, True) == []

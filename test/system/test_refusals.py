@@ -48,7 +48,8 @@ def test_apply_gains_without_a_controller_node_says_how_to_start_one(idle: Rig) 
     assert done.returncode == 1
     assert (
         "Start it: ros2 run relay_autotune controller_node --ros-args "
-        "-r measurement:=/measurement -p initial_command:=0.0 -p command_min:=-2.0 -p command_max:=2.0, or name another"
+        "-r measurement:=/measurement -p initial_command:=0.0 -p command_min:=-2.0 "
+        "-p command_max:=2.0, or name another"
     ) in done.stderr
 
 
