@@ -41,15 +41,21 @@ class GainsPage:
     :param client: of the loop's relay_node, whose node this uses.
     :param live: what pages see.
     :param page: with the models whose gains are shaped.
+    :param number: of the loop on the page.
     :param leave: returns True when a verification is to end.
     """
 
     def __init__(
-        self, client: TuneClient, live: Live, page: Page, leave: Callable[[], bool]
+        self,
+        client: TuneClient,
+        live: Live,
+        page: Page,
+        number: int,
+        leave: Callable[[], bool],
     ) -> None:
         self._client = client
         self._live = live
-        self._page = page
+        self._page, self._number = page, number
         self._leave = leave
         self._controller: GainsClient | None = None
         self._looked = -math.inf
@@ -93,7 +99,7 @@ class GainsPage:
             if any(getattr(told, name) != value for name, value in now.items()):
                 self._live.tell(**now)
             for subject in self._page.subjects:
-                if subject.case.present != present:
+                if subject.loop == self._number and subject.case.present != present:
                     subject.case = replace(subject.case, present=present)
         self._looked = time.monotonic()
 
@@ -143,6 +149,8 @@ class GainsPage:
         if wish.asked is None or not 0 <= wish.of < len(self._page.subjects):
             raise TuningError("there are no such gains")
         subject: Subject = self._page.subjects[wish.of]
+        if subject.loop != self._number:
+            raise TuningError(f"the gains are for another loop than {self._live.told.node}")
         shaped = subject.shaped(wish.asked)
         gains, judgement = shaped.gains, shaped.judgement
         if judgement.verdict is not Verdict.TRUSTED and not wish.doubtful:

@@ -133,7 +133,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--dry-run", action="store_true", help="only ask whether a tune could start, and how"
     )
-    parser.add_argument("--namespace", default="", metavar="NS", help="namespace of the loop")
+    parser.add_argument(
+        "--namespace", default="", metavar="NS",
+        help="namespace of the loop; with --web several, separated by commas",
+    )  # fmt: skip
     parser.add_argument(
         "--node", default="relay_node", metavar="NAME", help="name of the relay_node (%(default)s)"
     )
@@ -178,12 +181,15 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     new = of_joint or is_new_loop(options)
     try:
         namespace = own_namespace(options) if new else options.namespace
-        client = TuneClient(namespace, options.node, ros)
+        spaces = namespace.split(",") if options.web else [namespace]
+        clients = [TuneClient(space, options.node, ros) for space in spaces]
     except ParameterError as error:
         say(PROGRAM, str(error))
         return USAGE
+    client = clients[0]
     with ExitStack() as stack:
-        stack.enter_context(client)
+        for each in clients:
+            stack.enter_context(each)
         patience, joint, nodes = options.wait, None, None
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
@@ -198,12 +204,13 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
                 nodes.require_alive()
             return bool(interrupted)
 
-        with Working(f"{'starting' if new else 'looking for'} {client.name}"):
-            client.find(
-                patience,
-                needs_identifier=not (options.dry_run or options.record_only),
-                leave=leave,
-            )
+        for each in clients:
+            with Working(f"{'starting' if new else 'looking for'} {each.name}"):
+                each.find(
+                    patience,
+                    needs_identifier=not (options.dry_run or options.record_only),
+                    leave=leave,
+                )
         if joint:
             joint.show()
         asks_here = not (options.dry_run or options.web)
@@ -220,7 +227,11 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         if options.web:
             from relay_autotune.cli.tune_page import TunePage
 
-            return TunePage(PROGRAM, client, options, shown, _follow).run(interrupted)
+            # Lines of several loops must not be written over each other.
+            terminals = [shown]
+            if len(clients) > 1:
+                terminals = [Shown(sys.stderr, live=False) for _ in clients]
+            return TunePage(PROGRAM, clients, options, terminals, _follow).run(interrupted)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.

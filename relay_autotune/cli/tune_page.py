@@ -9,12 +9,14 @@ import argparse
 import math
 import shlex
 import signal
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say, worst
 from relay_autotune.cli.export import Target, exported, exports_of
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.layout import WIDEST
@@ -130,13 +132,68 @@ class _OnPage:
 
 
 class TunePage:
-    """The page of one loop.
+    """The page of one or more loops.
+
+    :param program: name of the command.
+    :param clients: of the loops' relay_nodes.
+    :param options: as the command line gives them.
+    :param shown: the terminal, for each of them.
+    :param follow: shows a tune until it has ended.
+    """
+
+    def __init__(
+        self,
+        program: str,
+        clients: Sequence[TuneClient],
+        options: argparse.Namespace,
+        shown: Sequence[Any],
+        follow: Follow,
+    ) -> None:
+        def written(gains: Gains, how: str, doubt: str) -> str:
+            return exported(gains, how, Target(), doubt=doubt)
+
+        self._program = program
+        lives = [Live(client.name) for client in clients]
+        self._page = Page((), exports_of, written, address_of(options.web_address), lives)
+        self._loops = [
+            _LoopOnPage(program, client, options, terminal, follow, self._page, number)
+            for number, (client, terminal) in enumerate(zip(clients, shown, strict=True))
+        ]
+
+    def run(self, interrupted: list[int]) -> int:
+        """Serve the page, and do what is wished there, until a signal comes.
+
+        :param interrupted: signals that have come.
+        :return: the worst exit status that the last tune of a loop deserves.
+        :raises LoopError: if a relay_node is lost during a tune; the other loops go on until the
+            end.
+        """
+        with in_background(self._page) as url:
+            say(
+                self._program,
+                f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is "
+                "started there",
+            )
+            if len(self._loops) == 1:
+                return self._loops[0].run(interrupted)
+            with ThreadPoolExecutor(len(self._loops)) as pool:
+                running = [pool.submit(loop.run, interrupted) for loop in self._loops]
+                # Only the main thread hears signals, and only between its own steps.
+                while not all(each.done() for each in running):
+                    time.sleep(_TICK)
+            return worst(*(each.result() for each in running))
+
+
+class _LoopOnPage:
+    """One loop of a page.
 
     :param program: name of the command.
     :param client: of the loop's relay_node.
     :param options: as the command line gives them.
     :param shown: the terminal.
     :param follow: shows a tune until it has ended.
+    :param page: that shows it.
+    :param number: of the loop on the page.
     """
 
     def __init__(
@@ -146,27 +203,24 @@ class TunePage:
         options: argparse.Namespace,
         shown: Any,
         follow: Follow,
+        page: Page,
+        number: int,
     ) -> None:
         self._program = program
         self._client = client
         self._options = options
         self._shown = shown
         self._follow = follow
-        self._live = Live(client.name)
+        self._page, self._number = page, number
+        self._live = page.lives[number]
         self._begin_command: Callable[[], Callable[[], None]] | None = None
-
-        def written(gains: Gains, how: str, doubt: str) -> str:
-            return exported(gains, how, Target(), doubt=doubt)
-
-        address = address_of(options.web_address)
-        self._page = Page((), exports_of, written, address, self._live)
         self._interrupted: list[int] = []
         # Messages of the cycles of the running tune.
         self._cycles: list[Any] = []
-        self._gains = GainsPage(client, self._live, self._page, self._is_to_end)
+        self._gains = GainsPage(client, self._live, page, number, self._is_to_end)
 
     def run(self, interrupted: list[int]) -> int:
-        """Serve the page, and do what is wished there, until a signal comes.
+        """Do what is wished on the page, until a signal comes.
 
         :param interrupted: signals that have come.
         :return: the exit status that the last tune deserves.
@@ -174,32 +228,26 @@ class TunePage:
         """
         status = DONE
         self._interrupted = interrupted
-        with in_background(self._page) as url:
+        try:
             self._show_signals()
-            say(
-                self._program,
-                f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is "
-                "started there",
-            )
-            try:
-                while not interrupted:
-                    self._client.rest(_TICK)
-                    wish = self._live.next_wish()
-                    if wish is None:
-                        self._gains.look_now_and_then()
-                    elif wish.what == CHECK:
-                        self._check()
-                    elif wish.what == START:
-                        status = self._tune(interrupted)
-                        self._gains.look_after_tune()
-                    else:
-                        with self._commands_shown():
-                            self._gains.do(wish)
-            except LoopError as error:
-                self._live.tell(phase="lost", tone="bad", status=str(error))
-                raise
-            finally:
-                self._gains.close()
+            while not interrupted:
+                self._client.rest(_TICK)
+                wish = self._live.next_wish()
+                if wish is None:
+                    self._gains.look_now_and_then()
+                elif wish.what == CHECK:
+                    self._check()
+                elif wish.what == START:
+                    status = self._tune(interrupted)
+                    self._gains.look_after_tune()
+                else:
+                    with self._commands_shown():
+                        self._gains.do(wish)
+        except LoopError as error:
+            self._live.tell(phase="lost", tone="bad", status=str(error))
+            raise
+        finally:
+            self._gains.close()
         return status
 
     def _is_to_end(self) -> bool:
@@ -317,5 +365,6 @@ class TunePage:
             return f"replay {shlex.quote(bag)} {flags_of({**values, **wanted})}".rstrip()
 
         case = case_of(found, bag or self._client.name)
-        subject = Subject(replace(case, command=command(first)), found.shaping, first, command)
+        case = replace(case, command=command(first))
+        subject = Subject(case, found.shaping, first, command, self._number)
         self._page.add(subject)

@@ -16,7 +16,7 @@ from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
 from math import isfinite
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -66,7 +66,7 @@ class Page:
     :param exports: returns the kinds of files that gains for a law can be written into.
     :param export: returns gains as such a file, with its kind and what makes them doubtful.
     :param address: where it is served.
-    :param live: the loop that is watched; None: the page is of what there is.
+    :param lives: the loops that are watched; empty: the page is of what there is.
     """
 
     def __init__(
@@ -75,17 +75,18 @@ class Page:
         exports: Callable[[str], Sequence[str]],
         export: Export,
         address: Address,
-        live: Live | None = None,
+        lives: Sequence[Live] = (),
     ) -> None:
         self.subjects: list[Subject] = []
         self.exports = exports
         self.export = export
         self.address = address
-        self.live = live
+        self.lives = tuple(lives)
         self.computes_ahead = True
         """Whether what the slider may ask for is computed while nothing is asked."""
         self._known: dict[tuple[int, Asked], str] = {}
         self._last: dict[int, Asked] = {}
+        self._adding = Lock()
         self.open: set[_Socket] = set()
         """Connections of the pages that are open."""
         self.worker = Worker(self._next_ahead)
@@ -98,13 +99,16 @@ class Page:
 
         :param subject: the model.
         """
-        self.subjects.append(subject)
+        with self._adding:
+            self.subjects.append(subject)
+            number = len(self.subjects) - 1
         if subject.shaping is not None:
-            self.worker.ask(partial(self._answer, len(self.subjects) - 1, subject.first))
+            self.worker.ask(partial(self._answer, number, subject.first))
 
     def _next_ahead(self) -> Callable[[], object] | None:
         """Return what to compute ahead: what the slider can ask for next, once somebody asked."""
-        if not self.computes_ahead or (self.live is not None and self.live.told.phase != "idle"):
+        # relay_node needs the processor while a tune runs.
+        if not self.computes_ahead or any(live.told.phase != "idle" for live in self.lives):
             return None
         for number, last in list(self._last.items()):
             for asked in self.subjects[number].positions(last):
@@ -177,14 +181,13 @@ class Page:
         return wire.to_text({"subjects": subjects, "laws": ["", *LAWS]})
 
     def tell_news(self) -> None:
-        """Tell all open pages what is new of the loop that is watched."""
-        if self.live is None:
-            return
-        news = self.live.news()
-        if news is not None:
-            text = wire.to_text(news)
-            for socket in list(self.open):
-                socket.tell(text)
+        """Tell all open pages what is new of the loops that are watched."""
+        for number, live in enumerate(self.lives):
+            news = live.news()
+            if news is not None:
+                text = wire.to_text({"loop": number} | news)
+                for socket in list(self.open):
+                    socket.tell(text)
 
 
 class _Guarded(RequestHandler):
@@ -320,10 +323,10 @@ class _Socket(_Guarded, WebSocketHandler):
         self._pending: Future[str] | None = None
         self._present: dict[int, Controller | None] = {}
         self._shown = 0
-        if self.page.live is not None:
-            # What is new until now is part of everything.
-            self.page.tell_news()
-            self.tell(wire.to_text(self.page.live.everything()))
+        # What is new until now is part of everything.
+        self.page.tell_news()
+        for number, live in enumerate(self.page.lives):
+            self.tell(wire.to_text({"loop": number} | live.everything()))
         self.page.open.add(self)
         self._tell_subjects()
         self._news = PeriodicCallback(self._tell_news, 1000.0 * _EVERY)
@@ -351,8 +354,11 @@ class _Socket(_Guarded, WebSocketHandler):
         begun = time.perf_counter()
         try:
             question = json.loads(message)
-            if self.page.live is not None and "do" in question:
-                self.page.live.wish(self._wish(question))
+            if self.page.lives and "do" in question:
+                loop = question.get("loop", 0)
+                if not (isinstance(loop, int) and 0 <= loop < len(self.page.lives)):
+                    raise TuningError("there is no such loop")
+                self.page.lives[loop].wish(self._wish(question))
                 return
             count = question["n"]
             number, asked = self.page.question(question["of"], question["asked"])

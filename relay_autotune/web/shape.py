@@ -169,12 +169,14 @@ class Subject:
     :param shaping: what the design of gains takes; None: there may be no gains.
     :param first: what the command line asks for.
     :param command: returns the command line that gives the same again.
+    :param loop: number of the loop that it is of, on a page that watches some.
     """
 
     case: Case
     shaping: Shaping | None
     first: Asked
     command: Callable[[Asked], str]
+    loop: int = 0
     _found: dict[Asked, tuple[Designed, Gains] | TuningError] = field(
         default_factory=dict, repr=False
     )

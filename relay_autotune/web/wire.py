@@ -80,6 +80,7 @@ def of_subject(subject: Subject) -> dict[str, Any]:
     model = case.model
     return {
         "name": visible(case.source),
+        "loop": subject.loop,
         "facts": [visible(fact) for fact in facts_of(case, with_id=True)] if case.samples else [],
         "verdict": _verdict(case),
         "checks": _checks(case),

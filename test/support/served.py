@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -57,12 +57,14 @@ def served(
     *,
     ahead: bool = False,
     live: Live | None = None,
+    lives: Sequence[Live] = (),
 ) -> Iterator[str]:
     """Serve a page, and yield what to open.
 
     :param subjects: what it shows.
     :param address: where it is served.
     :param live: the loop that is watched.
+    :param lives: the loops, if there are several.
     :param ahead: whether what the slider may ask for is computed in between.
     """
     page = Page(
@@ -70,7 +72,7 @@ def served(
         lambda law: ("yaml",),
         lambda gains, how, doubt: f"{how} {gains.kc:.6g} {doubt}\n",
         address or Address(),
-        live,
+        [live] if live is not None else lives,
     )
     page.computes_ahead = ahead
     with in_background(page) as url:
@@ -112,9 +114,11 @@ class OpenPage:
     """A page that is open in a browser, as the server sees it, in a thread of its own.
 
     :param url: of the page.
+    :param loop: number of the loop that it watches.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, loop: int = 0) -> None:
+        self._number = loop
         self._address = url.replace("http:", "ws:", 1) + "socket"
         self.told: dict[str, Any] = {}
         """What it was told last of the loop."""
@@ -136,6 +140,8 @@ class OpenPage:
         self._opened.set()
         while (text := await self._socket.read_message()) is not None:
             message = json.loads(text)
+            if message.get("loop", self._number) != self._number:
+                continue
             self.told = message.get("live", self.told)
             self.shown |= message.get("shown", {})
             self.subjects = message.get("subjects", self.subjects)
@@ -152,7 +158,7 @@ class OpenPage:
         """Wish something."""
 
         def send() -> None:
-            self._socket.write_message(json.dumps({"do": wish}))
+            self._socket.write_message(json.dumps({"do": wish, "loop": self._number}))
 
         self._loop.call_soon_threadsafe(send)
 

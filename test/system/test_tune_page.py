@@ -29,11 +29,9 @@ PLANT = {
 RELAY = {"amplitude": 0.5, "baseline": 1.0, "settle_time": 0.4, "measurement_timeout": 10.0}
 
 
-def page_of(rig: Rig, *words: str) -> tuple[Process, str]:
+def page_of(rig: Rig, *words: str, loops: str = "/tank") -> tuple[Process, str]:
     """Start the command, and return it with the address that it prints."""
-    command = rig.start_command(
-        "tune_loop", "--namespace", "/tank", "--web", "--wait", "60", *words
-    )
+    command = rig.start_command("tune_loop", "--namespace", loops, "--web", "--wait", "60", *words)
     found = rig.until(lambda: re.search(r"the page is at (\S+)", command.log), "the address")
     return command, found[1]
 
@@ -42,12 +40,14 @@ def accepted(rig: Rig, page: OpenPage) -> None:
     """Check until a tune could start; right after the start nodes have not found each other."""
 
     def checked() -> bool:
-        if page.phase == "idle" and not page.told["accepted"]:
-            page.do("check")
-        return bool(page.told.get("accepted"))
+        count = page.told["checked"]
+        page.do("check")
+        # A second wish on its way would be a second check, during which no tune can be started.
+        rig.until(lambda: page.told["checked"] > count and page.phase == "idle", "a check")
+        return bool(page.told["accepted"])
 
+    rig.until(lambda: page.told, "what is known")
     rig.until(checked, "a check that accepts")
-    rig.until(lambda: page.phase == "idle", "the end of the check")
 
 
 def test_a_tune_is_ended_on_any_page_in_each_state_and_a_closed_one_changes_nothing(
@@ -109,6 +109,31 @@ def test_an_open_page_does_not_count_as_somebody_who_hears_the_command(rig: Rig)
     assert page.samples["command"] == []
     command.signal(signal.SIGINT)
     assert command.wait() == 1
+
+
+def test_two_loops_of_a_page_are_tuned_at_once_and_ended_apart(rig: Rig) -> None:
+    spaces = ("tank", "oven")
+    commands = {each: rig.listen(f"{each}/command", Float64, RELIABLE) for each in spaces}
+    for each in spaces:
+        named = ("-r", f"__ns:=/{each}")
+        rig.start("plant_node", *named, time_constants=[50.0], **PLANT)
+        rig.relay(*named, **RELAY)
+    command, url = page_of(rig, "--record-only", loops=",".join(spaces))
+    pages = {each: OpenPage(url, number) for number, each in enumerate(spaces)}
+    for each in spaces:
+        accepted(rig, pages[each])
+        pages[each].do("start")
+        rig.until(lambda each=each: any(m.data != 1.0 for m in commands[each]), f"a step: {each}")
+    pages["oven"].do("abort")
+    rig.until(lambda: pages["oven"].phase == "idle", "the end of one")
+    assert commands["oven"][-1].data == 1.0
+    assert pages["oven"].told["node"] == "/oven/relay_node"
+    assert pages["tank"].phase == "tuning"
+    # Ctrl-C ends the other one, then the command
+    command.signal(signal.SIGINT)
+    assert command.wait() == 1
+    rig.until(lambda: commands["tank"][-1].data == 1.0, "the safe command")
+    assert "Traceback" not in command.log
 
 
 LOOP = {

@@ -25,7 +25,7 @@ CALM = Wish("apply", 0, Asked(controller="pi", ms=1.3), 0.0)
 def sent(subject, wish):
     """Return the message with the gains that a wish means."""
     page = SimpleNamespace(subjects=[subject])
-    return GainsPage(None, Live("/relay_node"), page, lambda: False)._message(wish)[0]
+    return GainsPage(None, Live("/relay_node"), page, 0, lambda: False)._message(wish)[0]
 
 
 def test_the_gains_are_those_that_the_page_shows():
@@ -35,6 +35,13 @@ def test_the_gains_are_those_that_the_page_shows():
     assert message.experiment_id == subject.case.experiment_id
     assert message.final
     assert message.verdict == PidGains.VERDICT_TRUSTED
+
+
+def test_gains_for_another_loop_are_not_sent():
+    subject = subject_of(analysed())
+    subject.loop = 1
+    with pytest.raises(TuningError, match="another loop than /relay_node"):
+        sent(subject, CALM)
 
 
 def test_doubtful_gains_are_sent_only_when_they_are_accepted_and_say_so(monkeypatch):

@@ -228,7 +228,7 @@ def test_a_model_that_is_added_is_told_to_open_pages():
     from relay_autotune.web.address import Address
     from relay_autotune.web.server import Page, in_background
 
-    page = Page((), (), lambda *_: "", Address(), Live("/relay_node"))
+    page = Page((), lambda _: (), lambda *_: "", Address(), [Live("/relay_node")])
 
     async def listen(socket):
         assert (await heard(socket, lambda m: "subjects" in m))["subjects"] == []
@@ -238,3 +238,52 @@ def test_a_model_that_is_added_is_told_to_open_pages():
 
     with in_background(page) as url:
         assert talk(url, listen) == "the bag"
+
+
+def test_what_is_wished_goes_to_the_loop_that_is_meant():
+    lives = [Live("/tank/relay_node"), Live("/oven/relay_node")]
+    lives[1].tell(phase="tuning")
+
+    async def wish(socket):
+        told = [await heard(socket, lambda m: m.get("all")) for _ in lives]
+        await socket.write_message(json.dumps({"do": "abort", "loop": 1}))
+        await socket.write_message(json.dumps({"do": "start", "loop": 0}))
+        await socket.write_message(json.dumps({"do": "start", "loop": 2}))
+        while await socket.read_message() is not None:
+            continue
+        return [(m["loop"], m["live"]["node"]) for m in told]
+
+    with served([], lives=lives) as url:
+        assert talk(url, wish) == [(0, "/tank/relay_node"), (1, "/oven/relay_node")]
+    assert (lives[0].abort.is_set(), lives[1].abort.is_set()) == (False, True)
+    assert (lives[0].next_wish(), lives[1].next_wish()) == (Wish("start"), None)
+
+
+@pytest.mark.browser
+def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
+    lives = [Live("/tank/relay_node"), Live("/oven/relay_node")]
+    lives[0].tell(controller="/tank/controller_node", present="kc 1 u/y", step=0.5)
+    subject = subject_of(analysed())
+    subject.loop = 1
+    with served([subject], lives=lives) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab(url)
+        tab.wait("document.querySelectorAll('#loops button').length === 2")
+        assert tab.text("#live-title") == "/tank/relay_node"
+        assert not tab.text("#gains")
+        # gains of another loop are not offered, and a question makes way for a tune
+        assert tab.eval("document.querySelector('#apply').disabled")
+        tab.click("#verify")
+        tab.wait("document.querySelector('#question').open")
+        lives[1].tell(phase="tuning", state="relay", status="at the high level")
+        tab.wait("!document.querySelector('#question').open")
+        tab.click("#loops .stop")
+        tab.until(lives[1].abort.is_set, "the end of the other loop")
+        assert not lives[0].abort.is_set()
+        tab.click("#loops button:nth-child(2)")
+        tab.wait("document.querySelector('#live-status').innerText === 'at the high level'")
+        tab.wait("document.querySelector('#gains').innerText.startsWith('kc')")
+        assert not tab.eval("document.querySelector('#abort').disabled")
+        tab.click("#loops button:nth-child(1)")
+        tab.wait("document.querySelector('#live-title').innerText === '/tank/relay_node'")
+        assert not tab.text("#gains")
+        assert tab.said == []

@@ -201,6 +201,6 @@ def test_what_is_no_address_is_refused(text):
 
 def test_an_address_that_is_taken_is_refused_in_one_line(url, subject):
     port = int(url.rsplit(":")[-1].strip("/"))
-    page = Page([subject], (), lambda *_: "", Address("127.0.0.1", port))
+    page = Page([subject], lambda _: (), lambda *_: "", Address("127.0.0.1", port))
     with pytest.raises(SelectionError, match="--web-address"):
         asyncio.run(serve(page, lambda _: None))

@@ -35,40 +35,22 @@ function texts(host, name, lines) {
   }));
 }
 
-export class Live {
-  // send: sends a wish; agreed: asks a question and resolves to the answer; offered: returns the
-  // gains that the page shows, as {wish, words, doubtful}; null: it shows none
-  constructor(send, agreed, offered) {
-    this.send = send;
-    this.agreed = agreed;
-    this.offered = offered;
+// What is known of one loop.
+class Loop {
+  constructor(number) {
+    this.number = number;
     this.told = null;
+    this.shown = {};
     this.asking = 0; // number of the check after which the start is to be confirmed; 0: none
-    this.drawn = false;
     this.signals = { measurement: [[], []], command: [[], []] };
-    this.plots = {
-      measurement: new Plot($("plot-live-measurement"), { label: "Measurement as it comes", y: "measurement [y]" }),
-      command: new Plot($("plot-live-command"), { label: "Command as it comes", x: "time [s]", y: "command [u]" }),
-    };
-    $("check").addEventListener("click", () => send("check"));
-    $("start").addEventListener("click", () => { this.asking = this.told.checked + 1; send("check"); });
-    $("abort").addEventListener("click", () => send("abort"));
-    this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
-    this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
-    this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
-    $("apply").addEventListener("click", () => this.apply(Number($("step").value)));
-    $("apply-only").addEventListener("click", () => this.apply(0));
-    $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
-    $("revert").addEventListener("click", () => this.revert());
-    $("step").addEventListener("input", () => this.showForce());
   }
 
-  // message: {live: what is known, samples: the newest, all: they replace those before}
+  get phase() { return this.told ? this.told.phase : ""; }
+
+  get running() { return this.phase === "tuning" || this.phase === "verifying"; }
+
   take(message) {
-    if (message.live) this.show(message.live);
-    const { proof, model } = message.shown || {};
-    if (proof) this.showProof(proof);
-    if (model !== undefined) this.showModel(model);
+    Object.assign(this.shown, message.shown);
     for (const [name, [times, values]] of Object.entries(message.samples || {})) {
       const [t, v] = message.all ? [[], []] : this.signals[name];
       for (let k = 0; k < times.length; k += 1) {
@@ -82,6 +64,73 @@ export class Live {
       }
       this.signals[name] = t.length < MOST ? [t, v] : this.thinned(t, v);
     }
+  }
+
+  thinned(t, v) {
+    const half = t.length >> 1;
+    const keep = (_, k) => k >= half || k % 2 === 0;
+    return [t.filter(keep), v.filter(keep)];
+  }
+}
+
+export class Live {
+  // wish: sends a wish; agreed: asks a question and resolves to the answer; offered: returns the
+  // gains that the page shows, as {wish, words, doubtful}; null: it shows none; chosen: called
+  // when another loop is shown
+  constructor(wish, agreed, offered, chosen) {
+    this.wish = wish;
+    this.agreed = agreed;
+    this.offered = offered;
+    this.chosen = chosen;
+    this.loops = [];
+    this.loop = null; // the one that is shown
+    this.drawn = false;
+    const send = (what) => this.send(what);
+    this.plots = {
+      measurement: new Plot($("plot-live-measurement"), { label: "Measurement as it comes", y: "measurement [y]" }),
+      command: new Plot($("plot-live-command"), { label: "Command as it comes", x: "time [s]", y: "command [u]" }),
+    };
+    $("check").addEventListener("click", () => send("check"));
+    $("start").addEventListener("click", () => { this.loop.asking = this.told.checked + 1; send("check"); });
+    $("abort").addEventListener("click", () => send("abort"));
+    this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
+    this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
+    this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
+    $("apply").addEventListener("click", () => this.apply(Number($("step").value)));
+    $("apply-only").addEventListener("click", () => this.apply(0));
+    $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
+    $("revert").addEventListener("click", () => this.revert());
+    $("step").addEventListener("input", () => this.showForce());
+  }
+
+  get told() { return this.loop.told; }
+
+  get signals() { return this.loop.signals; }
+
+  send(what, more, loop = this.loop) { this.wish(what, { loop: loop.number, ...more }); }
+
+  // message: {loop: its number, live: what is known, shown: figures, samples: the newest,
+  //           all: they replace those before}
+  take(message) {
+    const loop = this.loops[message.loop] ||= new Loop(message.loop);
+    this.loop ||= loop;
+    loop.take(message);
+    if (message.live) {
+      const before = loop.told;
+      loop.told = message.live;
+      this.showLoops();
+      // A question must not stand before what ends a tune.
+      if (loop.running && !(before && before.phase === loop.phase) && $("question").open) $("question-no").click();
+      if (loop === this.loop) this.show(before);
+      if (loop.asking && loop.told.checked >= loop.asking) {
+        loop.asking = 0;
+        if (loop.told.accepted) this.ask(loop);
+      }
+    }
+    if (loop !== this.loop) return;
+    const { proof, model } = message.shown || {};
+    if (proof) this.showProof(proof);
+    if (model !== undefined) this.showModel(model);
     if (this.drawn || !message.samples) return;
     this.drawn = true;
     // Not by frames, which a window behind others never gets.
@@ -93,10 +142,41 @@ export class Live {
     }, 0);
   }
 
-  thinned(t, v) {
-    const half = t.length >> 1;
-    const keep = (_, k) => k >= half || k % 2 === 0;
-    return [t.filter(keep), v.filter(keep)];
+  // Show another loop.
+  choose(loop) {
+    this.loop = loop;
+    $("live-cycles").replaceChildren();
+    this.showLoops();
+    this.show(null);
+    this.showModel(loop.shown.model);
+    this.showProof(loop.shown.proof || []);
+    this.draw();
+    this.chosen();
+  }
+
+  // A tab for each of several loops, and an end for each that runs, whichever is shown.
+  showLoops() {
+    const host = $("loops");
+    host.hidden = this.loops.length < 2;
+    const words = JSON.stringify([this.loop.number, this.loops.map((each) => [each.told && each.told.node, each.phase])]);
+    if (host.hidden || this.words === words) return;
+    this.words = words;
+    host.replaceChildren();
+    const button = (text, work) => {
+      const made = document.createElement("button");
+      made.type = "button";
+      made.textContent = text;
+      made.addEventListener("click", work);
+      host.append(made);
+      return made;
+    };
+    for (const loop of this.loops.filter((each) => each && each.told)) {
+      const tab = button(`${loop.told.node}: ${loop.phase}`, () => this.choose(loop));
+      tab.setAttribute("aria-pressed", String(loop === this.loop));
+      if (loop.running && loop !== this.loop) {
+        button(`Abort ${loop.told.node}`, () => this.send("abort", {}, loop)).className = "stop";
+      }
+    }
   }
 
   draw() {
@@ -117,19 +197,17 @@ export class Live {
     document.body.dataset.measured = t.length ? t[t.length - 1] : "";
   }
 
-  show(told) {
-    const before = this.told;
-    this.told = told;
+  show(before) {
+    const told = this.told;
     $("live").hidden = false;
     $("live-bar").hidden = false;
     $("live-title").textContent = told.node;
     const tuning = told.phase === "tuning";
-    const running = tuning || told.phase === "verifying";
     const state = tuning ? told.state || "asked" : told.phase;
     if ($("live-state").textContent !== state) $("live-state").textContent = state;
     $("live-state").className = `chip ${told.tone || TONES[told.state] || ""}`;
     $("live-status").textContent = told.status;
-    $("abort").disabled = !running;
+    $("abort").disabled = !this.loop.running;
     $("abort").textContent = told.phase === "verifying" ? "End the verification" : "Abort the tune";
     $("check").disabled = $("start").disabled = told.phase !== "idle";
     $("progress").value = told.progress || 0;
@@ -149,15 +227,11 @@ export class Live {
     $("force-proof").hidden = !told.proof.length;
     $("force-proof").textContent = told.proof.join("\n");
     this.showForce();
-    if (this.asking && told.checked >= this.asking) {
-      this.asking = 0;
-      if (told.accepted) this.ask(told.checks);
-    }
   }
 
   // The gains of the page beside those of the running controller, and what may be done.
   showForce() {
-    if (!this.told || !this.told.controller) return;
+    if (!(this.loop && this.told && this.told.controller)) return;
     const { controller, present, phase } = this.told;
     const new_ = this.offered();
     $("force-now").textContent = `${controller} has ${present}`;
@@ -207,29 +281,29 @@ export class Live {
   async apply(step) {
     const new_ = this.offered();
     if (!new_) return;
-    const { controller, present } = this.told;
+    const { loop, told: { controller, present } } = this;
     if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
     const then = step ? this.stepWords(step) : "They are not verified.";
     const what = `${controller} has ${present}. At once it gets ${new_.words}, without a bump of the command. ${then}`;
     if (await this.agreed(what, step ? "Apply and verify" : "Apply")) {
-      this.send("apply", { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) });
+      this.send("apply", { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) }, loop);
     }
   }
 
   async verify(step) {
-    const { controller, present } = this.told;
-    if (await this.agreed(`${controller} keeps ${present}. ${this.stepWords(step)}`, "Verify")) this.send("verify", { step });
+    const { loop, told: { controller, present } } = this;
+    if (await this.agreed(`${controller} keeps ${present}. ${this.stepWords(step)}`, "Verify")) this.send("verify", { step }, loop);
   }
 
   async revert() {
-    const { controller, present } = this.told;
+    const { loop, told: { controller, present } } = this;
     const what = `${controller} has ${present}. At once it gets the gains that it had before, without a bump of the command.`;
-    if (await this.agreed(what, "Take them back")) this.send("revert");
+    if (await this.agreed(what, "Take them back")) this.send("revert", {}, loop);
   }
 
-  async ask(checks) {
-    const levels = checks.find((line) => line.includes("levels")) || "";
-    const what = `The relay will move the command of ${this.told.node} until the tune has ended. ${levels.replace(/\s+/g, " ")}`;
-    if (await this.agreed(what, "Start the tune")) this.send("start");
+  async ask(loop) {
+    const levels = loop.told.checks.find((line) => line.includes("levels")) || "";
+    const what = `The relay will move the command of ${loop.told.node} until the tune has ended. ${levels.replace(/\s+/g, " ")}`;
+    if (await this.agreed(what, "Start the tune")) this.send("start", {}, loop);
   }
 }

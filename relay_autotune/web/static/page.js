@@ -21,7 +21,7 @@ const plots = {
 let subjects = [];
 let laws = [];
 let keeps = ""; // the kinds of files that are offered
-let chosen = 0;
+let chosen = -1; // number of the model that is shown
 let asked = null; // what the controls say
 let shaped = null; // what was answered last
 let trade = [];
@@ -257,9 +257,10 @@ function showSubject() {
     plots.record.draw({ curves });
     plots.relay.draw({ curves: [{ x: r.command[0], y: r.command[1], kind: "command" }] });
   }
-  $("tabs").hidden = subjects.length < 2;
   $("tabs").replaceChildren();
-  subjects.forEach((each, k) => {
+  const here = subjects.map((each, k) => [each, k]).filter(([each]) => each.loop === subject.loop);
+  $("tabs").hidden = here.length < 2;
+  here.forEach(([each, k]) => {
     const button = put($("tabs"), "button", each.name);
     button.type = "button";
     button.setAttribute("aria-pressed", String(k === chosen));
@@ -320,33 +321,47 @@ async function download(path, file, more) {
 
 // The gains that the page shows now, for the running controller.
 function offered() {
-  if (!shaped) return null;
+  if (!shaped || subjects[chosen].loop !== live.loop.number) return null;
   return { wish: { of: chosen, asked: shaped.asked }, words: gainsWords(shaped), doubtful: shaped.doubtful };
+}
+
+// Another loop is shown, with its newest model.
+function showLoop() {
+  const k = subjects.map((each) => each.loop).lastIndexOf(live.loop.number);
+  for (const id of ["data", "shape", "calm-fast"]) $(id).hidden = k < 0;
+  if (k >= 0) { choose(k); return; }
+  chosen = -1;
+  shaped = null;
+  $("name").textContent = live.told.node;
+  document.title = `${live.told.node} - relay_autotune`;
+  $("facts").replaceChildren();
+  $("gains").textContent = $("verdict").textContent = "";
+  $("marks").replaceChildren();
+  saidChecks = "";
+  live.showForce();
 }
 
 let live = null; // made when the server has a loop to watch
 
 function take(message) {
   if (message.live || message.samples || message.shown) {
-    live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), agreed, offered);
+    live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), agreed, offered, showLoop);
     live.take(message);
     return;
   }
-  if (message.subjects && !message.subjects.length) {
-    $("name").textContent = live ? live.told.node : "";
-    document.title = `${$("name").textContent} - relay_autotune`;
-    $("data").hidden = true;
-    $("shape").hidden = true;
-    return;
-  }
   if (message.subjects) {
-    $("data").hidden = false;
-    const added = live && subjects.length && message.subjects.length > subjects.length;
+    const before = subjects.length;
     subjects = message.subjects;
     laws = message.laws;
-    // After a tune its own result is shown, else what the address says.
+    $("data").hidden = $("shape").hidden = !subjects.length;
     const of = Number(new URLSearchParams(location.hash.slice(1)).get("of") ?? -1);
-    choose(of >= 0 && of < subjects.length && !added ? of : added ? subjects.length - 1 : 0);
+    if (!live) { choose(of >= 0 && of < subjects.length ? of : 0); return; }
+    const own = subjects.map((each, k) => k).filter((k) => subjects[k].loop === live.loop.number);
+    const newest = own[own.length - 1];
+    // After a tune its own result is shown, else what the address says.
+    if (!own.length) showLoop();
+    else if (before && newest < before) showSubject();
+    else choose(!before && own.includes(of) ? of : newest);
     return;
   }
   if (message.trade_off) {
