@@ -3,8 +3,8 @@
 
 """The messages of ros2_control for the tests: those that are installed, else stand-ins.
 
-ros2_control is not on any package index. The stand-ins have the same names, fields and order; they
-are built once, with only the generators that rclpy needs.
+ros2_control does not come as wheels. The stand-ins have the same names, fields and order; they are
+built once, into build/.
 """
 
 from __future__ import annotations
