@@ -489,4 +489,10 @@ class JointTune:
         # Not before, since relay_node refuses a second publisher of the reference.
         nodes.start("controller_node", ros_arguments(self._space, topics, values))
         name = f"/{self._space.strip('/')}/controller_node"
-        return apply_at(name, doubtful=bool(doubt), yes=self._options.yes, patience=START_WITHIN)
+        return apply_at(
+            name,
+            doubtful=bool(doubt),
+            yes=self._options.yes,
+            stays=False,
+            patience=START_WITHIN,
+        )

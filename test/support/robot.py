@@ -1,12 +1,14 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A robot under a stand-in for ros2_control: manager, controllers and two simulated wheels.
+"""A robot under a stand-in for ros2_control: manager, controllers, and two wheels or an arm.
 
 It does what the sources of ros2_control and ros2_controllers (branch jazzy) do, and shares no code
 with them or with the package: strict switches, references that NaN leaves as they are, a state
 that may miss a message. Cycles are 10 ms apart by their stamps; a busy machine makes up for late
-ones, so that the wheels and the law are the same on any machine.
+ones, so that the joints and the law are the same on any machine.
+
+    python3 robot.py [base|arm]
 
 What happens is ordered on the topic /trouble: `refuse`, `die NAME`; who is active is told on
 /active.
@@ -16,8 +18,11 @@ from __future__ import annotations
 
 import math
 import random
+import sys
 import time
+from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass
 
 import rclpy
 from control_msgs.msg import MultiDOFCommand, MultiDOFStateStamped, SingleDOFState
@@ -32,16 +37,13 @@ from std_msgs.msg import Float64MultiArray, String
 
 RATE = 100
 PERIOD = 1.0 / RATE
-WHEELS = ("left_wheel", "right_wheel")
-# Velocity per effort, time constant and dead time: an ultimate period of 0.5 s.
-GAIN, TAU, DEAD = 2.0, 0.5, 0.14
-NOISE = 0.01
-CRUISE = 2.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 DESCRIPTION = """<robot name="base">
   <joint name="left_wheel" type="continuous"><limit effort="20" velocity="6"/></joint>
-  <joint name="right_wheel" type="continuous"><limit effort="20" velocity="6"/></joint>
+  <joint name="arm_2" type="revolute">
+    <limit lower="-1.3" upper="0.7" effort="20" velocity="6"/>
+  </joint>
   <ros2_control name="base" type="system">
     <joint name="left_wheel">
       <command_interface name="effort">
@@ -52,24 +54,105 @@ DESCRIPTION = """<robot name="base">
 </robot>"""
 
 
+class Wheel:
+    """A wheel whose velocity follows the effort: an ultimate period of 0.5 s.
+
+    :param velocity: at which it turns now.
+    """
+
+    GAIN, TAU, DEAD, NOISE = 2.0, 0.5, 0.14, 0.01
+
+    def __init__(self, velocity: float) -> None:
+        self.effort = velocity / self.GAIN
+        self._plant = FopdtPlant(self.GAIN, self.TAU, self.DEAD)
+        self._plant.command = self._plant.arrived = self.effort
+        self._plant.output = velocity
+
+    def measure(self, at: float, effort: float) -> float:
+        return self._plant.advance(at, effort) + random.gauss(0.0, self.NOISE)
+
+
+class Link:
+    """A link of an arm whose position integrates a velocity that lags the effort.
+
+    :param position: where it rests.
+    """
+
+    TAU, DELAY, NOISE = 0.3, 3, 0.0005
+
+    def __init__(self, position: float) -> None:
+        self.effort, self._velocity, self._position = 0.0, 0.0, position
+        self._on_the_way = deque([0.0] * self.DELAY)
+
+    def measure(self, at: float, effort: float) -> float:
+        self._on_the_way.append(effort)
+        held = self._on_the_way.popleft()
+        left = math.exp(-PERIOD / self.TAU)
+        away = self._velocity - held
+        self._position += held * PERIOD + away * self.TAU * (1.0 - left)
+        self._velocity = held + away * left
+        return self._position + random.gauss(0.0, self.NOISE)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a robot has.
+
+    :param controller: name of its pid_controller.
+    :param measured: the state interface.
+    :param joints: its joints, each at its reference.
+    :param gains: p and i that it begins with.
+    :param forward: the forwarding controllers, with the joints that they command.
+    """
+
+    controller: str
+    measured: str
+    joints: dict[str, float]
+    gains: tuple[float, float]
+    forward: dict[str, tuple[str, ...]]
+
+    def joint(self, value: float) -> Wheel | Link:
+        return Wheel(value) if self.measured == "velocity" else Link(value)
+
+
+KINDS = {
+    "base": Kind(
+        "wheel_controller",
+        "velocity",
+        {"left_wheel": 2.0, "right_wheel": 2.0},
+        (0.3, 0.6),
+        {"forward_left": ("left_wheel",)},
+    ),
+    "arm": Kind(
+        "arm_controller",
+        "position",
+        {"arm_1": 0.5, "arm_2": -0.3},
+        (6.0, 0.0),
+        {"forward_arm": ("arm_2", "arm_1")},
+    ),
+}
+
+
 class PidController:
     """pid_controller with one state interface."""
 
     type_name = "pid_controller/PidController"
 
-    def __init__(self, name: str, joints: tuple[str, ...]) -> None:
-        self.name, self.joints = name, joints
+    def __init__(self, kind: Kind) -> None:
+        self.name, self.joints = kind.controller, tuple(kind.joints)
+        name, joints = self.name, self.joints
         self.needs = tuple(f"{joint}/effort" for joint in joints)
         self.node = Node(name)
         declare = self.node.declare_parameter
         declare("dof_names", list(joints))
         declare("reference_and_state_dof_names", list(joints))
         declare("command_interface", "effort")
-        declare("reference_and_state_interfaces", ["velocity"])
+        declare("reference_and_state_interfaces", [kind.measured])
         declare("enable_feedforward", False)
         for joint in joints:
             for key, value in (
-                ("p", 0.3), ("i", 0.6), ("d", 0.0), ("u_clamp_max", 4.0), ("u_clamp_min", -4.0),
+                ("p", kind.gains[0]), ("i", kind.gains[1]), ("d", 0.0),
+                ("u_clamp_max", 4.0), ("u_clamp_min", -4.0),
                 ("antiwindup_strategy", "back_calculation"), ("tracking_time_constant", 0.0),
                 ("save_i_term", True), ("feedforward_gain", 0.0), ("angle_wraparound", False),
             ):  # fmt: skip
@@ -77,8 +160,8 @@ class PidController:
         self.read_gains()
         self.node.add_post_set_parameters_callback(lambda _: self.read_gains())
         count = len(joints)
-        self.reference, self.error = [CRUISE] * count, [0.0] * count
-        self.integral = [CRUISE / GAIN] * count
+        self.reference, self.error = list(kind.joints.values()), [0.0] * count
+        self.integral = [kind.joint(value).effort for value in kind.joints.values()]
         self.told: MultiDOFCommand | None = None
         self.states = self.node.create_publisher(MultiDOFStateStamped, "~/controller_state", 100)
         self.node.create_subscription(MultiDOFCommand, "~/reference", self.hear, BEST_EFFORT)
@@ -161,19 +244,21 @@ class ForwardController:
 class Manager:
     """controller_manager, its hardware and its control loop."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: Kind) -> None:
+        self.measured = kind.measured
         self.controllers = [
-            PidController("wheel_controller", WHEELS),
-            ForwardController("forward_left", ("left_wheel/effort",)),
+            PidController(kind),
+            *(
+                ForwardController(name, tuple(f"{joint}/effort" for joint in joints))
+                for name, joints in kind.forward.items()
+            ),
         ]
-        self.active = {"wheel_controller"}
+        self.active = {kind.controller}
         self.refuses = False
-        self.plants = {name: FopdtPlant(GAIN, TAU, DEAD) for name in WHEELS}
-        self.commands = {f"{name}/effort": CRUISE / GAIN for name in WHEELS}
+        self.joints = {name: kind.joint(value) for name, value in kind.joints.items()}
+        self.commands = {f"{name}/effort": joint.effort for name, joint in self.joints.items()}
+        self.now = dict(kind.joints)
         self.start, self.count = time.time(), 0
-        for name, plant in self.plants.items():
-            plant.command = plant.arrived = self.commands[f"{name}/effort"]
-            plant.output = CRUISE
         self.node = Node("controller_manager")
         node = self.node
         node.declare_parameter("update_rate", RATE)
@@ -207,16 +292,17 @@ class Manager:
             self.cycle(PERIOD * self.count)
 
     def cycle(self, at: float) -> None:
-        measured = {
-            name: plant.advance(at, self.commands[f"{name}/effort"]) + random.gauss(0.0, NOISE)
-            for name, plant in self.plants.items()
+        self.now = measured = {
+            name: joint.measure(at, self.commands[f"{name}/effort"])
+            for name, joint in self.joints.items()
         }
         stamp = self.start + at
         for controller in self.controllers:
             if controller.name in self.active:
                 controller.update(stamp, measured, self.commands)
-        names = random.sample(WHEELS, len(WHEELS))
-        state = JointState(name=names, velocity=[measured[name] for name in names])
+        names = random.sample(list(measured), len(measured))
+        state = JointState(name=names)
+        setattr(state, self.measured, [measured[name] for name in names])
         state.header.stamp.sec, state.header.stamp.nanosec = divmod(round(stamp * 1e9), 10**9)
         self.joint_states.publish(state)
 
@@ -253,10 +339,9 @@ class Manager:
         response.ok = not response.message
         if response.ok:
             self.active -= set(request.deactivate_controllers)
-            measured = {name: plant.output for name, plant in self.plants.items()}
             for each in self.controllers:
                 if each.name in request.activate_controllers:
-                    each.activate(measured)
+                    each.activate(self.now)
                     self.active.add(each.name)
             self.tell()
         return response
@@ -284,7 +369,7 @@ class Manager:
 
 def main() -> None:
     rclpy.init()
-    manager = Manager()
+    manager = Manager(KINDS[sys.argv[1] if len(sys.argv) > 1 else "base"])
     executor = SingleThreadedExecutor()
     for node in (manager.node, *(each.node for each in manager.controllers)):
         executor.add_node(node)

@@ -4,7 +4,9 @@
 """The messages of ros2_control for the tests: those that are installed, else stand-ins.
 
 ros2_control does not come as wheels. The stand-ins have the same names, fields and order; they are
-built once, into build/.
+built once, into build/. A command that needs them begins with
+
+    python3 test/support/robot_interfaces.py COMMAND
 """
 
 from __future__ import annotations
@@ -69,3 +71,7 @@ def _build(place: Path) -> None:
         for command in (["cmake", "-Wno-dev", *folders, *given], make):
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
+
+
+if __name__ == "__main__":
+    os.execvpe(sys.argv[1], sys.argv[1:], os.environ | interfaces())

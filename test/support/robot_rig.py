@@ -13,25 +13,27 @@ from robot_interfaces import interfaces
 from std_msgs.msg import String
 
 ROBOT = Path(__file__).parent / "robot.py"
-WORDS = (
-    "--controller", "wheel_controller", "--joint", "left_wheel", "--within", "0", "4", "--yes",
-    "--wait", "30",
-)  # fmt: skip
-GAINS = tuple(f"gains.left_wheel.{name}" for name in "pid")
+# Controller, joint and further words for each robot.
+TUNED = {
+    "base": ("wheel_controller", "left_wheel", "--within", "0", "4"),
+    "arm": ("arm_controller", "arm_2"),
+}
 
 
 class Robot:
     """A robot, and tune_loop beside it."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, kind: str = "base") -> None:
         self.rig = rig
+        self.controller, self.joint, *self.words = TUNED[kind]
         rig.environment |= interfaces() | {"HOME": str(rig.folder)}
         self.active = rig.listen("/active", String, LATCHED)
-        self.process = rig._begin("robot", [sys.executable, str(ROBOT)], None)
+        self.process = rig._begin("robot", [sys.executable, str(ROBOT), kind], None)
         rig.until(lambda: self.active, "the robot")
 
     def gains(self) -> list[float]:
-        return self.rig.values("wheel_controller", *GAINS)
+        names = (f"gains.{self.joint}.{name}" for name in "pid")
+        return self.rig.values(self.controller, *names)
 
     def history(self) -> list[str]:
         """Return who was active, from the start to now."""
@@ -43,4 +45,5 @@ class Robot:
         mouth.publish(String(data=trouble))
 
     def tune(self, *words: str) -> Process:
-        return self.rig.start_command("tune_loop", *WORDS, *words)
+        given = ("--controller", self.controller, "--joint", self.joint, *self.words, *words)
+        return self.rig.start_command("tune_loop", *given, "--yes", "--wait", "30")

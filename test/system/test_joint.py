@@ -9,9 +9,11 @@ import os
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
-from loop_rig import Rig
+from loop_rig import RELIABLE, Rig
 from robot_rig import Robot
+from std_msgs.msg import Float64MultiArray
 
 
 @pytest.fixture
@@ -106,3 +108,33 @@ def test_a_controller_that_dies_during_its_tune_is_told_and_left_as_it_is(robot:
     assert tune.wait(60.0) == 1
     assert "wheel_controller is inactive: its manager has ended it" in tune.log
     robot.rig.until(lambda: robot.history() == ["wheel_controller", ""], "the end of it")
+
+
+@pytest.mark.nightly
+def test_a_link_of_an_arm_is_tuned_within_the_limits_of_its_description(rig: Rig) -> None:
+    arm = Robot(rig, "arm")
+    before = arm.gains()
+    done = arm.tune()
+    assert done.wait(240.0) == 0, done.log
+    assert "-1.3 to 0.7 (robot_description)" in done.log
+    assert "passed: the loop does what the model predicts" in done.log
+    assert arm.gains() != before
+    assert arm.history() == ["arm_controller"]
+
+
+@pytest.mark.nightly
+def test_the_other_link_of_an_opened_arm_keeps_its_command(rig: Rig) -> None:
+    arm = Robot(rig, "arm")
+    told = rig.listen("/forward_arm/commands", Float64MultiArray, RELIABLE)
+    tune = arm.tune("--open")
+    rig.until(lambda: "cycle 1" in tune.log, "a cycle", 120.0)
+    tune.signal(signal.SIGINT)
+    assert tune.wait(60.0) != 0
+    rig.until(lambda: arm.history()[-1] == "arm_controller", "the controller")
+    assert "holds         arm_1/effort" in tune.log
+    # The first is arm_2, as the forwarding controller has its joints.
+    ours, others = (np.array([m.data[k] for m in told]) for k in (0, 1))
+    assert np.ptp(ours) > 0.2
+    assert np.ptp(others) == 0.0
+    assert abs(others[0]) < 0.05
+    assert np.abs(ours).max() <= 4.0
