@@ -112,7 +112,7 @@ def prove(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> b
             return _made(client, nodes, options, proof, step, bool(doubt))
         finally:
             nodes.end(_CONTROLLER)
-            _say_what_is_left(nodes, proof.rest.baseline)
+            say_what_is_left(nodes, proof.rest.baseline)
     except RelayAutotuneError as error:
         say(PROGRAM, f"the gains are not proven: {error}")
         return False
@@ -177,7 +177,7 @@ def _made(
                 nodes.require_alive()
                 loop.put_in_force(client.result.gains)
             patience = max(_TIMES_SETTLING * proof.settles, _REST_WITHIN)
-            with _noted() as leave:
+            with _noted(nodes) as leave:
                 found = loop.prove(step, 0.0, proof.settles, patience, shown, leave)
                 loop.let_settle(proof.settles, shown, "the loop goes back", leave)
         finally:
@@ -187,20 +187,26 @@ def _made(
 
 
 @contextmanager
-def _noted() -> Iterator[Callable[[], bool]]:
+def _noted(nodes: OwnNodes) -> Iterator[Callable[[], bool]]:
     """Only note signals in the block, and obey them after it.
 
     An exception could be lost in a callback of rclpy.
 
-    :return: what tells whether one has come.
+    :param nodes: of this command.
+    :return: what tells whether one has come, and raises LoopError if a node has ended.
     """
     came: list[int] = []
+
+    def leave() -> bool:
+        nodes.require_alive()
+        return bool(came)
+
     before = {
         number: signal.signal(number, lambda n, _: came.append(n))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     }
     try:
-        yield lambda: bool(came)
+        yield leave
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -208,8 +214,12 @@ def _noted() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt if came[0] == signal.SIGINT else SystemExit(128 + came[0])
 
 
-def _say_what_is_left(nodes: OwnNodes, command: float) -> None:
-    """Say in which state the plant is, now that the controller has ended."""
+def say_what_is_left(nodes: OwnNodes, command: float) -> None:
+    """Say in which state the plant is, when only relay_node holds its command.
+
+    :param nodes: of this command.
+    :param command: that at which the process rested before the tune [u].
+    """
     try:
         nodes.require_alive()
     except RelayAutotuneError as error:

@@ -377,9 +377,12 @@ def _hand_over(
     doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
     if joint is None:
         # Imported here, because it loads slowly and must not delay a tune.
-        from relay_autotune.cli.proof import prove
+        from relay_autotune.cli.proof import prove, say_what_is_left
 
         proven = prove(client, nodes, options)
+        if proven is None:
+            print()
+            say_what_is_left(nodes, options.at)
     how, file = exports_of(result.gains.law)[0], options.export
     if not (file or joint or options.yes) and sys.stdin.isatty():
         others = ", ".join(name for name in EXPORTS if name != how)

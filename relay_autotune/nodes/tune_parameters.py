@@ -32,7 +32,8 @@ NODE_PARAMETERS = (
         "safe_command",
         math.nan,
         "u",
-        "Command after a tune that was aborted or failed; NaN: the baseline.",
+        "Command after a tune that was aborted or failed; NaN: the baseline. If it is given, also "
+        "when the node ends while it passes commands on.",
     ),
     Quantity(
         "process_type",

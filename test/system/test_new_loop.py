@@ -18,6 +18,7 @@ import pytest
 import yaml
 from loop_rig import RELIABLE, Rig
 from pages import block_noted, blocks, commands, matches
+from ros_domain import mapped_segments
 from std_msgs.msg import Float64
 
 FAST = {
@@ -132,8 +133,20 @@ def test_the_session_of_the_readme_leads_to_proven_gains_and_leaves_nothing_runn
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(rig: Rig, number: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "node"),
+    [
+        (signal.SIGINT, ""),
+        (signal.SIGTERM, ""),
+        (signal.SIGHUP, ""),
+        (signal.SIGKILL, ""),
+        (signal.SIGKILL, "controller_node"),
+        (signal.SIGKILL, "relay_node"),
+    ],
+)
+def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(
+    rig: Rig, number: int, node: str
+) -> None:
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
     rig.start("plant_node", *TOPICS, **SLOWER | {"noise_std": 0.002})
     process = begun(rig, "--verify", "--step", "2")
@@ -148,12 +161,26 @@ def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(rig: Rig, numb
     rig.until(is_stepping, "the step", timeout=180.0)
     started = nodes_of(process.pid)
     assert len(started) == 3
-    process.send_signal(number)
+    by_name = {
+        name: pid
+        for pid in started
+        for name in ("relay_node", "controller_node")
+        if name in Path(f"/proc/{pid}/cmdline").read_text()
+    }
+    hit = by_name.get(node, process.pid)
+    if number == signal.SIGKILL:
+        # What it leaves behind is removed with the rig.
+        rig.processes[0].segments |= mapped_segments(hit)
+    os.kill(hit, number)
     rig.until(lambda: process.poll() is not None, "its end")
     output = process.stdout.read()
+    if node == "relay_node":
+        # Nobody can publish the command any more.
+        assert "the last command stays in force; see to the plant" in process.stderr.read()
+        return
     rig.until(lambda: not any(map(is_there, started)), "the end of its nodes")
     rig.until(lambda: heard[-1].data == 2.0, "the command before the tune")
-    if number != signal.SIGKILL:
+    if node or number != signal.SIGKILL:
         assert "the command stands at 2 u" in output
 
 
