@@ -39,7 +39,7 @@ GROUPS = {
             "joint_reading",
         ),
         *("fleet_time", "lockstep", "latency", "joint_tune", "endurance", "back_to_back"),
-        "page_latency",
+        *("page_latency", "page_load"),
     ),
     "papers": ("chang_studies", "thyagarajan_studies", "paper_designs"),
     "faults": (

@@ -152,7 +152,11 @@ class Page:
         :param asked: what is asked for.
         """
         subject = self.subjects[number]
-        shaped = subject.sketched(asked)
+        try:
+            shaped = subject.sketched(asked)
+        except RelayAutotuneError:
+            # The exact answer says what is wrong.
+            return None
         if shaped is None:
             return None
         return wire.to_text({"sketched": wire.of_shaped(subject, shaped)})
@@ -320,7 +324,7 @@ class _Socket(_Guarded, WebSocketHandler):
         self.set_nodelay(True)
         self._told: dict[int, tuple[Asked, int]] = {}
         self._asked: dict[int, Asked] = {}
-        self._pending: Future[str] | None = None
+        self._waits: asyncio.Task[None] | None = None
         self._present: dict[int, Controller | None] = {}
         self._shown = 0
         # What is new until now is part of everything.
@@ -348,6 +352,8 @@ class _Socket(_Guarded, WebSocketHandler):
         """Stop telling."""
         self.page.open.discard(self)
         self._news.stop()
+        if self._waits is not None:
+            self._waits.cancel()
 
     async def on_message(self, message: str | bytes) -> None:
         """Answer what the page asks."""
@@ -367,25 +373,23 @@ class _Socket(_Guarded, WebSocketHandler):
             return
         head = {"of": number, "n": count if isinstance(count, int) else 0}
         self._asked[number] = asked
-        if self._pending is not None:
+        if self._waits is not None:
             # The page shows the newest answer alone.
-            self._pending.cancel()
+            self._waits.cancel()
         known = self.page.known(number, asked)
         if known is not None:
             self._tell_answer(head, known, begun)
             return
-        self._pending = answer = self.page.ask(number, asked)
-        self._waits = asyncio.create_task(self._sketch_and_answer(head, asked, answer, begun))
+        self._waits = asyncio.create_task(self._sketch_and_answer(head, asked, begun))
 
-    async def _sketch_and_answer(
-        self, head: dict[str, int], asked: Asked, answer: Future[str], begun: float
-    ) -> None:
-        """Tell gains that come near, then the exact ones, unless something newer is asked."""
+    async def _sketch_and_answer(self, head: dict[str, int], asked: Asked, begun: float) -> None:
+        """Tell gains that come near, then the exact ones."""
+        # One after the other, since both threads would only hold each other up.
         sketch = await asyncio.to_thread(self.page.sketch, head["of"], asked)
-        if sketch is not None and answer is self._pending and not answer.done():
+        if sketch is not None:
             self._tell_answer(head, sketch, begun)
-        with suppress(asyncio.CancelledError):
-            self._tell_answer(head, await asyncio.wrap_future(answer), begun)
+        answer = await asyncio.wrap_future(self.page.ask(head["of"], asked))
+        self._tell_answer(head, answer, begun)
 
     def _tell_answer(self, head: dict[str, int], answer: str, begun: float) -> None:
         took = round(1000.0 * (time.perf_counter() - begun), 3)

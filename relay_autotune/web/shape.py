@@ -233,7 +233,7 @@ class Subject:
         They are judged on the model alone, and carry no verdict.
 
         :param asked: what is asked for.
-        :return: None: too little is known, or the exact ones are known.
+        :return: None: too little is known.
         """
         if self.shaping is None or asked.rule != DEFAULT_RULE:
             return None
@@ -244,7 +244,10 @@ class Subject:
                 for each, found in self._found.items()
                 if not isinstance(found, TuningError) and each.apart_from_ms == base
             )[:2]
-        if len(near) < 2 or near[0][0] == 0.0 or near[1][0] > _NEAR:
+        if near and near[0][0] == 0.0:
+            # The gains themselves are known, and what they do on all models is not.
+            near = [near[0], (0.0, asked.ms + STEP, near[0][2])]
+        if len(near) < 2 or near[1][0] > _NEAR:
             return None
         (_, low, one), (_, high, other) = near
         if (one.td > 0.0) != (other.td > 0.0):

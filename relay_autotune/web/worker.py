@@ -5,16 +5,19 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from typing import TypeVar
 
 _Result = TypeVar("_Result")
 _Work = Callable[[], object]
 # How long to wait for a question where nothing is worth computing ahead [s].
 _PAUSE = 0.25
+_NICE = 10
 
 
 class Worker:
@@ -54,6 +57,9 @@ class Worker:
         self._queue.put(lambda: None)
 
     def _run(self) -> None:
+        # Nodes of the loop may need the same processor. Linux has a priority for each thread.
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         while self._open:
             try:
                 work: _Work | None = self._queue.get_nowait()

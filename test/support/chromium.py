@@ -56,6 +56,11 @@ class Chromium:
         self._loop = asyncio.new_event_loop()
         self._tabs: list[Tab] = []
 
+    @property
+    def pid(self) -> int:
+        """The process that has started all others."""
+        return self._process.pid
+
     def __enter__(self) -> Self:
         return self
 

@@ -127,9 +127,10 @@ def test_a_sketch_comes_near_to_the_gains_that_are_then_found(analysis):
     assert sketch.judgement == NOT_JUDGED
     assert ends[0] < sketch.gains.kc < ends[1]
     exact = subject.shaped(asked[2]).gains
+    known = subject.sketched(asked[2]).gains
+    assert (known.kc, known.ti, known.ms) == pytest.approx((exact.kc, exact.ti, exact.ms))
     assert sketch.gains.kc == pytest.approx(exact.kc, rel=0.03)
     assert sketch.gains.ti == pytest.approx(exact.ti, rel=0.03)
-    assert subject.sketched(asked[2]) is None
     assert subject.sketched(replace(asked[2], law="pid_controller", sample_period=0.5)) is None
     assert subject.sketched(replace(asked[2], rule="simc", ms=1.4)) is None
 
