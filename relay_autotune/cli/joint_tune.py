@@ -329,6 +329,7 @@ class JointTune:
             "baseline": self._baseline,
             "command_min": low,
             "command_max": high,
+            "use_sim_time": loop.is_simulated,
         }
         if loop.measured == "position" and loop.commanded != "position":
             # It drifts at a constant command, but its controllers come back at once.

@@ -77,6 +77,7 @@ class JointLoop:
     :param measured: what is controlled, such as ``velocity``.
     :param has_rate: True if the derivative comes from a second state interface.
     :param period: of the controller's updates [s].
+    :param is_simulated: True if the robot runs on /clock.
     :param gains: p, i and d in force.
     :param strategy: against windup.
     :param tracking_time_constant: of that strategy [s]; 0: control_toolbox's own.
@@ -100,6 +101,7 @@ class JointLoop:
     measured: str
     has_rate: bool
     period: float
+    is_simulated: bool
     gains: tuple[float, float, float]
     strategy: str
     tracking_time_constant: float
@@ -205,6 +207,7 @@ def joint_loop(
             "command_interface",
             "reference_and_state_interfaces",
             "enable_feedforward",
+            "use_sim_time",
         ),
     )
     dofs = tuple(wide["dof_names"])
@@ -233,6 +236,7 @@ def joint_loop(
         measured,
         len(wide["reference_and_state_interfaces"]) > 1,
         1.0 / _rate(client, manager, found),
+        wide["use_sim_time"],
         (own["p"], own["i"], own["d"]),
         own["antiwindup_strategy"],
         own["tracking_time_constant"],

@@ -44,6 +44,19 @@ def test_samples_are_timed_by_their_source_stamps() -> None:
     assert np.all(record.command == 0.5)
 
 
+def test_where_the_stamps_are_the_only_clock_a_simulation_may_run_at_any_pace() -> None:
+    session = Session(experiment(), "one", one_clock=True)
+    for k in range(300):
+        # Half as fast as our clock, which the stamps would otherwise be held against.
+        assert session.answer(1.0, info(10_000_000 * (k + 1), 20_000_000 * k)) == 0.5
+        session.answered()
+    assert not session.experiment.finished
+    record = session.record()
+    assert record.time == pytest.approx(0.01 * np.arange(300))
+    assert np.array_equal(record.receive_time, record.time)
+    assert np.array_equal(record.command_time, record.time)
+
+
 def test_without_source_stamps_the_arrival_counts() -> None:
     session = Session(experiment(), "one")
     for received in (10, 30, 60):

@@ -46,4 +46,4 @@ class Robot:
 
     def tune(self, *words: str) -> Process:
         given = ("--controller", self.controller, "--joint", self.joint, *self.words, *words)
-        return self.rig.start_command("tune_loop", *given, "--yes", "--wait", "30")
+        return self.rig.start_command("tune_loop", "--yes", "--wait", "30", *given)

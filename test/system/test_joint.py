@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,35 @@ def test_a_dry_run_switches_nothing_and_says_what_would_move(robot: Robot) -> No
     done = robot.tune("--open", "--dry-run")
     assert done.wait(60.0) == 0, done.log
     assert not [line for line in PLAN if line not in " ".join(done.log.split())]
+    assert robot.history() == ["wheel_controller"]
+
+
+@pytest.mark.skipif(find_spec("controller_manager_msgs") is not None, reason="it is installed")
+def test_without_the_messages_of_ros2_control_one_line_says_what_to_install(rig: Rig) -> None:
+    done = rig.start_command("tune_loop", "--controller", "any", "--joint", "joint")
+    assert done.wait() == 1
+    told = " ".join(done.log.split())
+    assert "sudo apt install ros-jazzy-controller-manager-msgs" in told
+    assert "Traceback" not in told
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--joint", "wheel"), "no joint wheel: expected one of left_wheel, right_wheel"),
+        (("--controller", "pid"), "has no controller pid: found wheel_controller"),
+        (("--controller", "forward_left"), "is a forward_command_controller"),
+        (("--controller-manager", "cm"), "of those that list_controllers: /controller_manager"),
+        (("--open", "--forward", "other"), "type --forward with one of forward_left"),
+    ],
+)
+def test_what_cannot_be_found_gets_one_line(
+    robot: Robot, words: tuple[str, ...], told: str
+) -> None:
+    done = robot.tune(*words, "--wait", "5")
+    assert done.wait() == 1
+    assert told in " ".join(done.log.split())
     assert robot.history() == ["wheel_controller"]
 
 
