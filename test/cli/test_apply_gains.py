@@ -62,6 +62,15 @@ def test_a_verdict_has_five_lines() -> None:
     assert "kc 0.6000, ti 0.7500, td 0.2000; apply_gains --revert" in lines[4]
 
 
+def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
+    close = step(reason="narrowly: the gain is 0.66 times the model's, 0.6 to 1.7 passes; numbers")
+    result = Verify.Result(passed=True, reason="long", steps=[step(), close])
+    first = verdict_lines(result, None, 99)[0]
+    assert first.split(maxsplit=1)[1] == (
+        "passed, narrowly: the gain is 0.66 times the model's, 0.6 to 1.7 passes"
+    )
+
+
 def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
     failed = Verify.Result(passed=False, reason="it settles later; kc 0.1 in force again")
     text = "\n".join(verdict_lines(failed, Controller(0.1, 3.0), 60))
