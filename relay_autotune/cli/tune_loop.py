@@ -104,7 +104,9 @@ def main(args: Sequence[str] | None = None) -> int:
         what = (options.joint or options.measurement, options.controller or options.command)
         told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
         print(told, file=sys.stderr, flush=True)
-    import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
+    starts = bool(options.measurement or options.joint)
+    with Working("loading what talks to the nodes") if starts else nullcontext():
+        import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
 
     return guarded(PROGRAM, lambda: _tune(options, ros))
 
