@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say, worst
@@ -61,6 +62,7 @@ class _OnPage:
     :param ends: gets a number when the tune is to end.
     :param interrupted: signals that have come.
     :param cycles: messages of the cycles so far.
+    :param compute: has something computed by another thread.
     :param begun: called at the first feedback.
     """
 
@@ -71,6 +73,7 @@ class _OnPage:
         ends: list[int],
         interrupted: list[int],
         cycles: list[Any],
+        compute: Callable[[Callable[[], None]], object],
         begun: Callable[[], object],
     ) -> None:
         self._live = live
@@ -78,7 +81,7 @@ class _OnPage:
         self._ends = ends
         self._interrupted = interrupted
         self._heeded = len(interrupted)
-        self._cycles = cycles
+        self._cycles, self._compute = cycles, compute
         self._gains: list[tuple[int, EstimatedQuantity]] = []
         self._begun: Callable[[], object] | None = begun
 
@@ -100,20 +103,29 @@ class _OnPage:
             words = (f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback))
             changed["cycles"] = (*told.cycles, ", ".join(filter(None, words)))
         if feedback.transfer_function.experiment_id:
-            found = identification_from_message(feedback.transfer_function)
-            changed["process"] = process_text(found.model)
-            self._show_model(found, feedback.cycle)
+            changed["process"] = self.model(feedback.transfer_function, feedback.cycle)
         self._live.tell(**changed)
         self._shown.take(feedback)
 
-    def _show_model(self, found: Identification, cycle: int) -> None:
+    def model(self, message: Any, cycle: int) -> str:
+        """Show a model, and return it as text.
+
+        :param message: the `TransferFunction`.
+        :param cycle: number of whole cycles.
+        """
+        found = identification_from_message(message)
+        # By another thread: this one has to hear relay_node, and who ends the tune.
+        self._compute(partial(self._show_model, found, cycle, list(self._cycles)))
+        return process_text(found.model)
+
+    def _show_model(self, found: Identification, cycle: int, cycles: list[Any]) -> None:
         """Show a model over the data so far, and how its intervals narrow."""
         case = model_case(found, None)
         self._gains += [(cycle, e) for e in case.ultimate if e.name == ULTIMATE_GAIN]
         record = None
         # Without the first cycle it is not known where the process was at rest.
-        if {0, *(c.index for c in self._cycles)} == set(range(len(self._cycles))):
-            record = record_from_cycles(self._cycles)
+        if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
+            record = record_from_cycles(cycles)
         self._live.show("model", of_running(case, record, self._gains))
 
     def tick(self) -> None:
@@ -310,7 +322,7 @@ class _LoopOnPage:
             client.ask(self._options.amplitude, dry_run=False)
             # Only once it has begun: see TuneClient.command_watch.
             shown = _OnPage(
-                live, self._shown, ends, interrupted, self._cycles,
+                live, self._shown, ends, interrupted, self._cycles, self._page.worker.ask,
                 lambda: stack.enter_context(self._commands_shown()),
             )  # fmt: skip
             self._follow(client, shown, ends, _TICK)
@@ -329,6 +341,9 @@ class _LoopOnPage:
             result=tuple(lines),
         )
         if result.transfer_function.experiment_id:
+            # A short tune ends before any model came.
+            cycles = len(live.told.cycles)
+            live.tell(process=shown.model(result.transfer_function, cycles))
             self._add_subject(result)
         done = client.succeeded and bool(result.gains.experiment_id)
         live.forget_wishes()
