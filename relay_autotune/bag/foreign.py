@@ -14,7 +14,7 @@ import numpy as np
 from relay_autotune.bag.fields import split_name
 from relay_autotune.bag.joints import Choice, has_joints, named_pair
 from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
-from relay_autotune.bag.signals import Signal, join
+from relay_autotune.bag.signals import Signal, join, preceded
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.excitation import find_experiments
@@ -35,6 +35,7 @@ def experiments_of_pair(
     joint: str = "",
     joint_order: tuple[str, ...] = (),
     whole: bool = False,
+    before: float | None = None,
 ) -> tuple[list[Record], list[str]]:
     """Return the experiments in two topics, and notes about them.
 
@@ -44,6 +45,7 @@ def experiments_of_pair(
     :param joint: name of the joint that both are of; empty: none is named.
     :param joint_order: the joints in the order of commands that do not name them.
     :param whole: whether they are one experiment, whatever they look like.
+    :param before: command that held before the recording; None: its first one.
     :raises SelectionError: if the names do not fit, or more than one pair does.
     :raises BagError: if nothing stands out of the noise.
     """
@@ -74,7 +76,7 @@ def experiments_of_pair(
             f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
             f"they are aligned by the recorder's clock"
         )
-    records, found = take_apart(join(signals[0], signals[1]), whole=whole)
+    records, found = take_apart(join(signals[0], preceded(signals[1], before)), whole=whole)
     return records, [*notes, *found]
 
 

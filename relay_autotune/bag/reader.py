@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from relay_autotune.bag.experiments import interrupted_experiment, recorded_experiments
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.mcap_file import McapFile
-from relay_autotune.bag.signals import join, window
+from relay_autotune.bag.signals import join, preceded, window
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.timing import CLOCKS
 from relay_autotune.bag.topics import Progress, Topics
@@ -72,6 +72,7 @@ class Selection:
     joint_order: tuple[str, ...] = ()
     time_unit: str | None = None
     period: float | None = None
+    command_before: float | None = None
 
     @property
     def is_part(self) -> bool:
@@ -222,6 +223,7 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
         joint=wanted.joint,
         joint_order=wanted.joint_order,
         whole=wanted.is_part,
+        before=wanted.command_before,
     )
 
 
@@ -233,6 +235,7 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
         wanted.measurement, wanted.command, wanted.time, wanted.time_unit, wanted.period
     )
     log = read_csv(path, columns)
-    record = join(log.measurement, log.command, dated=log.dated)
+    command = preceded(log.command, wanted.command_before)
+    record = join(log.measurement, command, dated=log.dated)
     records, notes = take_apart(record, whole=wanted.is_part)
     return records, [*log.notes, *notes]

@@ -32,6 +32,18 @@ class Signal:
         return int(self.values.size)
 
 
+def preceded(command: Signal, before: float | None) -> Signal:
+    """Return a command with the level that held before its first value.
+
+    :param command: the command.
+    :param before: the level; None: it is not known.
+    """
+    if before is None or not len(command):
+        return command
+    time_ns = np.concatenate((command.time_ns[:1], command.time_ns))
+    return replace(command, time_ns=time_ns, values=np.append(before, command.values))
+
+
 def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
     """Return the record of a loop of which measurement and command were recorded.
 
@@ -117,10 +129,13 @@ def _check(signal: Signal, role: str) -> None:
             f"recording"
         )
     if bool(np.all(signal.values == signal.values[0])):
-        what = "is constant" if role == "measurement" else "never changes"
+        what, remedy = "is constant", ""
+        if role == "command":
+            what = "never changes"
+            remedy = "; if it was another before the recording, give that as --command-before"
         raise BagError(
             f"the {role} {signal.name} {what} ({signal.values[0]:g} in all of {len(signal)} "
-            f"values): nothing can be identified from it"
+            f"values): nothing can be identified from it{remedy}"
         )
 
 

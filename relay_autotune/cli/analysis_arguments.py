@@ -43,6 +43,10 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
     )
     taken.add_argument(
+        "--command-before", type=finite, metavar="U",
+        help="command that held before the recording, where that begins with its step",
+    )  # fmt: skip
+    taken.add_argument(
         "--clock", choices=CLOCKS, default=CLOCKS[0],
         help="time of a message: when it was published, when it was recorded, or its header's "
         "stamp (%(default)s)",
@@ -144,6 +148,7 @@ def jobs_of(
                 order,
                 options.time_unit,
                 options.period,
+                options.command_before,
             ),
             method=options.method,
             rule=options.rule,

@@ -344,3 +344,17 @@ def test_a_relay_may_be_on_or_off_and_a_few_damaged_rows_are_left_out(tmp_path):
         " ".join(found.notes)
     )
     assert "2 lines between the rows hold remarks" in " ".join(found.notes)
+
+
+def test_a_step_before_the_first_row_needs_the_command_before_it(tmp_path):
+    t = 0.05 * np.arange(60)
+    speed = 1000.0 * (1.0 - np.exp(-t / 0.3)) + np.random.default_rng(2).normal(0.0, 5.0, 60)
+    text = "t,volt,speed\n" + "".join(
+        f"{a:.2f},10,{b:.2f}\n" for a, b in zip(t, speed, strict=True)
+    )
+    path = write(tmp_path / "a.csv", text)
+    with pytest.raises(BagError, match=r"never changes \(10 in all.*--command-before"):
+        read_experiments(path)
+    (record,) = read_experiments(path, Selection(command_before=0.0)).experiments
+    held = record.input()
+    assert (held.initial, held.times.tolist(), held.values.tolist()) == (0.0, [0.0], [10.0])

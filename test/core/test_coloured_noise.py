@@ -167,6 +167,37 @@ def test_a_step_after_a_rest_of_few_samples_is_no_drift():
     assert found.dead_time < 2.0
 
 
+def test_a_process_that_visibly_rested_needs_no_past():
+    """A heater at an uneven supply, of which a free state explained the first 100 s."""
+    time = np.arange(481.0)
+    rng = np.random.default_rng(4)
+    supply = 1.0 + 0.5 * lfilter([0.2], [1.0, -0.98], rng.standard_normal(481))
+    power = np.where(time >= 30.0, 178.5, 0.0) * np.maximum(supply, 0.0)
+    for tau in (12.0, 250.0):
+        power = lfilter([1.0 / tau], [1.0, 1.0 / tau - 1.0], power)
+    y = 0.49 * np.round((29.33 + 0.53 * power) / 0.49)
+    u = PiecewiseConstant(np.array([30.0]), np.array([178.5]), initial=0.0)
+    found = identify_waveform(Record(time=time, measurement=y, command=u(time)))
+    assert found.model.gain > 0.0
+    assert found.model.dead_time < 20.0
+
+
+def test_a_step_that_came_just_before_the_record_leaves_no_endless_dead_time():
+    """Gain and dead time cannot be told apart; draws of 1e9 s took the gains for ever."""
+    time = 0.02 * np.arange(170.0)
+    u = PiecewiseConstant(np.array([0.0]), np.array([255.0]), initial=0.0)
+    process = TransferFunction.fopdt(2.6, 0.23, 0.0)
+    noise = np.random.default_rng(4).normal(0.0, 9.5, time.size)
+    y = response(process, time + 0.01, u) + noise
+    record = Record(time=time, measurement=y, command=u(time), held_input=u)
+    found = identify_waveform(record)
+    slow = found.model.dead_time + sum(abs(t) for t in found.model.time_constants)
+    assert found.model.gain == pytest.approx(2.6, rel=0.1)
+    at = found.parameters.index("dead_time")
+    assert found.std[at] <= 0.6 * slow
+    assert found.ci95_high[at] < 1.5 * slow
+
+
 def test_heating_up_from_cold_is_no_switch_of_the_relay():
     """The relay keeps 60 within 2.5; the heater was switched on at 20."""
     time = np.arange(0.0, 4000.0, 2.0)

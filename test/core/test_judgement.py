@@ -214,7 +214,7 @@ def test_gains_that_do_not_hold_on_one_half_are_doubtful(gains):
 
 
 def test_a_half_that_works_in_the_other_direction_gives_no_gains(gains):
-    record = joined(PROCESS, TransferFunction.fopdt(-2.0, 10.0, 3.0))
+    record = joined(PROCESS, TransferFunction.fopdt(-4.0, 10.0, 3.0))
     found = of_checks(record, fitted_as(PROCESS, record), gains)["halves_direction"]
     assert found.value == 1.0
     assert found.result is Result.FAILED

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.partial_fractions import partial_fractions
 from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.rational import free_motion, responses
+from relay_autotune.identification.waveform.selection import support
 from relay_autotune.identification.waveform.theta import columns_of
 from relay_autotune.process.factors import Denominator, Lag, Quadratic, UnstableLag
 from relay_autotune.process.response import response
@@ -236,3 +238,20 @@ def test_a_drift_beside_a_slow_pole_and_zero_is_no_process():
     slowest = max(abs(c) for c in (*found.model.time_constants, *found.model.zeros))
     assert slowest < 2.0 * time[-1]
     assert found.ultimate_gain == pytest.approx(1.9034, rel=0.05)
+
+
+def test_a_response_that_turns_only_after_the_record_is_unseen():
+    # From 400 s on a higher command is said to lower the measurement, which first rises.
+    model = TransferFunction(
+        -0.01, dead_time=5.0, zeros=(-300.0,), time_constants=(100.0,), integrators=1
+    )
+    assert is_unseen(model, 1.0, 390.0)
+    assert not is_unseen(model, 1.0, 420.0)
+    inverse = TransferFunction(2.0, dead_time=1.0, zeros=(-3.0,), time_constants=(10.0, 4.0))
+    assert not is_unseen(inverse, 0.1, 100.0)
+
+
+def test_the_support_of_candidates_that_are_not_in_order():
+    found = support([SimpleNamespace(criterion=c) for c in (-36500.0, -38748.0, -38746.0)])
+    assert found[0] == pytest.approx(0.0, abs=1e-300)
+    assert found[1] == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))

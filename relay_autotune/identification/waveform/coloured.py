@@ -25,14 +25,14 @@ from relay_autotune.identification.waveform.fit_covariance import (
     estimate_of,
 )
 from relay_autotune.identification.waveform.residuals import ljung_box, worth
-from relay_autotune.identification.waveform.selection import Candidate, Ground, nuisances_of
-from relay_autotune.identification.waveform.separable import Problem, Trial, refine
-from relay_autotune.identification.waveform.starts import (
-    Starts,
-    changes_within,
-    refine_best,
-    start_fopdt,
+from relay_autotune.identification.waveform.selection import (
+    Candidate,
+    Ground,
+    begins_at_rest,
+    nuisances_of,
 )
+from relay_autotune.identification.waveform.separable import Problem, Trial, refine
+from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
 from relay_autotune.identification.waveform.theta import unit_steps
 
 FloatArray = NDArray[np.float64]
@@ -60,10 +60,6 @@ _FIRST = ("fopdt", "sopdt", "sopdt_zero")
 _OTHERS = (("lag_n", 3), ("lag_n", 5), ("lag_n", 8), ("three_lags", 0))
 _INTEGRATING = (("ipdt", 0), ("integrator_lag", 0), ("integrator_inverse", 0))
 _UNSTABLE = (("unstable_fopdt", 0), ("unstable_sopdt", 0))
-# Least number of samples of a rest that shows the past, and the largest share of its range by
-# which the measurement moves during it.
-_ENOUGH_REST = 15
-_STILL = 0.05
 # Longest dead time, as a share of the record: a later response cannot be told from a drift.
 _LONGEST = 0.25
 # Gain in the criterion asked of an integrator, a growing mode or a free past: they fit any drift.
@@ -109,7 +105,8 @@ def is_clearly_coloured(problem: Problem, sign: int) -> bool:
     :param problem: samples and input, with a FOPDT structure.
     :param sign: direction of the relay; 0: not known.
     """
-    few = replace(problem.thinned(_FEW), past=problem.past_is_open)
+    rested = not sign and begins_at_rest(problem)
+    few = replace(problem.thinned(_FEW), past=problem.past_is_open and not rested)
     found = Ground.of(few, few.time.size * NEGLIGIBLE**2, sign)
     if found.problem.time.size < few.time.size:
         # The first samples, which no past explains, were left out.
@@ -139,9 +136,16 @@ def in_colour(
     found = _compared(*_dense_enough(whole, sign), sign, names, known.order, held=held)
     if not found or found[0].problem.colour is None:
         return None
-    chosen = next((c for c in found if _is_told(c)), found[0])
-    found = [chosen, *(c for c in found if c is not chosen)]
-    return Fit(chosen.problem, refine(chosen.problem, chosen.state.theta), tuple(found), scale)
+    # The last steps of a fit may lead to where a pole and a zero cancel: they come first.
+    told = (c for c in map(_finished, found) if _is_told(c))
+    chosen = next(told, None) or _finished(found[0])
+    others = (c for c in found if c.structure != chosen.structure)
+    return Fit(chosen.problem, chosen.state, (chosen, *others), scale)
+
+
+def _finished(candidate: Candidate) -> Candidate:
+    state = refine(candidate.problem, candidate.state.theta)
+    return replace(candidate, state=state)
 
 
 def _is_told(candidate: Candidate) -> bool:
@@ -196,7 +200,7 @@ def _compared(
     """
     grounds = [
         _ground(replace(few, relaxation=relaxation, past=past), sign)
-        for relaxation, past in (_PASTS[:1] if _rests(problem) else _PASTS)
+        for relaxation, past in (_PASTS[:1] if begins_at_rest(problem) else _PASTS)
         if problem.past_is_open or not past
     ]
     # Each past is judged in the colour of its own residual; a richer one has to be clearly better.
@@ -247,20 +251,6 @@ def _ground(problem: Problem, sign: int) -> Ground:
     fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
     floor = problem.time.size * NEGLIGIBLE**2
     return Ground(problem, fopdt, Starts(problem, fopdt), floor, sign)
-
-
-def _rests(problem: Problem) -> bool:
-    """Return whether each experiment begins with a rest, which shows what came before."""
-    for part, u in zip(problem.experiments, problem.inputs, strict=True):
-        time, y = problem.time[part], problem.y[part]
-        changes = changes_within(u, time)
-        before = time < (changes[0] if changes.size else time[0])
-        if np.count_nonzero(before) < _ENOUGH_REST:
-            return False
-        moved = np.polyfit(time[before], y[before], 1)[0] * np.ptp(time[before])
-        if abs(float(moved)) > _STILL * float(np.ptp(y)):
-            return False
-    return True
 
 
 def _converged(found: list[Candidate], ground: Ground) -> list[Candidate]:

@@ -22,6 +22,7 @@ from relay_autotune.identification.waveform.residuals import (
 )
 from relay_autotune.identification.waveform.selection import Candidate
 from relay_autotune.identification.waveform.separable import Problem, Trial
+from relay_autotune.identification.waveform.theta import unit_steps
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -117,6 +118,12 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)
+    # A dead time is known to half of all times of the process together: without samples before
+    # the response, gain and dead time cannot be told apart at all.
+    slow = unit_steps(problem.structure, state.theta)[-1]
+    prior = np.zeros((jacobian.shape[0], 1))
+    prior[-1] = math.sqrt(float(scores @ scores) / n) / (0.5 * slow)
+    jacobian, scores = np.append(jacobian, prior, axis=1), np.append(scores, 0.0)
     size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((jacobian / size[:, None]).T)

@@ -71,6 +71,7 @@ _MOST_ROUNDS = 20
 _SETTLED = 1e-6
 _STEADY = 0.02
 _LEAST_NOISE = 1e-3
+_SEEN = "a response that the samples show (it is over between two of them)"
 
 
 def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
@@ -296,8 +297,9 @@ def _candidates(ground: Ground, known: Known) -> list[Candidate]:
         candidates = fit_all(ground)
         if not candidates:
             raise IdentificationError(
-                "no structure explains the record with a gain in the direction of the relay: "
-                "check that command and measurement belong to one loop"
+                "no structure explains the record with "
+                + ("a gain in the direction of the relay" if ground.sign else _SEEN)
+                + ": check that command and measurement belong to one loop"
             )
         return candidates
     found = fit_one(ground, known.structure, known.order)

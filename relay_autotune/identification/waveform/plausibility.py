@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 
 # Least number of samples in each period of an oscillation of the process.
 _SAMPLES_A_SWING = 4.0
@@ -22,7 +26,9 @@ def is_unseen(model: TransferFunction, interval: float, length: float) -> bool:
 
     It rings faster than the samples show: noise alone leads to such a resonance, of any height,
     and it would limit every gain. Or its whole response falls between two samples, or comes from
-    an unreasonable zero: so a controller responds, where command and measurement were swapped.
+    an unreasonable zero: so a controller responds, where command and measurement were swapped. Or
+    its response turns into the direction of its gain only after the record's end: what the record
+    shows is the other direction, and the rest is a drift.
 
     :param model: the fit.
     :param interval: between samples [s].
@@ -34,4 +40,9 @@ def is_unseen(model: TransferFunction, interval: float, length: float) -> bool:
     whole = model.dead_time + sum(abs(c) for c in model.time_constants)
     if not model.integrators and whole < _SHORTEST_RESPONSE * interval:
         return True
-    return any(abs(zero) > _LONGEST_ZERO * length for zero in model.zeros)
+    if any(abs(zero) > _LONGEST_ZERO * length for zero in model.zeros):
+        return True
+    if not (model.is_stable or model.integrators) or all(zero.real >= 0.0 for zero in model.zeros):
+        return False
+    step = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
+    return float(response(model, np.array([length]), step)[0]) * model.process_sign <= 0.0

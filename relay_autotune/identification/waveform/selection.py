@@ -64,6 +64,10 @@ _MUCH_BETTER = 4.0
 _CORRELATED = 4.0
 # Least gain in the criterion for which drift or initial state is fitted: they blur the gain K.
 _EVIDENCE = 6.0
+# Least number of samples of a rest that shows the past; the largest share of its range by which
+# the measurement moves during it, and by which it would, going on like that, in the whole record.
+_ENOUGH_REST = 15
+_STILL, _STILL_LATER = 0.05, 0.5
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
 # A structure whose mean square is this many times the least one has no support.
@@ -145,6 +149,14 @@ class Ground:
         problem = replace(self.problem, structure=UNSTABLE_FOPDT)
         return begin(problem, self.starts.unstable(problem))
 
+    @cached_property
+    def rested(self) -> bool:
+        """Whether the samples show that the process was at rest before, so that it needs no past.
+
+        A relay test began where its settings say, and is asked of its samples all the same.
+        """
+        return not self.sign and begins_at_rest(self.problem)
+
     def candidate(self, problem: Problem, state: Trial) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure."""
         structure = problem.structure
@@ -177,6 +189,8 @@ class Ground:
                 # The free state of an integrator is the offset.
                 continue
             if past and not now.past_is_open:
+                continue
+            if (relaxation or past) and self.rested:
                 continue
             problem = replace(now, drift=drift, relaxation=relaxation, past=past)
             state = refine(problem, found.state.theta, tolerance=_TRIAL)
@@ -376,6 +390,28 @@ def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | Non
     return refine_all(problem, rough, _TRIAL)
 
 
+def begins_at_rest(problem: Problem) -> bool:
+    """Return whether each experiment begins with a rest, which shows what came before.
+
+    :param problem: all samples.
+    """
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        time, y = problem.time[part], problem.y[part]
+        changes = changes_within(u, time)
+        before = time < (changes[0] if changes.size else time[0])
+        if np.count_nonzero(before) < _ENOUGH_REST:
+            return False
+        t, wide = time[before] - float(np.mean(time[before])), float(np.ptp(y))
+        slope = float(t @ y[before]) / float(t @ t)
+        left = y[before] - np.mean(y[before]) - slope * t
+        chance = 2.0 * math.sqrt(float(left @ left) / left.size / float(t @ t))
+        if abs(slope) * float(np.ptp(t)) > _STILL * wide:
+            return False
+        if abs(slope) > chance and abs(slope) * float(np.ptp(time)) > _STILL_LATER * wide:
+            return False
+    return True
+
+
 def _without_the_unknown(
     problem: Problem, fopdt: Trial, floor: float, sign: int
 ) -> tuple[Problem, Trial]:
@@ -387,6 +423,8 @@ def _without_the_unknown(
     :param sign: the direction in which the relay worked; 0: not known.
     :return: the samples to be fitted, and the FOPDT that fits these best.
     """
+    if not sign and begins_at_rest(problem):
+        return problem, fopdt
     whole = replace(problem, relaxation=True)
     _, longest = time_scales(whole)
     later = whole.part(whole.time >= whole.starts + longest)
@@ -474,9 +512,9 @@ def _good_enough(candidates: list[Candidate]) -> Candidate | None:
 def support(candidates: list[Candidate]) -> list[float]:
     """Return the weight of each candidate, from its criterion; their sum is 1.
 
-    :param candidates: the best first.
+    :param candidates: in any order.
     """
-    best = candidates[0].criterion
+    best = min(c.criterion for c in candidates)
     weights = [math.exp(-0.5 * min(c.criterion - best, 1400.0)) for c in candidates]
     total = sum(weights)
     return [w / total for w in weights]
