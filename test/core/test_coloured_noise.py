@@ -15,7 +15,10 @@ from scipy.signal import lfilter
 
 from relay_autotune.identification.waveform.colour import colour_of, slow_colour
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.selection import Ground, fit_all, nuisances_of
+from relay_autotune.identification.waveform.separable import problem_of
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.foreign import find_relay, infer_settings
@@ -168,18 +171,15 @@ def test_a_step_after_a_rest_of_few_samples_is_no_drift():
 
 
 def test_a_process_that_visibly_rested_needs_no_past():
-    """A heater at an uneven supply, of which a free state explained the first 100 s."""
-    time = np.arange(481.0)
-    rng = np.random.default_rng(4)
-    supply = 1.0 + 0.5 * lfilter([0.2], [1.0, -0.98], rng.standard_normal(481))
-    power = np.where(time >= 30.0, 178.5, 0.0) * np.maximum(supply, 0.0)
-    for tau in (12.0, 250.0):
-        power = lfilter([1.0 / tau], [1.0, 1.0 / tau - 1.0], power)
-    y = 0.49 * np.round((29.33 + 0.53 * power) / 0.49)
-    u = PiecewiseConstant(np.array([30.0]), np.array([178.5]), initial=0.0)
-    found = identify_waveform(Record(time=time, measurement=y, command=u(time)))
-    assert found.model.gain > 0.0
-    assert found.model.dead_time < 20.0
+    """A process that is not linear, of which a command before the rest made a gain of -12."""
+    time = 2.0 * np.arange(241.0)
+    u = PiecewiseConstant(np.array([40.0]), np.array([1.0]), initial=0.0)
+    y = response(TransferFunction.sopdt(1.0, (150.0, 12.0), 5.0), time, u) ** 1.5
+    y = np.round(150.0 * y / y.max()) / 150.0
+    ground = Ground.of(problem_of([(time, y, u)], FOPDT), time.size * 1e-18)
+    best = fit_all(ground)[0]
+    assert best.model.gain > 0.0
+    assert nuisances_of(best.problem)[1:] == (False, False)
 
 
 def test_a_step_that_came_just_before_the_record_leaves_no_endless_dead_time():
