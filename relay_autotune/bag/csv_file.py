@@ -12,6 +12,7 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -103,12 +104,12 @@ class Log:
     notes: tuple[str, ...] = ()
 
 
-def read_csv(path: Path, wanted: Columns | None = None) -> Log:
-    """Return measurement and command of a text with columns.
+def read_csv(path: Path, wanted: Columns | None = None) -> tuple[Log, ...]:
+    """Return measurement and command of each recording in a text with columns.
 
     Times are rounded to a nanosecond, as those of a bag are, so that a file and the bag made
     of it give the same numbers. Rows are put into the order of their time; rows at the same time
-    keep the order of the file.
+    keep the order of the file. Where the time starts anew, another recording begins.
 
     :param path: the file; the line above its numbers names the columns, else they are called 1,
         2, 3.
@@ -149,8 +150,34 @@ def read_csv(path: Path, wanted: Columns | None = None) -> Log:
         time_ns, dated = _nanoseconds(path, name, times, unit, notes)
         if wanted.time is None and not _is_time(name):
             _check_rises(path, name, time_ns)
-    order = _order(path, time_ns, table.lines, notes)
-    time_ns, y, u = time_ns[order], y[order], u[order]
+    bounds = _recordings(time_ns)
+    if len(bounds) > 2:
+        lines = ", ".join(str(table.lines[at]) for at in bounds[1:-1])
+        notes.append(
+            f"the time starts anew at line {lines}: {len(bounds) - 1} recordings are read, one "
+            "after the other"
+        )
+    logs = []
+    for first, last in pairwise(bounds):
+        part = slice(first, last)
+        logs.append(_log(names, time_ns[part], (y[part], u[part]), dated, notes))
+        notes = []
+    return tuple(logs)
+
+
+def _log(
+    names: Sequence[str],
+    time_ns: IntArray,
+    values: tuple[FloatArray, FloatArray],
+    dated: bool,
+    notes: list[str],
+) -> Log:
+    """Return one recording, its rows in the order of their time."""
+    back = int(np.count_nonzero(np.diff(time_ns) < 0))
+    if back:
+        notes.append(f"the time goes back at {back} rows; rows are put into its order")
+    order = np.argsort(time_ns, kind="stable")
+    time_ns = time_ns[order]
     same = int(np.count_nonzero(np.diff(time_ns) == 0))
     if same:
         notes.append(
@@ -158,15 +185,16 @@ def read_csv(path: Path, wanted: Columns | None = None) -> Log:
             "counts from then on"
         )
     signals = []
-    for name, values in zip(names, (y, u), strict=True):
-        there = ~np.isnan(values)
+    for name, column in zip(names, values, strict=True):
+        ordered = column[order]
+        there = ~np.isnan(ordered)
         if not there.all():
             gap = _longest_gap(time_ns[there])
             notes.append(
                 f"{np.count_nonzero(~there)} cells of the column {name!r} are empty and left out; "
                 f"the longest gap is {gap / 1e9:.6g} s"
             )
-        signals.append(Signal(name, time_ns[there], values[there]))
+        signals.append(Signal(name, time_ns[there], ordered[there]))
     return Log(signals[0], signals[1], dated, tuple(notes))
 
 
@@ -242,27 +270,21 @@ def _check_rises(path: Path, name: str, time_ns: IntArray) -> None:
         )
 
 
-def _order(path: Path, time_ns: IntArray, lines: IntArray, notes: list[str]) -> IntArray:
-    """Return the rows in the order of their time.
+def _recordings(time_ns: IntArray) -> list[int]:
+    """Return the first row of each recording, and the number of rows.
 
-    :raises BagError: if the time starts anew, as where two recordings are in one file.
+    A time that goes back and runs on from there begins another recording; one that goes back at
+    single rows only is out of order.
     """
-    order = np.argsort(time_ns, kind="stable")
-    back = np.flatnonzero(np.diff(time_ns) < 0)
-    if back.size == 0:
-        return order
-    bounds = np.concatenate(([0], back + 1, [time_ns.size]))
-    for k, at in enumerate((back + 1).tolist()):
-        before, after = at - bounds[k], bounds[k + 2] - at
-        behind = int(np.searchsorted(time_ns[bounds[k] : at], time_ns[at]))
-        if min(before, after) >= _RESTART and before - behind >= _RESTART:
-            raise BagError(
-                f"{path}, line {lines[at]}: the time goes back from {time_ns[at - 1] / 1e9:g} s "
-                f"to {time_ns[at] / 1e9:g} s and runs on from there; expected one recording in a "
-                "file"
-            )
-    notes.append(f"the time goes back at {back.size} rows; rows are put into its order")
-    return order
+    back = (np.flatnonzero(np.diff(time_ns) < 0) + 1).tolist()
+    ends = [*back, time_ns.size][1:]
+    bounds = [0]
+    for at, end in zip(back, ends, strict=True):
+        before = at - bounds[-1]
+        behind = int(np.count_nonzero(time_ns[bounds[-1] : at] < time_ns[at]))
+        if min(before, end - at) >= _RESTART and before - behind >= _RESTART:
+            bounds.append(at)
+    return [*bounds, time_ns.size]
 
 
 def _longest_gap(time_ns: IntArray) -> int:

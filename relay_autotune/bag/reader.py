@@ -234,8 +234,20 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
     columns = Columns(
         wanted.measurement, wanted.command, wanted.time, wanted.time_unit, wanted.period
     )
-    log = read_csv(path, columns)
-    command = preceded(log.command, wanted.command_before)
-    record = join(log.measurement, command, dated=log.dated)
-    records, notes = take_apart(record, whole=wanted.is_part)
-    return records, [*log.notes, *notes]
+    records: list[Record] = []
+    notes: list[str] = []
+    faults: list[BagError] = []
+    for log in read_csv(path, columns):
+        notes += log.notes
+        try:
+            command = preceded(log.command, wanted.command_before)
+            record = join(log.measurement, command, dated=log.dated)
+            found, said = take_apart(record, whole=wanted.is_part)
+        except BagError as fault:
+            faults.append(fault)
+            continue
+        records += found
+        notes += said
+    if not records:
+        raise faults[0]
+    return records, [*notes, *(f"one of the recordings is left out: {f}" for f in faults)]

@@ -65,7 +65,12 @@ def _convert(options: argparse.Namespace) -> int:
     wanted = Columns(
         options.measurement, options.command, options.time, options.time_unit, options.period
     )
-    log = read_csv(options.csv, wanted)
+    log, *others = read_csv(options.csv, wanted)
+    if others:
+        raise BagError(
+            f"{options.csv} holds {1 + len(others)} recordings, each with times that start anew; "
+            "expected one"
+        )
     for note in log.notes:
         say(PROGRAM, f"{options.csv}: {note}")
     measurement, command = log.measurement, log.command

@@ -199,13 +199,17 @@ def envelope(
     :param stable: integral gains up to which the loop is stable, shape (k, m).
     """
     x, y = parts
-    square = x * x + y * y
     p, lead = rest
+    # Where a response is so small that its inverse overflows, only endless gains are forbidden.
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = x * x + y * y
+        rooms = [r * r * square - (p + c * x) ** 2 for c, r in bounds.circles]
     edges = []
-    for c, r in bounds.circles:
-        room = r * r * square - (p + c * x) ** 2
+    for (c, _), room in zip(bounds.circles, rooms, strict=True):
+        room = np.where(np.isfinite(room), room, 0.0)
         root = w * np.sqrt(np.maximum(room, 0.0))
-        middle = w * (lead + c * y)
+        with np.errstate(over="ignore", invalid="ignore"):
+            middle = w * (lead + c * y)
         low, high = middle - root, middle + root
         # An ellipse below ki = 0, or where no loop is stable, does not matter.
         forbids = (room > 0.0) & (high > 0.0) & (low < stable[..., None])

@@ -244,8 +244,14 @@ def test_rows_are_put_into_the_order_of_their_time(tmp_path):
 
 def test_two_recordings_in_one_file_are_not_mixed(tmp_path):
     body = "\n".join(line(k) for k in range(30))
-    with pytest.raises(BagError, match=r"line 32: the time goes back from 14.5 s to 0 s"):
-        read_experiments(write(tmp_path / "a.csv", f"t,y,u\n{body}\n{body}\n"))
+    still = "\n".join(f"{k},{k},1" for k in range(20))
+    text = f"t,y,u\n{body}\nt,y,u\n{body}\n{still}\n"
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    first, second = found.experiments
+    np.testing.assert_array_equal(first.time, second.time)
+    np.testing.assert_array_equal(first.measurement, second.measurement)
+    assert "the time starts anew at line 33, 63: 3 recordings are read" in " ".join(found.notes)
+    assert "one of the recordings is left out: the command u never changes" in found.notes[-1]
 
 
 def test_latin_1_utf_16_and_what_spreadsheets_add(tmp_path):
