@@ -73,11 +73,11 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     if problem.colour is not None:
         # The colour includes that rounding errors stay alike from sample to sample.
         noise = replace(noise, inflation=1.0)
-    estimate = estimate_of(problem, state, fit, noise)
+    estimate = estimate_of(problem, state, fit, noise, bounded=True)
     halves = None if problem.colour is None or estimate is None else _halves(fit, estimate.model)
     if halves is not None and not halves.agree:
         noise = replace(noise, inflation=noise.inflation * halves.apart)
-        estimate = estimate_of(problem, state, fit, noise)
+        estimate = estimate_of(problem, state, fit, noise, bounded=True)
     if estimate is None:
         raise IdentificationError(
             f"the fit of a {problem.structure.name} model left its structure; name another "
@@ -227,7 +227,7 @@ def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) ->
     if noise is None:
         read = problem.structure.read(state.theta, fit.scale * state.coefficients)
         return None if read is None else Rival(Estimate.of(*read), share)
-    found = estimate_of(problem, state, replace(fit, loss="squares"), noise)
+    found = estimate_of(problem, state, replace(fit, loss="squares"), noise, bounded=True)
     if found is None or found.root is None:
         return None
     # Where samples are many, it was fitted to some of them only.

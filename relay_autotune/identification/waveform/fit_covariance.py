@@ -90,13 +90,17 @@ def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
     return Noise(coloured, larger * samples / held, step)
 
 
-def estimate_of(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> Estimate | None:
+def estimate_of(
+    problem: Problem, state: Trial, fit: Fit, noise: Noise, *, bounded: bool = False
+) -> Estimate | None:
     """Return the structure's parameters with their covariance to first order.
 
     :param problem: what was fitted.
     :param state: its fit.
     :param fit: for its scale and loss.
     :param noise: properties of the residual.
+    :param bounded: True: a dead time is known to half of all times of the process together.
+        Without samples before the response, gain and dead time cannot be told apart at all.
     :return: None if the fit left its structure.
     """
     read = problem.structure.read(state.theta, fit.scale * state.coefficients)
@@ -104,11 +108,11 @@ def estimate_of(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> Estim
         return None
     gradient = _gradient(problem, state, fit.scale)
     with np.errstate(over="ignore", invalid="ignore"):
-        root = gradient @ _root(problem, state, fit, noise)
+        root = gradient @ _root(problem, state, fit, noise, bounded)
     return Estimate.of_root(*read, root)
 
 
-def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
+def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise, bounded: bool) -> FloatArray:
     """Return B of the covariance B B' of all linear coefficients and theta, in this order.
 
     For least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
@@ -118,12 +122,11 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise) -> FloatArray:
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)
-    # A dead time is known to half of all times of the process together: without samples before
-    # the response, gain and dead time cannot be told apart at all.
-    slow = unit_steps(problem.structure, state.theta)[-1]
-    prior = np.zeros((jacobian.shape[0], 1))
-    prior[-1] = math.sqrt(float(scores @ scores) / n) / (0.5 * slow)
-    jacobian, scores = np.append(jacobian, prior, axis=1), np.append(scores, 0.0)
+    if bounded:
+        slow = unit_steps(problem.structure, state.theta)[-1]
+        prior = np.zeros((jacobian.shape[0], 1))
+        prior[-1] = math.sqrt(float(scores @ scores) / n) / (0.5 * slow)
+        jacobian, scores = np.append(jacobian, prior, axis=1), np.append(scores, 0.0)
     size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((jacobian / size[:, None]).T)
