@@ -227,7 +227,7 @@ def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) ->
     if noise is None:
         read = problem.structure.read(state.theta, fit.scale * state.coefficients)
         return None if read is None else Rival(Estimate.of(*read), share)
-    found = estimate_of(problem, state, replace(fit, loss="squares"), noise, bounded=True)
+    found = estimate_of(problem, state, replace(fit, loss="squares"), noise)
     if found is None or found.root is None:
         return None
     # Where samples are many, it was fitted to some of them only.
