@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Any
 
 from relay_autotune.cli.apply_gains import verdict_lines
-from relay_autotune.cli.layout import WIDEST
 from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.loop.gains import Controller
@@ -33,6 +32,8 @@ _REST_WITHIN = 60.0
 _FOUND_WITHIN = 5.0
 # Interval at which the gains in force are read while nothing else happens [s].
 _LOOK_EVERY = 3.0
+# Columns of the verdict on a verification.
+_COLUMNS = 60
 
 
 class GainsPage:
@@ -172,7 +173,7 @@ class GainsPage:
             phase="idle",
             tone="good" if result.passed else "bad",
             status=f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
-            proof=tuple(verdict_lines(result, present, WIDEST)),
+            proof=tuple(verdict_lines(result, present, _COLUMNS)),
         )
 
 

@@ -298,7 +298,7 @@ export class Live {
   async revert() {
     const { loop, told: { controller, present } } = this;
     const what = `${controller} has ${present}. At once it gets the gains that it had before, without a bump of the command.`;
-    if (await this.agreed(what, "Take them back")) this.send("revert", {}, loop);
+    if (await this.agreed(what, "Return to them")) this.send("revert", {}, loop);
   }
 
   async ask(loop) {

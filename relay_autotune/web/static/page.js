@@ -107,7 +107,7 @@ function showControls() {
     option.value = law;
     option.selected = law === asked.law;
   }
-  $("rate").value = asked.sample_period || "";
+  $("rate").value = asked.sample_period ? Number(asked.sample_period.toPrecision(6)) : "";
 }
 
 let saidChecks = "";
