@@ -106,7 +106,9 @@ def is_clearly_coloured(problem: Problem, sign: int) -> bool:
     :param sign: direction of the relay; 0: not known.
     """
     rested = not sign and begins_at_rest(problem)
-    few = replace(problem.thinned(_FEW), past=problem.past_is_open and not rested)
+    # A drift is no colour; a free past explains it as well.
+    past = problem.past_is_open and not rested
+    few = replace(problem.thinned(_FEW), past=past, drift=rested)
     found = Ground.of(few, few.time.size * NEGLIGIBLE**2, sign)
     if found.problem.time.size < few.time.size:
         # The first samples, which no past explains, were left out.
