@@ -20,6 +20,7 @@ import numpy as np
 from relay_autotune.bag.signals import Signal
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
+from relay_autotune.bag.timing import TIME_UNITS
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.record import FloatArray, IntArray
 
@@ -83,9 +84,6 @@ class Columns:
     time: str | None = None
     time_unit: str | None = None
     period: float | None = None
-
-
-TIME_UNITS = ("s", "ms", "us", "min", "h")
 
 
 @dataclass(frozen=True)

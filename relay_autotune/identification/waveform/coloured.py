@@ -29,6 +29,7 @@ from relay_autotune.identification.waveform.selection import (
     Candidate,
     Ground,
     begins_at_rest,
+    needs_no_past,
     nuisances_of,
 )
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
@@ -105,7 +106,7 @@ def is_clearly_coloured(problem: Problem, sign: int) -> bool:
     :param problem: samples and input, with a FOPDT structure.
     :param sign: direction of the relay; 0: not known.
     """
-    rested = not sign and begins_at_rest(problem)
+    rested = needs_no_past(problem, sign)
     # A drift is no colour; a free past explains it as well.
     past = problem.past_is_open and not rested
     few = replace(problem.thinned(_FEW), past=past, drift=rested)

@@ -68,6 +68,8 @@ _EVIDENCE = 6.0
 # the measurement moves during it, and by which it would, going on like that, in the whole record.
 _ENOUGH_REST = 15
 _STILL, _STILL_LATER = 0.05, 0.5
+# Least number of moves of a command that tell whether one came before the record.
+_MANY = 6
 # A step that gains less than this share of the sum of squares changes no choice.
 _TRIAL = 1e-6
 # A structure whose mean square is this many times the least one has no support.
@@ -151,11 +153,8 @@ class Ground:
 
     @cached_property
     def rested(self) -> bool:
-        """Whether the samples show that the process was at rest before, so that it needs no past.
-
-        A relay test began where its settings say, and is asked of its samples all the same.
-        """
-        return not self.sign and begins_at_rest(self.problem)
+        """Whether the samples show that the process was at rest before."""
+        return needs_no_past(self.problem, self.sign)
 
     def candidate(self, problem: Problem, state: Trial) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure."""
@@ -390,6 +389,23 @@ def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | Non
     return refine_all(problem, rough, _TRIAL)
 
 
+def needs_no_past(problem: Problem, sign: int) -> bool:
+    """Return whether a record of a few steps shows that the process was at rest before.
+
+    A free past explains any single step. Many moves tell of themselves whether one is needed: a
+    command that moved just before the record acts in the rest, or after it where the dead time is
+    longer. A relay test began where its settings say, and is asked of its samples all the same.
+
+    :param problem: all samples.
+    :param sign: the direction in which the relay worked, 1 or -1; 0: not known.
+    """
+    changes = (
+        changes_within(u, problem.time[part])
+        for part, u in zip(problem.experiments, problem.inputs, strict=True)
+    )
+    return not sign and all(c.size < _MANY for c in changes) and begins_at_rest(problem)
+
+
 def begins_at_rest(problem: Problem) -> bool:
     """Return whether each experiment begins with a rest, which shows what came before.
 
@@ -423,7 +439,7 @@ def _without_the_unknown(
     :param sign: the direction in which the relay worked; 0: not known.
     :return: the samples to be fitted, and the FOPDT that fits these best.
     """
-    if not sign and begins_at_rest(problem):
+    if needs_no_past(problem, sign):
         return problem, fopdt
     whole = replace(problem, relaxation=True)
     _, longest = time_scales(whole)
