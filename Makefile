@@ -22,10 +22,10 @@ setup:
 demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
-# two at a time, since few of the tests of nodes keep a processor busy
+# two at a time, the longest first; few of the tests of nodes keep a processor busy
 test: setup
 	@$(MAKE) --no-print-directory --jobs=2 --keep-going --output-sync=target \
-		test-core test-oldest test-system test-rest
+		test-system test-core test-rest test-oldest
 
 test-core: lint
 	@$(ENTER) && python3 -m pytest -q test/core
