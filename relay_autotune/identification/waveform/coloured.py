@@ -140,8 +140,9 @@ def in_colour(
     if not found or found[0].problem.colour is None:
         return None
     # The last steps of a fit may lead to where a pole and a zero cancel: they come first.
-    told = (c for c in map(_finished, found) if _is_told(c))
-    chosen = next(told, None) or _finished(found[0])
+    chosen = first = _finished(found[0])
+    if not _is_told(first):
+        chosen = next((c for c in map(_finished, found[1:]) if _is_told(c)), first)
     others = (c for c in found if c.structure != chosen.structure)
     return Fit(chosen.problem, chosen.state, (chosen, *others), scale)
 
