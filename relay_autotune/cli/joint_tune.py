@@ -18,7 +18,7 @@ from relay_autotune.cli.arguments import say
 from relay_autotune.cli.asking import asked, number_of, pair_of
 from relay_autotune.cli.export import Target
 from relay_autotune.cli.layout import width
-from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, ros_arguments
+from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, own_node, ros_arguments
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import check_lines
@@ -489,9 +489,8 @@ class JointTune:
         topics = {"measurement": loop.state_topic, "setpoint": loop.reference_topic}
         # Not before, since relay_node refuses a second publisher of the reference.
         nodes.start("controller_node", ros_arguments(self._space, topics, values))
-        name = f"/{self._space.strip('/')}/controller_node"
         return apply_at(
-            name,
+            own_node(self._options, "controller_node"),
             doubtful=bool(doubt),
             yes=self._options.yes,
             stays=False,

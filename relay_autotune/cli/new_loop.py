@@ -130,6 +130,14 @@ def own_namespace(options: argparse.Namespace) -> str:
     return f"tune_loop_{os.getpid()}"
 
 
+def own_node(options: argparse.Namespace, name: str) -> str:
+    """Return the full name of a node of this command.
+
+    :param name: its name in their namespace.
+    """
+    return f"/{own_namespace(options).strip('/')}/{name}"
+
+
 def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     """Look at the loop, ask for what is not given, and return the nodes to start.
 

@@ -19,7 +19,7 @@ from relay_autotune.cli.apply_gains import found_lines
 from relay_autotune.cli.arguments import say
 from relay_autotune.cli.asking import agreed_step
 from relay_autotune.cli.layout import labelled, width
-from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, ros_arguments
+from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, own_node, ros_arguments
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import StatusLine, Working
 from relay_autotune.control.verification import LEAST_OF_NOISE, Step, plan, proving_step
@@ -132,8 +132,7 @@ def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof
             f"a step of {step:g} y leads from {rest.setpoint:.6g} out of {within.low:g} to "
             f"{within.high:g} y: give another --step"
         )
-    interval = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-    wanted = plan(gains, model, Step(setpoint=step), interval)
+    wanted = plan(gains, model, Step(setpoint=step), record.mean_interval)
     settles = gains.settling_time
     if not math.isfinite(settles):
         settles = wanted.duration
@@ -150,7 +149,7 @@ def _made(
     doubtful: bool,
 ) -> bool:
     """Put the gains in force in a controller_node in front of relay_node, and make the step."""
-    name = f"/{own_namespace(options).strip('/')}/{_CONTROLLER}"
+    name = own_node(options, _CONTROLLER)
     kind = client.values(client.name, ["measurement_type"])["measurement_type"]
     shown = StatusLine()
     # The journal of proven and failed gains is that of this controller_node alone.
