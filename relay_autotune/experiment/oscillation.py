@@ -26,7 +26,7 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Patience, Relay
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
-from relay_autotune.experiment.turns import SHORT_STAY, Turns
+from relay_autotune.experiment.turns import Turns
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.record.record import Cycle, FloatArray, Outcome
 
@@ -59,6 +59,9 @@ _SPARE_CYCLES = 12
 # Chatter: more switches in a cycle than this, and this many times as many as in any cycle before.
 _CHATTER, _CHATTER_RATIO = 40, 10.0
 
+# Fast switching: this many cycles in a row are shorter than this part of the usual cycle.
+_FAST_CYCLES, _FAST = 3, 0.3
+
 # If the levels started at a quarter, the swings are compared after this many cycles, once the
 # swing grows by less than this factor from one to the next.
 _TRIED, _STILL = 2, 1.1
@@ -69,6 +72,15 @@ _CLEARLY = 5.0
 _STAYS = 2
 
 _SIGNS = {1: "positive", -1: "negative"}
+
+
+def usual_period(cycles: list[Cycle]) -> float:
+    """Return the lower quartile of the undisturbed periods [s]; 0 for less than two of them.
+
+    The longer ones may hold an actuator that stuck, and the shortest the begin of fast switching.
+    """
+    clean = sorted(cycle.period for cycle in cycles if not cycle.disturbed)
+    return clean[len(clean) // 4] if len(clean) > 1 else 0.0
 
 
 class Oscillation:
@@ -268,8 +280,8 @@ class Oscillation:
     def _learn_anew(self) -> None:
         """Learn the length of a stay again from the relay's present switching, or fail."""
         turns, most = self._turns, self._parameters.max_cycles
-        self._usual = self._usual or min((cycle.period for cycle in self.cycles), default=0.0)
-        if self._switches_fast(2.0 * turns.longest):
+        self._usual = self._usual or usual_period(self.cycles)
+        if self._switches_fast(2.0 * turns.longest, self._usual):
             return
         if len(self.cycles) + turns.lost >= most:
             self._end(
@@ -283,13 +295,13 @@ class Oscillation:
         self._patience.forget(turns.longest)
         self._is_lost = True
 
-    def _switches_fast(self, period: float) -> bool:
-        """Fail if a period is too short compared with the cycles before one was lost."""
-        if period >= SHORT_STAY * self._usual:
+    def _switches_fast(self, period: float, usual: float) -> bool:
+        """Fail if a period is too short compared with the usual one."""
+        if period >= _FAST * usual:
             return False
         self._end_fast(
             f"each {0.5 * period:.3g} s or sooner after {count_cycles(self.cycles)}, where a "
-            f"cycle took {self._usual:.3g} s before"
+            f"cycle took {usual:.3g} s before"
         )
         return True
 
@@ -322,7 +334,9 @@ class Oscillation:
             cycle = replace(cycle, disturbed=True)
             self._is_lost = False
         self.cycles.append(cycle)
-        if self._switches_fast(cycle.period) or self._chatters():
+        last = max(c.period for c in self.cycles[-_FAST_CYCLES:])
+        usual = self._usual or usual_period(self.cycles[:-_FAST_CYCLES])
+        if self._switches_fast(last, usual) or self._chatters():
             return
         p = self._parameters
         if is_growing([c.peak_max - c.peak_min for c in self.cycles]):

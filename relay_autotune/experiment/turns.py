@@ -8,7 +8,7 @@ from __future__ import annotations
 # A stay at the low level is noise at a switch, and begins no cycle, if it is shorter than this
 # part of the longest stay (less for a biased relay, in proportion to the ratio of its steps), or
 # of half the time that the process took to respond.
-SHORT_STAY = 0.2
+_SHORT_STAY = 0.2
 
 # A cycle takes about two of the longest stays. If the relay switches for this many of them without
 # a cycle, the longest stay is not typical. The least number of samples applies as well.
@@ -65,7 +65,7 @@ class Turns:
                     self._usual, self._begun = self._usual or self.longest, 0
                 self._since, self._recent = time, 0.0
             self.longest = max(self.longest, stay)
-        return stay >= SHORT_STAY * max(balance * self.longest, self._least)
+        return stay >= _SHORT_STAY * max(balance * self.longest, self._least)
 
     def begin(self, time: float) -> None:
         """Note that a cycle begins [s]."""

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 import textwrap
@@ -21,6 +22,8 @@ _FENCE = re.compile(
     r"^(?P<indent> *)```(?P<language>\w+)\n(?P<text>.*?)^(?P=indent)```$",
     re.DOTALL | re.MULTILINE,
 )
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_TOKEN = re.compile(rf"\.\.\.|{_NUMBER.pattern}|[^\W\d]+|.", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -99,10 +102,31 @@ def parts_of(lines: list[list[str]]) -> list[list[str]]:
     return [words for words in parts if words]
 
 
-def matches(shown: str, output: str) -> bool:
-    """Return whether an output matches the shown one, in which `...` stands for anything."""
-    pieces = [re.escape(piece) for piece in shown.rstrip("\n").split("...")]
-    return re.fullmatch(".*".join(pieces) + r"\s*", output, re.DOTALL) is not None
+def matches(shown: str, output: str, within: float = 0.0) -> bool:
+    """Return whether an output is the shown one.
+
+    :param shown: the text of a page, in which `...` stands for anything.
+    :param output: what was printed.
+    :param within: how far a number may be from the shown one, as a share of it; above 0 the width
+        of a number may break the lines elsewhere, too.
+    """
+    if within:
+        shown, output = (" ".join(text.split()) for text in (shown, output))
+    printed = _TOKEN.findall(output.rstrip())
+
+    def is_alike(token: str, other: str) -> bool:
+        if within and _NUMBER.fullmatch(token) and _NUMBER.fullmatch(other):
+            return math.isclose(float(token), float(other), rel_tol=within)
+        return token == other
+
+    # How much of the output may have passed, after each token.
+    passed = {0}
+    for token in _TOKEN.findall(shown.rstrip()):
+        if token == "..." and passed:
+            passed = set(range(min(passed), len(printed) + 1))
+        else:
+            passed = {k + 1 for k in passed if k < len(printed) and is_alike(token, printed[k])}
+    return len(printed) in passed
 
 
 def spans(page: Path) -> list[str]:
