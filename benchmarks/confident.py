@@ -32,6 +32,7 @@ from functools import partial
 from markdown import table
 
 from relay_autotune import threads  # noqa: F401  before numpy
+from relay_autotune.arrays import FloatArray
 from relay_autotune.confidence import NORMAL_95
 
 # isort: split
@@ -45,7 +46,7 @@ from relay_autotune.experiment.experiment import ExperimentParameters, RelayExpe
 from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
-from relay_autotune.record.record import FloatArray, Record, RelaySettings
+from relay_autotune.record.record import Record, RelaySettings
 from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.tuning import DesignOptions, analyse_loop
 

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.decode import decoded_message
 from relay_autotune.bag.field_path import Element, Step, reading, written
 from relay_autotune.bag.limits import MOST_STEPS
 from relay_autotune.bag.locate import Content, every_byte
 from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type
 from relay_autotune.errors import BagError, FieldError
-from relay_autotune.record.record import IntArray
 
 _ENCAPSULATION = 4
 _UINT32 = Number("uint32", "u4")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.names import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, RecordError
@@ -19,7 +20,7 @@ from relay_autotune.exchange.messages import (
     stamp_nanoseconds,
     start_seconds,
 )
-from relay_autotune.record.record import IntArray, Outcome, Record
+from relay_autotune.record.record import Outcome, Record
 
 _STAMP_ERROR_NS = 1000
 

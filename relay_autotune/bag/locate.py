@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.mcap_records import (
     MESSAGE,
     MESSAGE_HEAD_SIZE,
     MESSAGE_INDEX,
     RECORD,
 )
-from relay_autotune.record.record import IntArray
 
 Content = bytes | memoryview
 

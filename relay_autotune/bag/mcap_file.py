@@ -15,6 +15,7 @@ from typing import Self
 
 import numpy as np
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.compressed_messages import Expander, are_compressed
 from relay_autotune.bag.limits import LARGEST_CHUNK, MOST_NOTES
 from relay_autotune.bag.locate import (
@@ -31,7 +32,6 @@ from relay_autotune.bag.mcap_records import RECORD, Channel, DamageError
 from relay_autotune.bag.mcap_scan import scan
 from relay_autotune.bag.mcap_summary import layout_by_summary
 from relay_autotune.bag.source import Source
-from relay_autotune.record.record import IntArray
 
 # Least distance between the beginnings of two records [bytes].
 _SMALLEST_RECORD = 9

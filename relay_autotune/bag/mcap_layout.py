@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.chunks import chunk_content
 from relay_autotune.bag.locate import Content
 from relay_autotune.bag.mcap_records import CHUNK, RECORD, DamageError, Declarations
 from relay_autotune.bag.source import Source
-from relay_autotune.record.record import IntArray
 
 # What a chunk takes beside its content, compressed or not.
 _CHUNK_OVERHEAD = 1 << 20

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.locate import (
     Content,
     every_byte,
@@ -34,7 +35,6 @@ from relay_autotune.bag.mcap_records import (
     unsigned,
 )
 from relay_autotune.bag.source import MAGIC, Source, file_records, record_body
-from relay_autotune.record.record import IntArray
 
 # Size of the pieces in which records outside of chunks are read [bytes].
 _PIECE = 4 << 20

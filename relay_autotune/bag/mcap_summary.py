@@ -11,6 +11,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.limits import LARGEST_SUMMARY
 from relay_autotune.bag.locate import every_byte, record_offsets
 from relay_autotune.bag.mcap_layout import ChunkIndex, Layout
@@ -25,7 +26,6 @@ from relay_autotune.bag.mcap_records import (
     DamageError,
 )
 from relay_autotune.bag.source import MAGIC, Source, file_records, record_body
-from relay_autotune.record.record import IntArray
 
 # A chunk index up to its list of message indexes: times of the first and the last message, start
 # and length of the chunk, and the list's length.

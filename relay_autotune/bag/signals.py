@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.bag.limits import LARGEST_VALUE
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.exchange.messages import start_seconds
-from relay_autotune.record.record import FloatArray, IntArray, PiecewiseConstant, Record
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from relay_autotune.arrays import IntArray
 from relay_autotune.bag.signals import Signal
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.record.record import IntArray
 
 T = TypeVar("T", bound=np.generic)
 

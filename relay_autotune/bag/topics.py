@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.bag.cdr import Path
 from relay_autotune.bag.decode import decode_messages, decoded_message
 from relay_autotune.bag.fields import may_be_single, named_field, only_field, split_name, stamp_of
@@ -24,7 +25,6 @@ from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Struct, message_type
 from relay_autotune.bag.timing import SignalReader, TimedSignal
 from relay_autotune.errors import BagError, FieldError, SelectionError
-from relay_autotune.record.record import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from relay_autotune.bag.sqlite_file import SqliteFile

@@ -23,13 +23,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.closed_loop import ClosedLoop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
 from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import FloatArray
 
 # A measurement, set-point or command of a larger magnitude is an error of its sender [y, u].
 LARGEST_VALUE = 1e12

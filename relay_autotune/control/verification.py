@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.control.controller import run_loop, scaled
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import FloatArray, Record
+from relay_autotune.record.record import Record
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import (
     ModelError,
     ParameterError,
@@ -26,7 +27,7 @@ from relay_autotune.errors import (
 from relay_autotune.escape import visible
 from relay_autotune.exchange.fields import float64_array, of_message, to_message
 from relay_autotune.experiment.early_end import FitProgress
-from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.faults.repetition import SilenceWatch
 from relay_autotune.experiment.faults.sensor import FrozenWatch, SampleCheck
@@ -17,7 +18,7 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import Procedure, State
 from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy
 from relay_autotune.experiment.samples import Samples
-from relay_autotune.record.record import Cycle, FloatArray, Outcome, Record, RelaySettings
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 __all__ = [
     "ExperimentParameters",

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.record.record import FloatArray
 
 # An amplitude that is not given starts at this part of the command's range.
 FIRST_SHARE = 0.01

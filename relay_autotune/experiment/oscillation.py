@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.faults.process import (
     NO_ANSWER,
     TELL,
@@ -28,7 +29,7 @@ from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
 from relay_autotune.experiment.turns import Turns
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
-from relay_autotune.record.record import Cycle, FloatArray, Outcome
+from relay_autotune.record.record import Cycle, Outcome
 
 # Two instants that differ by less than this part of the sample interval are equal.
 _ROUNDING = 1e-6

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from relay_autotune.record.record import FloatArray
+from relay_autotune.arrays import FloatArray
 
 # An interval counts at most this many times the mean of the intervals before it: a gap in the
 # samples, or a step of their clock, says nothing about the process. The pauses of a sensor that

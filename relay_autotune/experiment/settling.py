@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.record.record import FloatArray
+from relay_autotune.arrays import FloatArray
 
 # Samples needed for a constant, and for a noise band: 50 give a standard deviation to 10 %, since
 # its relative standard error is 1/sqrt(2 n).

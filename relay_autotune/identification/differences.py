@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from relay_autotune.arrays import FloatArray
 
 _SHARE = 1e-6
 

@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
@@ -20,8 +20,6 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import told, told_fields
 from relay_autotune.text import process_text
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import SampledController, SampledPid
 from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

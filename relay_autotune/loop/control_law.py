@@ -6,14 +6,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray
 from relay_autotune.process.transfer_function import TransferFunction
-
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 
 class ControlLaw(Protocol):

@@ -8,16 +8,13 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import check_told, derived, told
-
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,13 @@ import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import TuningError, look_up
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import filter_matrices, require_period
-
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 # Largest excess of a weight that counts as the same.
 _SAME_WEIGHT = 0.005

@@ -7,19 +7,15 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.loop.control_law import ControlLaw
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.margins import frequencies
 from relay_autotune.loop.sampled import filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _ANGLES = 2048
 

@@ -14,17 +14,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.control_law import ControlLaw
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _POINTS = 4096
 _MOST_POINTS = 1 << 18

@@ -13,11 +13,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import performance_of
 from relay_autotune.loop.gains import Controller, Performance
@@ -34,9 +33,6 @@ from relay_autotune.loop.responses import (
 )
 from relay_autotune.process.held import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _PER_DECADE = 60
 _MOST_TURNS = 800.0 * math.pi

@@ -23,17 +23,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.integer[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _PIECES = 128
 _PARTS = 4

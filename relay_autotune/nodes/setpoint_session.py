@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.readiness import NotReadyError
 from relay_autotune.nodes.session import Session
-from relay_autotune.record.record import FloatArray, Record, RelaySettings
+from relay_autotune.record.record import Record, RelaySettings
 
 
 def reported_by(values: Mapping[str, Any]) -> Callable[[Any], float] | None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.process.model_parameters import (
     DAMPING,
     NATURAL_FREQUENCY,
@@ -23,7 +24,6 @@ from relay_autotune.process.model_parameters import (
     positive,
 )
 
-FloatArray = NDArray[np.float64]
 Polynomial = NDArray[np.float64]
 
 TWO_LAGS = (TIME_CONSTANT_1, TIME_CONSTANT_2)

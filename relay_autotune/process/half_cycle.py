@@ -17,13 +17,11 @@ hysteresis for one that has it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.modes import Coordinates, Modes
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.float64]
 
 
 class HalfCycle:

@@ -14,15 +14,12 @@ where the sum has a closed form, since s is the free motion of a linear system.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray
 from relay_autotune.process.modes import Modes
 from relay_autotune.process.transfer_function import TransferFunction
-
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 # A dead time of a whole number of periods is recognised in spite of this relative rounding.
 _ROUNDING = 1e-9

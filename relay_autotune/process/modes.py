@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.transfer_function import TransferFunction
 
-FloatArray = NDArray[np.float64]
 # Real if every time constant is real, which is four times as fast; else complex.
 Coordinates = NDArray[Any]
 

@@ -6,13 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.process.modes import Coordinates, Modes
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
-
-FloatArray = NDArray[np.float64]
 
 
 def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> FloatArray:

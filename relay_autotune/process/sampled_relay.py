@@ -6,14 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
-
-FloatArray = NDArray[np.float64]
 
 
 def simulate_sampled_relay(

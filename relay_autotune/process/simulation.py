@@ -11,15 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.modes import Coordinates, Modes
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Outcome, PiecewiseConstant, Record, RelaySettings
-
-FloatArray = NDArray[np.float64]
 
 _QUADRATURE = np.polynomial.legendre.leggauss(8)
 

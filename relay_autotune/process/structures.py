@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError, look_up
 from relay_autotune.process.factors import (
     PAIR,
@@ -38,8 +39,6 @@ from relay_autotune.process.model_parameters import (
     exactly,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.float64]
 
 GENERAL = "general"
 

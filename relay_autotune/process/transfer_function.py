@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.model_parameters import (
     exactly,
@@ -20,8 +21,6 @@ from relay_autotune.process.model_parameters import (
     positive,
 )
 from relay_autotune.text import process_latex, process_text
-
-ComplexArray = NDArray[np.complex128]
 
 
 def _conjugate_closed(values: tuple[complex, ...]) -> bool:

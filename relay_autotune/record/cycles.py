@@ -12,17 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RecordError
 from relay_autotune.quantities import told
 from relay_autotune.record.foreign import find_cycles, settings_of
-from relay_autotune.record.record import (
-    Cycle,
-    CycleFeatures,
-    FloatArray,
-    Outcome,
-    Record,
-    asked_once,
-)
+from relay_autotune.record.record import Cycle, CycleFeatures, Outcome, Record, asked_once
 
 __all__ = [
     "MIN_CYCLES",

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.record.record import FloatArray, IntArray, Record, roughness
+from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.record.record import Record, roughness
 
 # Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.record.record import FloatArray, IntArray, Record, RelaySettings, asked_once
+from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.record.record import Record, RelaySettings, asked_once
 
 # Two commands that differ by less than this part of the command's range are one level.
 _LEVEL_TOLERANCE = 1e-6

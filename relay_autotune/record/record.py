@@ -14,15 +14,13 @@ from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RecordError
 from relay_autotune.quantities import told
 
-FloatArray = NDArray[np.float64]
 # Difference of equal slopes, relative to the steepest one.
 _STRAIGHT = 1e-12
-IntArray = NDArray[np.int64]
 # Largest value of a quantity; squares of values up to this can be added without overflow.
 LARGEST = 1e152
 

@@ -15,14 +15,8 @@ import math
 
 import numpy as np
 
-from relay_autotune.record.record import (
-    FloatArray,
-    IntArray,
-    PiecewiseConstant,
-    Record,
-    Unthinned,
-    roughness,
-)
+from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.record.record import PiecewiseConstant, Record, Unthinned, roughness
 
 # Largest number of samples of a record that is not thinned, and of blocks of a longer one.
 LEFT_ALONE = 10_000

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.analysis import Analysis
+from relay_autotune.arrays import FloatArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.combinations import Combination
@@ -23,8 +23,6 @@ from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, set
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.tuning import Controller, Gains, ensemble
 from relay_autotune.verdict import NOT_JUDGED, Judgement
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.record.record import Record, RelaySettings
 from relay_autotune.report.case import Case, ModelCase
 from relay_autotune.report.style import (
@@ -32,8 +32,6 @@ from relay_autotune.report.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
-
-FloatArray = NDArray[np.float64]
 
 _FEW = 400
 _NUMBERED = 15

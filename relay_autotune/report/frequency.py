@@ -10,8 +10,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, in_loop
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.path import Path
 
     from relay_autotune.tuning import Gains
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # 95 % of a normal distribution in the plane lie within this number of standard deviations.
 _ELLIPSE = math.sqrt(-2.0 * math.log(0.05))

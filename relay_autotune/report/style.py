@@ -16,13 +16,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from relay_autotune.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure, SubFigure
-
-FloatArray = NDArray[np.float64]
 
 # Name of the CSS variable, colour on white, colour on black. All colours differ, since each colour
 # in a figure is replaced by its variable.

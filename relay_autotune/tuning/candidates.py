@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.loop.gains import Controller
-
-FloatArray = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.floating[Any]]
 
 
 def design_grid(model: TransferFunction, frequency: float) -> FloatArray:

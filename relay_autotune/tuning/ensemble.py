@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller
@@ -26,9 +26,6 @@ from relay_autotune.tuning.model_set import HeldSet, ModelSet
 from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.surroundings import allowed_outside
 from relay_autotune.tuning.task import DesignTask
-
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 _MODELS = 100
 # One model in this number is one of another structure on which the gains have to hold.

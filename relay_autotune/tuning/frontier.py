@@ -29,18 +29,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
 from relay_autotune.tuning.model_set import ModelSet
-
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
-IntArray = NDArray[np.integer[Any]]
 
 _ALL = slice(None)
 

@@ -6,15 +6,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
-
-FloatArray = NDArray[np.floating[Any]]
 
 
 def stable_gains(

@@ -14,14 +14,11 @@ which is small for well damped loops, so that few points suffice.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.floating[Any]]
 
 _POINTS = 512
 _RESETS, _TURNS = 6.0, 5.0

@@ -9,19 +9,17 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import Law
 from relay_autotune.loop.sampled_loop import SampledLoop, sampled_grid
 from relay_autotune.process.held import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
 _Constants = Sequence[tuple[complex, ...]]
 
 

@@ -20,11 +20,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import Law, Rational, Slope
 from relay_autotune.loop.margins import peaks
@@ -36,10 +35,6 @@ from relay_autotune.tuning.design_grid import design_grid
 from relay_autotune.tuning.frontier import Bounds, Responses, envelope, first_crossing
 from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.search import Search
-
-FloatArray = NDArray[np.floating[Any]]
-ComplexArray = NDArray[np.complexfloating[Any, Any]]
-IntArray = NDArray[np.integer[Any]]
 
 _ALL = slice(None)
 # The range of gains of the continuous loop is left by this factor.

@@ -16,11 +16,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.margins import frequencies, peaks
@@ -34,8 +33,6 @@ from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.load_cost import load_iaes
 from relay_autotune.tuning.pattern_search import pattern_search
 from relay_autotune.tuning.surroundings import Surroundings
-
-FloatArray = NDArray[np.floating[Any]]
 
 # Proportional gains are scanned over this part of the stable range, from its upper end.
 _DEPTH = 1e4

@@ -6,16 +6,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.tuning.candidates import Candidates
 from relay_autotune.tuning.frontier import Bounds, Responses
-
-FloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.integer[Any]]
 
 _SHARE = 0.95
 # The first models to be asked are this factor times the number that may exceed a bound.

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.responses import step_responses
@@ -28,9 +28,6 @@ from relay_autotune.shaping import Shaping
 from relay_autotune.tuning import DEFAULT_RULE, Designed, DesignOptions, designed, judged
 from relay_autotune.tuning.ensemble import ensemble_peaks
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
-
-FloatArray = NDArray[np.floating]
-ComplexArray = NDArray[np.complexfloating]
 
 # What the slider asks for: from calm to fast.
 CALM, FAST, STEP = 1.2, 2.0, 0.02

@@ -14,8 +14,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.escape import visible
 from relay_autotune.process.response import response
 from relay_autotune.record.record import Record
@@ -33,8 +34,6 @@ from relay_autotune.text import digits, process_text
 from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.shape import CALM, FAST, STEP, Asked, Shaped, Subject
-
-FloatArray = NDArray[np.floating]
 
 # Samples at which the model of a running tune is computed.
 _MOST_SIMULATED = 2000

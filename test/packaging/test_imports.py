@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # From the ground up. A package imports itself and those on floors below; two on one floor do not
 # know each other.
 FLOORS = (
-    {"errors", "threads"},
+    {"errors", "threads", "arrays"},
     {"quantities", "confidence", "text", "escape"},
     {"record", "verdict"},
     {"process"},

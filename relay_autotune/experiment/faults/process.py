@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from relay_autotune.record.record import Cycle, FloatArray
+from relay_autotune.arrays import FloatArray
+from relay_autotune.record.record import Cycle
 
 # The swings grow like an unstable loop's after this many steps, each larger than the one before by
 # a factor, to a multiple of the first swing. In the transient of a stable loop the steps become

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError, ModelError, RecordError
 from relay_autotune.identification.judgement.validation import (
@@ -27,8 +26,6 @@ from relay_autotune.identification.waveform.residuals import ljung_box, noise_to
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record
-
-FloatArray = NDArray[np.float64]
 
 _NEGLIGIBLE = 1e-10
 # More different commands than these in a cycle are not those of a relay.

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError, RecordError
 from relay_autotune.identification.shown.fourier import frequency_point
 from relay_autotune.identification.waveform.residuals import worth
@@ -20,8 +20,6 @@ from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import PiecewiseConstant, Record
-
-FloatArray = NDArray[np.float64]
 
 _SURE = 4.5
 _LEAST_ASYMMETRY = 0.05

@@ -15,8 +15,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
 from relay_autotune.identification.waveform.residuals import worth
@@ -36,8 +36,6 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, INTEGRATOR_INVERSE, SOPDT_ZERO
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Input, PiecewiseConstant, Record
-
-FloatArray = NDArray[np.float64]
 
 _MOST_SAMPLES = 4096
 # Least correlation of neighbours that counts, in standard errors.

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.judgement.direction import OtherDirection, other_direction
 from relay_autotune.identification.judgement.refits import Part, halves, plain_models
@@ -26,9 +26,6 @@ MOST_GROWTH = 7.0
 # Largest residual of a rival relative to the model's, and its least share of the support.
 _AS_WELL = 1.1
 _WORTH_HEARING = 0.01
-
-FloatArray = NDArray[np.floating]
-ComplexArray = NDArray[np.complexfloating]
 
 
 @dataclass(frozen=True)

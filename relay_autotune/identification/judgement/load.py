@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.record import FloatArray, PiecewiseConstant, Record
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 # Numbers of instants at which a load is tried, and of the best ones that are followed up.
 _INSTANTS = 60

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
@@ -34,8 +34,6 @@ from relay_autotune.identification.waveform.theta import theta_of, unit_steps
 from relay_autotune.process.structures import FOPDT, SOPDT, GivenModel, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 _MOST_SAMPLES = 1200
 _FEWEST = 24

@@ -14,8 +14,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError, ModelError
 from relay_autotune.identification.result import Validation
 from relay_autotune.identification.shown.fold import Fold, as_switched, fold
@@ -24,8 +24,6 @@ from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Record, RelaySettings
-
-FloatArray = NDArray[np.float64]
 
 _POINTS = 512
 _FREQUENCIES = 4001

@@ -16,14 +16,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complexfloating]
 
 _BINS = 24
 _MOST_SAMPLES = 2000

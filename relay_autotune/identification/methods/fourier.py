@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 from scipy.special import fdtrc
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
@@ -41,9 +42,6 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _NEAREST = 3
 _REACH = 3.0

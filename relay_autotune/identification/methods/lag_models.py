@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.process.structures import (
@@ -20,9 +20,6 @@ from relay_autotune.process.structures import (
     Structure,
     equal_lags,
 )
-
-FloatArray = NDArray[np.float64]
-
 
 MODEL_1, MODEL_4, MODEL_5 = FOPDT, SOPDT, TWO_EQUAL_ONE
 

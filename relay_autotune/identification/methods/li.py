@@ -23,10 +23,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.differences import exact_steps, jacobian
 from relay_autotune.identification.estimate import Estimate
@@ -54,8 +54,6 @@ from relay_autotune.identification.shown.symmetric_cycle import (
 )
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 # Relative errors of a period and an amplitude read off a chart.
 CHART_ERRORS = (0.002, 0.01)

@@ -25,9 +25,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
@@ -36,8 +36,6 @@ from relay_autotune.identification.result import FitReport, Identification, iden
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.record.record import PiecewiseConstant, Record
-
-FloatArray = NDArray[np.float64]
 
 _SMALL = 1e-3
 _LARGEST = 1e8

@@ -21,12 +21,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
-
-FloatArray = NDArray[np.float64]
 
 _CLOSE = 0.25
 _TAYLOR = 15

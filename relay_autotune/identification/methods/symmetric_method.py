@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
@@ -50,8 +50,6 @@ from relay_autotune.identification.shown.symmetric_cycle import (
 )
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 MOST_EQUAL = 20
 

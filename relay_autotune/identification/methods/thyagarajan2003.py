@@ -18,14 +18,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.methods.square_wave import level as level_of_lags
 from relay_autotune.identification.methods.square_wave import peak as peak_of_lags
-
-FloatArray = NDArray[np.float64]
 
 SMALL_DEAD_TIME = 0.001
 HIGHER_ORDER = 5

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.differences import jacobian
@@ -45,8 +45,6 @@ from relay_autotune.process.structures import FOPDT, IPDT, LAG_N, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 METHOD = "thyagarajan"
 

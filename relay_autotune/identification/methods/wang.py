@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr, stdtrit
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
@@ -39,8 +39,6 @@ from relay_autotune.identification.shown.steady_state import (
 from relay_autotune.identification.shown.symmetric_cycle import require_unbiased
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

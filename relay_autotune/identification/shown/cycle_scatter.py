@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.record.cycles import (
     LimitCycle,
@@ -22,8 +22,6 @@ from relay_autotune.record.cycles import (
     settings_of,
 )
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_CYCLES = 3
 # Least distance from both levels, in amplitudes, that counts as between them, and the largest

@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.kick import ResponseDetector
@@ -18,8 +17,6 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.shown.cycle_scatter import CycleRun, RelayTest
 from relay_autotune.identification.shown.fold import Fold, fold
 from relay_autotune.record.record import Record, RelaySettings
-
-FloatArray = NDArray[np.float64]
 
 # Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by
 # more than 1 where the command arrives.

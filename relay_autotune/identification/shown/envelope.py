@@ -9,15 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import fdtrc
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.record.cycles import cycles_of, settings_of
 from relay_autotune.record.record import Record, asked_once
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_PEAKS = 6
 _QUICKEST = 0.1

@@ -19,12 +19,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.periodic_spline import Basis, Kinks, Spline
 from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, asked_once
-
-FloatArray = NDArray[np.float64]
 
 # Numbers of knots in half a period, from the fewest on, and least number of samples for each.
 _KNOTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)

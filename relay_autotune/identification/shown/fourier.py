@@ -9,14 +9,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.quantities import told
 from relay_autotune.record.record import PiecewiseConstant, Record
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _SMALL_ANGLE = 0.2
 

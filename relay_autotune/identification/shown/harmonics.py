@@ -9,7 +9,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.cycle_scatter import CycleRun
@@ -23,7 +22,6 @@ from relay_autotune.identification.shown.fourier import (
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 
-FloatArray = NDArray[np.float64]
 Points = tuple[FrequencyPoint, ...]
 
 _MOST = 9

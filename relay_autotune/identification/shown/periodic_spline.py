@@ -9,13 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor
 from scipy.linalg.lapack import dpotrs
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
-FloatArray = NDArray[np.float64]
+from relay_autotune.arrays import FloatArray
 
 _RIDGE = 1e-13
 _TOLERANCE = 1e-7

@@ -17,17 +17,15 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.envelope import envelope, growth_time, normalised_growth
 from relay_autotune.identification.shown.fold import Fold, fold, fold_without
 from relay_autotune.process.half_cycle import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Record, asked_once
-
-FloatArray = NDArray[np.float64]
 
 SHARP = 0.25
 SLOW = 1.0

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.cycle_scatter import CycleRun, RelayTest
 from relay_autotune.identification.shown.fourier import cycle_means
-from relay_autotune.record.record import FloatArray, Record, RelaySettings, asked_once
+from relay_autotune.record.record import Record, RelaySettings, asked_once
 
 _LEAST_BIAS = 0.02
 _LEAST_SAMPLES = 8

@@ -9,15 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.shown.cycle_scatter import CycleRun
 from relay_autotune.record.record import RelaySettings
-
-FloatArray = NDArray[np.float64]
 
 _MOST_BIAS = 0.01
 _MOST_SKEW = 0.05

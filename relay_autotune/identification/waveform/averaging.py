@@ -9,13 +9,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.combinations import point_of
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification, Rival
-
-FloatArray = NDArray[np.float64]
 
 # Largest deviation of a rival's value for which the first order holds: relative to the value, and
 # of a dead time or a zero, in radians at the ultimate frequency.

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from relay_autotune.arrays import FloatArray
 
 _MOST_LAGS = 24
 # Least number of samples for each further lag.

@@ -14,7 +14,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.identification.known import LOSSES, Known
 from relay_autotune.identification.waveform.colour import Colour, colour_of, slow_colour
@@ -35,8 +34,6 @@ from relay_autotune.identification.waveform.selection import (
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
 from relay_autotune.identification.waveform.theta import unit_steps
-
-FloatArray = NDArray[np.float64]
 
 # Probability as white noise below which a residual has a colour.
 _WHITE = 1e-3

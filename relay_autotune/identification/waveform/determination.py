@@ -9,9 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from relay_autotune.arrays import FloatArray
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.combinations import determined_combinations, is_determined
 from relay_autotune.identification.estimate import Uncertain
@@ -26,8 +24,6 @@ from relay_autotune.identification.waveform.fit_covariance import (
 from relay_autotune.identification.waveform.profiles import profile_ends
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 _MOST_FOR_PROFILES = 4096
 # Largest standard deviation of a logarithm with which a search begins, and farthest end of an

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
@@ -40,8 +40,6 @@ from relay_autotune.identification.waveform.separable import Problem, Trial, eva
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 _UNEXPLAINED = 1.5
 _WHITE = 1e-3

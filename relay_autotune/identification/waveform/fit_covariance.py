@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.differences import jacobian, relative_steps
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.waveform.residuals import (
@@ -24,8 +24,6 @@ from relay_autotune.identification.waveform.selection import Candidate
 from relay_autotune.identification.waveform.separable import Problem, Trial
 from relay_autotune.identification.waveform.theta import unit_steps
 from relay_autotune.record.record import Record
-
-FloatArray = NDArray[np.float64]
 
 # Residual that is rounding, as a share of the measurement's range.
 NEGLIGIBLE = 1e-10

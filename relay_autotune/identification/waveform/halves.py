@@ -9,14 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.float64]
 
 _TRIAL = 1e-6
 _STEPS = 15

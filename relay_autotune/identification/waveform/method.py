@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
@@ -52,8 +53,6 @@ from relay_autotune.identification.waveform.starts import changes_within
 from relay_autotune.identification.waveform.theta import unit_steps
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.record import Input, Record
-
-FloatArray = NDArray[np.float64]
 
 # Number of samples from which even a coarse measurement takes more than two values.
 _ENOUGH_FOR_TWO = 20

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from relay_autotune.arrays import FloatArray
+
 # Real for a real pole, complex for the upper one of a pair.
 Numbers = NDArray[Any]
 

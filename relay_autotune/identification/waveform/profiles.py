@@ -10,12 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.differences import jacobian, relative_steps
 from relay_autotune.identification.waveform.separable import Problem, Trial
 
-FloatArray = NDArray[np.float64]
 # A parameter as a function of theta and the linear coefficients.
 Parameter = Callable[[FloatArray, FloatArray], float]
 

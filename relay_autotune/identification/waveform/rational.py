@@ -6,15 +6,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.partial_fractions import follow, partial_fractions
 from relay_autotune.process.factors import Denominator, Lag, UnstableLag
 from relay_autotune.process.modes import Modes
 from relay_autotune.process.response import coordinates_at_changes
 from relay_autotune.record.record import Input, PiecewiseLinear
-
-FloatArray = NDArray[np.float64]
 
 _CHUNK = 1 << 15
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-FloatArray = NDArray[np.float64]
+from relay_autotune.arrays import FloatArray
 
 
 def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
@@ -52,8 +52,6 @@ from relay_autotune.process.structures import (
     equal_lags,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-
-FloatArray = NDArray[np.float64]
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4

@@ -16,13 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.colour import Colour
 from relay_autotune.identification.waveform.rational import free_motion
 from relay_autotune.identification.waveform.theta import columns_of, stepped, unit_steps
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
-
-FloatArray = NDArray[np.float64]
 
 _MOST_ITERATIONS = 80
 _MOST_ROUGH_ITERATIONS = 25
@@ -134,7 +133,8 @@ class Problem:
         """Return one experiment's responses, free motion and straight line, with derivatives."""
         time = self.time[part]
         common, by_theta = columns_of(self.structure, theta, time, self.inputs[number])
-        own, own_by_theta = np.zeros((0, time.size)), np.zeros((theta.size, 0, time.size))
+        own: FloatArray = np.zeros((0, time.size))
+        own_by_theta: FloatArray = np.zeros((theta.size, 0, time.size))
         if self.relaxation or self.structure.unstable:
             own, own_by_theta = free_motion(
                 self.structure.denominator, theta, time, growing_only=not self.relaxation

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
@@ -21,8 +21,6 @@ from relay_autotune.identification.waveform.theta import columns_of, unit_steps
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Input, PiecewiseConstant
-
-FloatArray = NDArray[np.float64]
 
 _GRID_SAMPLES = 240
 _BEST = 3

@@ -11,16 +11,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.partial_fractions import MANY_CHANGES, doubled
 from relay_autotune.identification.waveform.rational import responses
 from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.model_parameters import DEAD_TIME
 from relay_autotune.process.structures import FOPDT, Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
-
-FloatArray = NDArray[np.float64]
 
 _LOG_STEP = 1.0
 _DEAD_TIME_STEP = 0.3

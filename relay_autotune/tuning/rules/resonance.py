@@ -21,14 +21,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-
-FloatArray = NDArray[np.float64]
 
 _POINTS = 800
 _BELOW, _ABOVE = 1e-5, 30.0
