@@ -50,6 +50,7 @@ RATIONAL = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("controller", "model"), RATIONAL)
 def test_margins_agree_with_python_control(control, controller, model):
     c, g = _rational(control, controller, model)

@@ -49,6 +49,7 @@ def models(record):
     return assess(found, record)
 
 
+@pytest.mark.long
 def test_the_limit_cycle_of_each_model_is_compared(models):
     wang, atv, _ = models
     assert wang.validation.worst < 0.02

@@ -72,6 +72,7 @@ def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
     assert "the operator said stop" in found.reason
 
 
+@pytest.mark.long
 def test_while_it_runs_there_is_a_model_and_no_gains():
     found = model_so_far(_record())
     assert found.model is not None
@@ -100,7 +101,7 @@ def test_data_that_tell_nothing_are_a_reason():
     assert "constant" in found.reason
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_rule_that_does_not_apply_says_so():
     found = analyse(_record(), rule="itae")
     assert found.best_gains.rule == "itae"
@@ -160,7 +161,7 @@ def _beginning(record: Record, samples: int) -> Record:
     )
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_running_test_forgets_a_disturbance_of_its_beginning():
     """While the model contradicts the record there is no interval to end the test on."""
     model = TransferFunction.fopdt(1.65, 20.0, 10.0)

@@ -106,6 +106,7 @@ def test_equations_11_and_12(name, inputs, exact, tol):
     assert abs(printed) < tol * scale
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
 @pytest.mark.parametrize("model", PROCESSES, ids=str)
 def test_the_generalised_equations_return_the_process(model, share):
@@ -201,6 +202,7 @@ def test_one_lag_is_refused_outside_its_existence():
     assert (again.period, again.peak_max) == pytest.approx((10.0, 1.0), rel=1e-9)
 
 
+@pytest.mark.long
 def test_numbers_that_cannot_be_are_refused():
     with pytest.raises(IdentificationError, match="amplitude"):
         time_constant_from_amplitude(1, 10.0, 1.5, None)
@@ -221,7 +223,7 @@ def test_numbers_that_cannot_be_are_refused():
         two_equal_and_one(period, 0.1, amplitude / (2.0 * RELAY), 0.0, None)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @settings(deadline=None, max_examples=40)
 @given(
     order=st.integers(1, 8),
@@ -256,6 +258,7 @@ def _record(
     return run.record(noise_std=noise * swing, rng=np.random.default_rng(3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.0, 0.2])
 @pytest.mark.parametrize("model", [*PROCESSES[:6], *PROCESSES[7:9]], ids=str)
 def test_records_with_gain_and_dead_time_known(model, share):
@@ -269,6 +272,7 @@ def test_records_with_gain_and_dead_time_known(model, share):
         assert any("without the hysteresis" in w for w in found.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [2.0, -2.0])
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_records_of_an_unknown_gain(order, gain):
@@ -280,6 +284,7 @@ def test_records_of_an_unknown_gain(order, gain):
     assert any("without the gain the structure is not checked" in w for w in found.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("order", "source"), [(1, "the sharp peak"), (2, "the first response"), (3, "first response")]
 )

@@ -61,6 +61,7 @@ def test_within_its_limits_the_controller_does_not_wind_up():
         assert run.measurement[-1] == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("period", [0.25, 1.0])
 def test_the_noise_in_the_command_is_what_was_predicted(period):
     noise = np.random.default_rng(1).standard_normal(3001)

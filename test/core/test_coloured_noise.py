@@ -141,6 +141,7 @@ def test_a_heater_that_is_switched_on_with_the_first_sample():
     assert np.all(np.isfinite(found.fitted))
 
 
+@pytest.mark.long
 def test_an_oven_that_rests_and_then_warms_has_a_positive_gain():
     """A single step beside a slow disturbance, which once passed for a drift and a zero."""
     time = np.arange(1200.0)

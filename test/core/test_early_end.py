@@ -119,7 +119,7 @@ def _ended(
     return tune, found
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_test_of_three_lags_ends_early_and_its_interval_is_true():
     # No FOPDT explains this process: the structure has to be chosen on the way.
     model = TransferFunction.lag_n(1.0, 1.0, 3, 0.5)

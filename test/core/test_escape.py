@@ -29,6 +29,7 @@ def test_what_cannot_be_seen_is_made_visible(text, expected):
     assert visible(visible(text)) == expected
 
 
+@pytest.mark.long
 def test_every_character_comes_out_printable():
     text = visible("".join(map(chr, range(sys.maxunicode + 1))))
     assert text.isprintable()

@@ -53,6 +53,7 @@ def gains_of(process: TransferFunction) -> Controller:
     return Controller(0.4 * point.gain, 2.0 * point.period)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROCESSES)
 @pytest.mark.parametrize("samples", [60, 2000])
 def test_the_process_itself_and_its_gains_pass(name: str, samples: int) -> None:

@@ -99,6 +99,7 @@ def test_a_clipped_actuator_shows_in_a_response_that_does_not_grow(end):
     assert command == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("amplitude", [20.0, 100.0])
 @pytest.mark.parametrize("baseline", [0.0, 0.5, 1.0, 2.5, 4.5, 5.0])
 @pytest.mark.parametrize("std", [0.0, 0.05])
@@ -119,6 +120,7 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
     assert command == baseline
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bias", [{}, {"bias": -0.3}, {"bias_ratio": 0.0}])
 @pytest.mark.parametrize("dead_time", [0.1, 1.0, 10.0])
 @pytest.mark.parametrize("std", [0.0, 0.005, 0.02])

@@ -179,6 +179,7 @@ def test_a_limit_cycle_comes_back_with_the_number_of_its_cycles(data):
     assert_same(of_document(LimitCycle, document, cycles=value.cycles), value)
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(value=results(Identification))
 def test_an_identification_comes_back_from_its_message(value):

@@ -88,6 +88,7 @@ def test_a_biased_relay_tells_even_harmonics_and_the_static_gain():
     assert abs(rested.values[0] - 1.65) < 3.0 * rested.std[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "model",
     [
@@ -104,6 +105,7 @@ def test_the_ultimate_point_needs_no_structure(model):
     assert any("another structure" in text for text in found.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "known"),
     [

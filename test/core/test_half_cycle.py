@@ -68,7 +68,7 @@ def test_multiplier(name, inputs, exact, tol):
     )
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.eq25.grid"))
 def test_growth_of_two_equal_lags(name, inputs, exact, tol):
     for case in exact:

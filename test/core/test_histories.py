@@ -88,6 +88,7 @@ def test_one_long_stay_is_no_end_of_all_cycles(kind, begin):
     assert tune.switches < 150
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0.3, 3.0, 1e3, 1e6, 1e9])
 @pytest.mark.parametrize("kind", ["gap", "clock"])
 def test_a_gap_and_a_step_of_the_clock_count_as_no_more_than_some_samples(kind, size):

@@ -128,7 +128,7 @@ def test_steps_and_relays_of_ordinary_processes_are_trusted(record):
     assert completed().verdict is Verdict.TRUSTED
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_record_that_is_mostly_another_input_is_doubtful():
     record = steps(PROCESS, noise=0.0)
     other = np.cumsum(np.random.default_rng(8).normal(0.0, 0.35, len(record)))
@@ -213,6 +213,7 @@ def test_gains_that_do_not_hold_on_one_half_are_doubtful(gains):
     assert found.value == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_half_that_works_in_the_other_direction_gives_no_gains(gains):
     record = joined(PROCESS, TransferFunction.fopdt(-4.0, 10.0, 3.0))
     found = of_checks(record, fitted_as(PROCESS, record), gains)["halves_direction"]
@@ -222,6 +223,7 @@ def test_a_half_that_works_in_the_other_direction_gives_no_gains(gains):
     assert of_checks(same, fitted_as(PROCESS, same), gains)["halves_direction"].value == 0.0
 
 
+@pytest.mark.long
 def test_a_half_that_shows_nothing_objects_to_nothing(gains):
     # The noise of the first half is two hundred times that of the other.
     record = joined(PROCESS, PROCESS)
@@ -245,6 +247,7 @@ def test_a_plain_model_that_explains_as_much_speaks_against_gains_of_another(rec
     )
 
 
+@pytest.mark.long
 def test_a_plain_model_that_explains_less_is_not_asked():
     # Two equal lags and a zero in the right half plane: a lag with dead time leaves a tenth.
     inverse = TransferFunction(2.0, (-6.0,), (6.0, 6.0), 0, 1.0)
@@ -308,6 +311,7 @@ def fed_back(process, gain, *, steps=2000):
     return Record(time=time, measurement=y, command=u)
 
 
+@pytest.mark.long
 def test_a_controller_that_is_read_backward_gives_no_gains():
     record = fed_back(TransferFunction.fopdt(2.0, 4.0, 1.0), 1.5)
     assert followed_share(record, -1) == pytest.approx(1.0)
@@ -324,6 +328,7 @@ def test_a_slow_command_that_the_process_follows_is_not_fed_back():
     assert followed_share(replace(record, measurement=y), 1) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("tau", "result"), [(8.0, Result.PASSED), (0.2, Result.DOUBTFUL)])
 def test_an_answer_between_few_samples_is_not_trusted(record, gains, tau, result):
     found = fitted_as(TransferFunction.fopdt(2.0, tau, 0.1), record)
@@ -341,7 +346,7 @@ def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
     assert lost_effect(record, heater) is None
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse_alone(clipped_steps(9.0)).verdict is Verdict.TRUSTED
     assert analyse_alone(clipped_steps(0.7)).verdict is not Verdict.TRUSTED

@@ -73,6 +73,7 @@ def test_a_first_order_process_shows_its_sign_soon(gain, noise_std, ratio):
     assert intervals < 15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("zero", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("dead_time", [0.05, 0.2, 1.0])
 @pytest.mark.parametrize("integrators", [0, 1])

@@ -236,6 +236,7 @@ def test_its_ms_is_that_of_a_sinusoidal_test_of_its_source(name):
     assert math.hypot(a, b) == pytest.approx(found.ms, rel=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("period", [0.3, 1.7])
 @pytest.mark.parametrize(
     ("model", "ti"),
@@ -266,6 +267,7 @@ def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
     assert found.overshoot == pytest.approx(max(setpoint.measurement.max() - 1.0, 0.0), abs=1e-4)
 
 
+@pytest.mark.long
 def test_noise_reaches_the_command_as_said():
     law = law_named("marlin_heater")
     gains = law.best(WANTED, PERIOD)

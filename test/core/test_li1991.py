@@ -49,6 +49,7 @@ def _tests(process: TransferFunction, epsilon: float = 0.0) -> list[SymmetricCyc
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("epsilon", [0.0, 0.1])
 @pytest.mark.parametrize(("model", "values"), CASES, ids=str)
 def test_two_exact_limit_cycles_give_all_parameters(model, values, epsilon):
@@ -63,6 +64,7 @@ def test_two_exact_limit_cycles_give_all_parameters(model, values, epsilon):
         assert found == pytest.approx(values, rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("model", "values"), CASES[:4], ids=str)
 def test_the_simplest_model_that_agrees_comes_first(model, values):
     tests = _tests(model.build(np.array(values)))

@@ -59,7 +59,7 @@ def test_a_load_in_the_first_two_cycles_is_estimated(model, load_time, load_size
     assert time == pytest.approx(load_time, abs=3.0)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_load_that_no_structure_explains_does_not_pass_for_no_response():
     # What the models leave is so correlated that the simplest was chosen, which leaves all of it.
     tune = run(SECOND_ORDER, load_time=70.17, load_size=-0.4, noise_std=0.0, seed=1000)
@@ -81,6 +81,7 @@ def test_no_load_is_looked_for_where_noise_explains_what_is_left(noise_std):
     assert with_its_load(found, record, tune.cycles, unwanted) == (found, record)
 
 
+@pytest.mark.long
 def test_what_is_not_known_of_the_load_widens_the_intervals():
     tune = run(SECOND_ORDER, load_time=25.6, load_size=0.2, noise_std=0.0114, seed=1003)
     known = Known(structure="sopdt")

@@ -140,6 +140,7 @@ PROCESSES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("process", "end"), PROCESSES)
 @pytest.mark.parametrize("step", [2.0, -2.0])
 def test_a_record_without_noise(process, end, step):
@@ -170,6 +171,7 @@ def test_a_known_dead_time_is_used():
     assert found.std[3] == 0.0
 
 
+@pytest.mark.long
 def test_many_samples_take_no_longer():
     record = step_record(EXAMPLE, samples=200_001, noise=0.05)
     found = identify(record, "luyben_step")

@@ -152,6 +152,7 @@ def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
     return time, run.measurement + noise
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [Step(setpoint=0.5), Step(setpoint=-0.2), Step(load=0.4)])
 @pytest.mark.parametrize("noise_std", [0.0, 0.01])
 def test_the_process_itself_passes(step, noise_std):
@@ -162,6 +163,7 @@ def test_the_process_itself_passes(step, noise_std):
     assert found.fit > 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [Step(setpoint=0.5), Step(load=0.4)])
 @pytest.mark.parametrize("factor", [0.4, 2.2])
 def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
@@ -235,6 +237,7 @@ def test_gains_that_are_unstable_on_the_model_are_not_tried():
 # Samples that cannot be true.
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wild", [65535.0, -65535.0, 1e9, 1e12, 1e20, -1e20, 1.7e308])
 @pytest.mark.parametrize(
     "gains",

@@ -31,12 +31,14 @@ def _record(rate: float) -> Record:
     return loop.record()
 
 
+@pytest.mark.long
 def test_the_command_as_it_was_gives_the_exact_process():
     found = identify(_record(0.5))
     assert found.structure == "fopdt"
     assert found.values == pytest.approx((1.65, 20.0, 10.0), rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["wang_unbiased", "chang", "atv", "thyagarajan"])
 def test_methods_for_an_ideal_relay_step_aside(method):
     with pytest.raises(IdentificationError, match="between its two levels"):

@@ -62,6 +62,7 @@ def check(tune, rel=0.05):
     assert gain_of(tune) == pytest.approx(ULTIMATE_GAIN, rel=rel)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("load_time", "load_size"), [(60.0, -0.4), (110.0, 0.3)])
 def test_a_load_at_the_begin_of_the_test_is_left_out(load_time, load_size):
     check(run(load_time=load_time, load_size=load_size, noise_std=0.01), rel=0.03)

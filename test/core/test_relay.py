@@ -50,6 +50,7 @@ def feed(tune, measurements, period=0.1):
 # On known processes.
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ratio", [0.1, 0.3, 1.0, 4.0])
 @pytest.mark.parametrize("gain", [1.7, -0.6])
 @pytest.mark.parametrize("sign_given", [False, True])
@@ -154,6 +155,7 @@ def test_a_quantised_measurement_on_the_set_point_does_not_switch():
     assert answers == [high, low, low, low, high, high, high, low]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 5.0])
 @pytest.mark.parametrize("level", [0.1, 0.2])
@@ -188,6 +190,7 @@ def test_dense_noisy_samples_make_no_false_cycles():
     assert all(0.8 * ideal < c.period < 1.3 * ideal for c in tune.cycles)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [1.0, -2.0])
 @pytest.mark.parametrize("sign_given", [False, True])
 @pytest.mark.parametrize(
@@ -477,6 +480,7 @@ def test_parameters_are_checked_against_the_baseline():
 # Whatever happens.
 
 
+@pytest.mark.long
 @settings(max_examples=60)
 @given(
     gain=st.floats(0.1, 10.0),

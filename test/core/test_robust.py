@@ -39,6 +39,7 @@ def _ms_of(controller, model) -> float:
     return float(np.max(1.0 / np.abs(1.0 + loop)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), MIGO, ids=[c[0] for c in MIGO])
 def test_the_largest_integral_gain(name, inputs, exact, tol):
     model, ms = PROCESSES[inputs["process"]], _asked(name)
@@ -49,6 +50,7 @@ def test_the_largest_integral_gain(name, inputs, exact, tol):
         assert found.kc == pytest.approx(inputs["Kc"], rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), LEAST, ids=[c[0] for c in LEAST])
 def test_the_least_iae_of_pi(name, inputs, exact, tol):
     model, ms = PROCESSES[inputs["process"]], _asked(name)
@@ -59,6 +61,7 @@ def test_the_least_iae_of_pi(name, inputs, exact, tol):
     assert analyse_loop(found.controller, model).iae_load <= exact["IAE_load"] * (1.0 + tol)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "inputs", "exact", "tol"), LEAST_PID, ids=[c[0] for c in LEAST_PID]
 )
@@ -72,6 +75,7 @@ def test_the_least_iae_of_pid(name, inputs, exact, tol):
     assert analyse_loop(found.controller, model).iae_load <= exact["IAE_load"] * 1.008
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("ratio", "pi", "pid"), [(0.22, 1.61, 1.35), (0.3, 1.97, 1.52), (0.5, 3.55, 2.08)]
 )
@@ -123,6 +127,7 @@ def test_the_loop_of_the_controller_to_be_is_longer_by_its_period_and_delay():
     assert (slow.kc, slow.ti) == pytest.approx((whole.kc, whole.ti), rel=1e-9)
 
 
+@pytest.mark.long
 def test_95_percent_of_the_models_around_keep_the_bound():
     rng = np.random.default_rng(0)
     models = tuple(
@@ -140,6 +145,7 @@ def test_95_percent_of_the_models_around_keep_the_bound():
         assert peaks[37] == pytest.approx(1.4, abs=2e-3)
 
 
+@pytest.mark.long
 def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
     rng = np.random.default_rng(0)
     gains, lags, delays = np.array([0.09, 0.005, 0.009])[:, None] * rng.standard_normal((3, 100))
@@ -157,6 +163,7 @@ def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
     assert all(is_stable(controller, m) for m in models[::10])
 
 
+@pytest.mark.long
 def test_a_gain_beside_the_ultimate_one_does_not_pass_for_one_without_limit():
     # With the filter, one of the gains that are scanned lies within a cell of the ultimate one.
     model = TransferFunction.unstable_sopdt(0.976, 0.5765, 0.04902, 0.04714)

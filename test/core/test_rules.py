@@ -104,6 +104,7 @@ LISTED = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs"), LISTED, ids=[n for n, _ in LISTED])
 def test_every_worked_loop_has_the_gains_of_its_rule(name, inputs):
     # Printed gains have three or four digits, of five lags kc K was rounded to 1, and of example
@@ -328,6 +329,7 @@ def test_the_fopdt_of_two_points_of_the_step_response():
         two_point_fopdt(_T.ipdt(1.0, 1.0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ratio", [0.05, 0.22, 0.3, 0.5])
 @pytest.mark.parametrize(
     ("kind", "least"),

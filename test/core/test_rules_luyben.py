@@ -66,6 +66,7 @@ def test_table_1(name, inputs, exact, tol):
     assert found.upper == pytest.approx(exact, rel=tol), name
 
 
+@pytest.mark.long
 def test_the_optimum_of_table_1():
     (_, _, exact, tol), *_ = cases("luyben.T1.optimum")
     for share, case in ((0.5, exact["ti11_5"]), (0.25, exact["ti5_75"])):
@@ -92,6 +93,7 @@ def test_an_integral_time_may_be_too_short_for_the_resonance():
         gain(DRUM, 14.0, 2.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "kind"),
     [

@@ -52,6 +52,7 @@ def ideal_record(model, relay=IDEAL, cycles=6, samples=1200, noise=0.0, seed=0, 
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T1"))
 def test_numbers_of_the_examples(name, inputs, exact, tol):
     p = inputs
@@ -62,7 +63,7 @@ def test_numbers_of_the_examples(name, inputs, exact, tol):
     assert 4.0 / (math.pi * shape.amplitude) == pytest.approx(exact["Ku"], rel=tol)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.class.grid"))
 def test_categories_over_order_and_dead_time(name, inputs, exact, tol):
     for case in exact:
@@ -123,6 +124,7 @@ def test_a_record_has_the_shape_of_its_process(category, noise):
     assert found.sharpness == pytest.approx(exact.sharpness, rel=0.05 + 2.0 * noise)
 
 
+@pytest.mark.long
 def test_a_dense_record_gives_the_shape_exactly():
     model = TransferFunction.fopdt(-1.0, 1.0, 1.0)
     relay = RelaySettings(5.0, 40.0, 2.0, 0.0, 0.1, reverse_acting=True)
@@ -199,6 +201,7 @@ def test_the_time_constant_of_growing_peaks(growth):
     assert normalised_growth(math.exp(-0.5 / growth)) == pytest.approx(growth)
 
 
+@pytest.mark.long
 def test_steady_peaks_do_not_grow():
     rng = np.random.default_rng(2)
     time = np.arange(12.0)
@@ -214,6 +217,7 @@ def test_growth_of_the_examples_start_up():
     assert growth == pytest.approx(2.269, rel=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("order", "least", "most"), [(3, 1.02, 1.05), (10, 0.66, 0.69)])
 def test_curvature_of_the_start_up(order, least, most):
     model = TransferFunction.lag_n(1.0, 1.0, order, 0.001)

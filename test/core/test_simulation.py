@@ -37,6 +37,7 @@ def test_biased_relay(name, inputs, exact, tol):
     assert cycle.mean_measurement == pytest.approx(inputs["K"] * cycle.mean_command, rel=1e-9)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=40)
 @given(
     gain=st.floats(0.2, 5.0),
@@ -74,6 +75,7 @@ def test_closed_forms_of_thyagarajan_for_an_unstable_process(ratio):
     assert cycle.peak_max == pytest.approx(2.0 * math.expm1(ratio), rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "inputs", "exact", "tol"),
     cases("thy.T1", "thy.eq42", "thy.eq14-17", "luyben.relay", "chang.eq11", "chang.eq12"),
@@ -116,6 +118,7 @@ def test_samples_equal_the_response_to_the_recorded_command():
     np.testing.assert_allclose(run.measurement, exact, atol=1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("cycles", [1, 2, 5])
 def test_as_many_whole_cycles_are_run_as_asked_for(cycles, reverse):
@@ -165,6 +168,7 @@ def test_without_dead_time_and_hysteresis_a_kick_is_needed():
     assert run.cycles[-1].period == pytest.approx(run.cycles[-2].period, rel=1e-9)
 
 
+@pytest.mark.long
 def test_a_sampled_relay_tends_to_the_ideal_one():
     model = TransferFunction.fopdt(1.0, 2.0, 1.0)
     relay = RelaySettings(0.0, 0.0, 1.0, 0.3, 0.1)

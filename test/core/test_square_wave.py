@@ -45,6 +45,7 @@ def test_lags_that_are_nearly_equal(close):
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lags", [(3.0,), (3.0,) * 2, (3.0,) * 8, (3.0, 1.0), (1.0, 1.0, 5.0)])
 @pytest.mark.parametrize("period", [4.0, 20.0])
 def test_amplitude_with_more_and_more_harmonics(lags, period):

@@ -191,17 +191,18 @@ class Rig:
                 raise AssertionError(f"{what}: not within {timeout:g} s\n{self.logs()}")
             self.executor.spin_once(timeout_sec=0.05)
 
-    def call(self, kind: Any, name: str, request: Any) -> Any:
-        """Call a service and return its answer."""
+    def call(self, kind: Any, name: str, request: Any, again: float = PATIENCE) -> Any:
+        """Call a service and return its answer.
+
+        :param again: ask again after this time, since an answer may be lost [s].
+        """
         # Keep the client: discovery takes longer than the call.
         client = self.clients.get(name)
         if client is None:
             client = self.clients[name] = self.node.create_client(kind, name)
             self.be_known_to(name.rpartition("/")[0])
         self.until(client.service_is_ready, f"service {name}")
-        future = client.call_async(request)
-        self.until(future.done, f"answer of {name}")
-        return future.result()
+        return self.until(lambda: self._answer(client, request, again), f"answer of {name}")
 
     def be_known_to(self, node: str) -> None:
         """Wait until a node has discovered all clients made so far.
@@ -223,19 +224,23 @@ class Rig:
     def _parameters(self, client: Any, *names: str) -> list[Any]:
         """Ask for parameters, and again each second, since an answer may be lost."""
         self.until(client.service_is_ready, f"service {client.srv_name}")
+        answer = self.until(
+            lambda: self._answer(client, GetParameters.Request(names=names), 1.0),
+            f"answer of {client.srv_name}",
+        )
+        return [parameter_value_to_python(value) for value in answer.values]
 
-        def answer() -> Any:
-            future = client.call_async(GetParameters.Request(names=names))
-            end = time.monotonic() + 1.0
-            while not future.done() and time.monotonic() < end:
-                self.executor.spin_once(timeout_sec=0.05)
-            return future.result() if future.done() else None
-
-        values = self.until(answer, f"answer of {client.srv_name}").values
-        return [parameter_value_to_python(value) for value in values]
+    def _answer(self, client: Any, request: Any, wait: float) -> Any:
+        """Return the answer of a service; None if none has come after a time [s]."""
+        future = client.call_async(request)
+        end = time.monotonic() + wait
+        while not future.done() and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+        return future.result() if future.done() else None
 
     def ask_for_tune(self, **request: Any) -> Any:
-        return self.call(StartTune, "relay_node/start_tune", StartTune.Request(**request))
+        name = "relay_node/start_tune"
+        return self.call(StartTune, name, StartTune.Request(**request), again=15.0)
 
     def tune(self, **request: Any) -> Any:
         """Start a tune as soon as the processes have found each other; return the answer."""
