@@ -62,6 +62,12 @@ def wandering(rng: np.random.Generator, n: int) -> FloatArray:
     return np.cumsum(rng.normal(0.0, math.sqrt(_PERIOD / _LENGTH), n))
 
 
+def loaded(rng: np.random.Generator, n: int) -> FloatArray:
+    """Return white noise, and the response to a load step in the fourth cycle of a relay test."""
+    past = np.maximum(_PERIOD * np.arange(n) - 42.0, 0.0)
+    return white(rng, n) - 0.15 * -np.expm1(-past / 8.0)
+
+
 class Outflow:
     """A tank with an outflow by the root of its level, ``4 h' = 1 + q - sqrt(1 + h)``.
 
@@ -138,6 +144,8 @@ KINDS = (
     Kind("distributed delay", _SPREAD),
     Kind("FOPDT, noise with pole 0.98", (_FOPDT,), coloured),
     Kind("FOPDT, random walk", (_FOPDT,), wandering),
+    Kind("FOPDT, load step", (_FOPDT,), loaded),
+    Kind("distributed delay, load step", _SPREAD, loaded),
     Kind("FOPDT, saturated sensor", (_FOPDT,), bend=lambda y: min(max(y, -0.3), 0.3)),
     Kind("FOPDT, saturated actuator", (_FOPDT,), actuator={"minimum": -0.1, "maximum": 0.6}),
     Kind("FOPDT, stiction", (_FOPDT,), actuator={"stiction": 0.6}),

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -372,3 +373,12 @@ def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     assert found.verdict is not Verdict.TRUSTED
     clipped = {f.name: f for f in found.judgement.findings}["clipped"]
     assert clipped.result is not Result.PASSED
+
+
+@pytest.mark.parametrize(("share", "result"), [(0.3, Result.PASSED), (0.7, Result.DOUBTFUL)])
+def test_a_model_of_less_than_half_of_the_record_is_doubtful(record, gains, share, result):
+    found = fitted_as(PROCESS, record)
+    fitted = np.where(np.arange(len(record)) < share * len(record), math.nan, found.fitted)
+    of_part = of_checks(record, replace(found, fitted=fitted), gains)["left_out"]
+    assert of_part.result is result
+    assert of_part.value == pytest.approx(share, abs=0.01)

@@ -184,6 +184,11 @@ def _beyond(evidence: Evidence) -> Measured | None:
     return Measured(longest / evidence.record.duration)
 
 
+def _left_out(evidence: Evidence) -> Measured | None:
+    fitted = evidence.found.fitted
+    return Measured(float(np.isnan(fitted).mean())) if len(fitted) else None
+
+
 def _clipped(evidence: Evidence) -> Measured | None:
     found = lost_effect(evidence.driven or evidence.record, evidence.found.model)
     return None if found is None else Measured(found[0], f"{found[1]:.4g}")
@@ -270,6 +275,18 @@ MODEL_CHECKS = (
         sentence="{value} of the measurement's variance is not explained",
         remedy="keep other inputs constant, or use a larger amplitude",
         measure=_share,
+    ),
+    Check(
+        name="left_out",
+        title="Left out",
+        what="share of the samples that the model was not fitted to, since no model fits them "
+        "together with the others",
+        unit="",
+        doubtful=0.5,
+        sentence="{value} of the record is left out as disturbed: the model rests on the others",
+        remedy="repeat the test while nothing else acts on the process, on a computer with time "
+        "for it",
+        measure=_left_out,
     ),
     Check(
         name="limit_cycle",
