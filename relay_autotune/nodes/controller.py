@@ -45,7 +45,7 @@ from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
-from relay_autotune.nodes.results import ResultCheck
+from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Predictors, Verifiable, Verifier
 from relay_autotune_msgs.action import Verify
@@ -83,7 +83,7 @@ class ControllerNode(ServedNode):
         # Why the waiting gains are doubtful; empty: they are trusted.
         self._doubt = ""
         self._applying = False
-        self._predictors = Predictors()
+        self._predictors = Predictors(self._results.models)
         self._limits = limits_from(values)
         self._range = range_from(values)
         self._pid = PidController(
@@ -355,11 +355,7 @@ class ControllerNode(ServedNode):
         return bounds_from(values_of(self, OTHERS))
 
     def _on_model(self, message: Any) -> None:
-        if not message.final:
-            return
-        model = self._results.model(message)
-        if model is not None:
-            self._predictors.know(message.experiment_id, model, why_doubtful(message))
+        if message.final and self._results.model(message) is not None:
             self._apply_by_itself()
 
     def _on_experiment(self, message: Any) -> None:
@@ -649,18 +645,6 @@ def gains_from(values: dict[str, Any]) -> Controller | None:
     if values["kc"] == 0.0:
         return None
     return Controller(**{name: values[name] for name in ("kc", "ti", "td", "tf", "b")})
-
-
-def why_doubtful(message: Any) -> str:
-    """Return why a result needs accept_doubtful before it is used; empty: it is trusted.
-
-    :param message: the `PidGains` or `TransferFunction`.
-    """
-    if message.verdict == PidGains.VERDICT_TRUSTED:
-        return ""
-    if message.verdict == PidGains.VERDICT_UNKNOWN:
-        return "not judged, since it carries no verdict"
-    return f"not trusted: {message.verdict_reason}"
 
 
 def limits_from(values: dict[str, Any]) -> Limits:

@@ -32,6 +32,7 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
+from relay_autotune.verdict import Verdict
 
 # Limits on remembered experiments and logged reasons, since a node may send any number.
 _MOST = 8
@@ -87,7 +88,8 @@ class ResultCheck:
         self.refusals = Refusals(node)
         self._is_stable = is_stable
         self._evidence: dict[str, ExperimentFacts] = {}
-        self._models: dict[str, TransferFunction] = {}
+        self.models: dict[str, tuple[TransferFunction, str]] = {}
+        """The final models by experiment, the newest last, each with the reason to doubt it."""
 
     def know(self, experiment: Record) -> None:
         """Remember the facts of a record; a later record with the same id changes nothing.
@@ -121,7 +123,7 @@ class ResultCheck:
             self.refusals.say("the model", name, error)
             return None
         if message.final:
-            keep(self._models, name, model)
+            keep(self.models, name, (model, why_doubtful(message)))
         return model
 
     def gains(self, message: Any) -> Gains | None:
@@ -149,7 +151,7 @@ class ResultCheck:
         """
         if experiment_id not in self._evidence:
             return "no record of their experiment has come"
-        if experiment_id not in self._models:
+        if experiment_id not in self.models:
             return "no model of their experiment has come"
         try:
             self.check(experiment_id, gains)
@@ -168,9 +170,9 @@ class ResultCheck:
         if evidence is None:
             return
         evidence.require_completed()
-        model = self._models.get(experiment_id)
-        if model is None:
+        if experiment_id not in self.models:
             return
+        model, _ = self.models[experiment_id]
         try:
             # The model may have come before the record did.
             evidence.check_model(model)
@@ -217,7 +219,7 @@ class OwnResults(ResultCheck):
                 self._early = None
                 found += self.take(early[0], early[1], running, on_setpoint)
             return found
-        if message.final and told in self._evidence and told not in self._models:
+        if message.final and told in self._evidence and told not in self.models:
             self._early = name, message
             return []
         return [(name, message)] if self.gains(message) is not None else []
@@ -240,6 +242,18 @@ class OwnResults(ResultCheck):
         except RelayAutotuneError as error:
             return error
         return None
+
+
+def why_doubtful(message: Any) -> str:
+    """Return why a result needs accept_doubtful before it is used; empty: it is trusted.
+
+    :param message: the `PidGains` or `TransferFunction`.
+    """
+    if message.verdict == Verdict.TRUSTED:
+        return ""
+    if message.verdict == Verdict.UNKNOWN:
+        return "not judged, since it carries no verdict"
+    return f"not trusted: {message.verdict_reason}"
 
 
 def keep(known: dict[Any, Any], name: Any, value: Any) -> None:

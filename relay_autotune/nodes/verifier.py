@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
@@ -82,21 +82,13 @@ class Predictors:
 
     Gains are proved on the model of their own experiment. Messages of several experiments may
     arrive late and out of order, and a prediction by another one's model proves nothing.
+
+    :param models: `ResultCheck.models`.
     """
 
-    def __init__(self) -> None:
-        # Model and doubt by experiment, the newest last.
-        self._models: dict[str, tuple[TransferFunction, str]] = {}
+    def __init__(self, models: Mapping[str, tuple[TransferFunction, str]]) -> None:
+        self._models = models
         self._experiments: dict[GainSet, str] = {}
-
-    def know(self, experiment_id: str, model: TransferFunction, doubt: str) -> None:
-        """Remember a model.
-
-        :param experiment_id: its experiment; "": it was published without one.
-        :param model: the process.
-        :param doubt: why it is doubtful; "": it is trusted.
-        """
-        keep(self._models, experiment_id, (model, doubt))
 
     def applied(self, gains: GainSet, experiment_id: str) -> None:
         """Remember of which experiment gains are."""
@@ -122,7 +114,7 @@ class Predictors:
         """
         self.require_any()
         name = next((n for known, n in self._experiments.items() if known.is_near(gains)), "")
-        newest = next(reversed(self._models))
+        newest = list(self._models)[-1]
         if name not in self._models and name and newest:
             raise NotVerifiable(
                 f"the gains are of the experiment {name}, and its model has not come; the newest "

@@ -8,6 +8,7 @@ from __future__ import annotations
 import pytest
 
 from relay_autotune.control.gains_history import GainSet
+from relay_autotune.nodes.results import keep
 from relay_autotune.nodes.verifier import NotVerifiable, Predictors
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -16,29 +17,29 @@ TRUE, WRONG = (TransferFunction.fopdt(gain, 0.5, 0.2) for gain in (2.0, 0.7))
 
 
 def test_gains_are_proved_on_the_model_of_their_own_experiment() -> None:
-    models = Predictors()
+    known: dict[str, tuple[TransferFunction, str]] = {}
+    models = Predictors(known)
     with pytest.raises(NotVerifiable, match="no model has come"):
         models.of(GOOD)
-    models.know("first", TRUE, "")
+    keep(known, "first", (TRUE, ""))
     models.applied(GOOD, "first")
     models.applied(WILD, "second")
     # The model of the second is late: with that of the first, any gains do what is predicted.
     with pytest.raises(NotVerifiable, match=r"of the experiment second.*newest one is of first"):
         models.of(WILD)
-    models.know("second", WRONG, "doubtful")
+    keep(known, "second", (WRONG, "doubtful"))
     assert models.of(WILD) == (WRONG, "doubtful")
     assert models.of(GOOD) == (TRUE, "")
     # A message that is repeated changes nothing.
-    models.know("first", TRUE, "")
+    keep(known, "first", (TRUE, ""))
     assert models.of(WILD) == (WRONG, "doubtful")
 
 
 def test_gains_without_an_experiment_take_the_newest_model() -> None:
-    models = Predictors()
-    models.know("first", TRUE, "")
-    models.know("second", WRONG, "")
+    known = {"first": (TRUE, ""), "second": (WRONG, "")}
+    models = Predictors(known)
     assert models.of(BY_HAND) == (WRONG, "")
     # So do those of an experiment where the newest model names none.
-    models.know("", TRUE, "")
+    keep(known, "", (TRUE, ""))
     models.applied(GOOD, "third")
     assert models.of(GOOD) == (TRUE, "")
