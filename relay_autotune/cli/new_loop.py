@@ -39,6 +39,50 @@ _FLAGS = {
 }
 
 
+_LIMITS = {"type": finite, "nargs": 2, "metavar": ("LOW", "HIGH")}
+_OF_NEW_LOOP: dict[str, dict[str, Any]] = {
+    "measurement": {"metavar": "TOPIC", "help": "topic that measures"},
+    "command": {"metavar": "TOPIC", "help": "topic that commands the actuator"},
+    "field": {
+        "default": "data", "metavar": "PATH",
+        "help": "the number in the messages of --measurement (%(default)s)",
+    },
+    "command_field": {
+        "metavar": "PATH",
+        "help": "the number in the messages of --command, such as linear.x",
+    },
+    "command_message": {
+        "metavar": "YAML",
+        "help": "what stands in their other elements, such as '{data: [0.0, 1.5]}'",
+    },
+    "command_period": {
+        "type": finite, "metavar": "S",
+        "help": "send the last command again after this time, for an actuator that stops without",
+    },
+    "at": {
+        "type": finite, "metavar": "U",
+        "help": "the present command, at which the process rests",
+    },
+    "within": {**_LIMITS, "help": "the tune ends where the measurement leaves these [y]"},
+    "command_within": {**_LIMITS, "help": "no command beyond these is sent [u]"},
+    "verify": {
+        "action": argparse.BooleanOptionalAction,
+        "help": "prove the gains with a step of the set-point, by a controller_node of its own; "
+        "without either flag it asks, with --yes it does not",
+    },
+    "step": {
+        "type": finite, "metavar": "Y",
+        "help": "height of that step [y]; default: half of the swing of the tune, at least twenty "
+        "times the noise, as far as --within and --command-within allow",
+    },
+    "yes": {
+        "default": False, "action": "store_true",
+        "help": "do not ask, for scripts; gains are then proven with --verify alone",
+    },
+    "export": {"metavar": "FILE", "help": "write the gains for ros2_controllers' pid_controller"},
+}  # fmt: skip
+
+
 def add_new_loop(parser: argparse.ArgumentParser) -> None:
     """Add the flags of a loop that has no nodes yet.
 
@@ -49,52 +93,8 @@ def add_new_loop(parser: argparse.ArgumentParser) -> None:
         "with --measurement and --command it starts relay_node and identifier_node itself, asks "
         "for what it must know, shows the plan, tunes, and ends them",
     )
-    group.add_argument("--measurement", metavar="TOPIC", help="topic that measures")
-    group.add_argument("--command", metavar="TOPIC", help="topic that commands the actuator")
-    group.add_argument(
-        "--field", default="data", metavar="PATH",
-        help="the number in the messages of --measurement (%(default)s)",
-    )  # fmt: skip
-    group.add_argument(
-        "--command-field", metavar="PATH",
-        help="the number in the messages of --command, such as linear.x",
-    )  # fmt: skip
-    group.add_argument(
-        "--command-message", metavar="YAML",
-        help="what stands in their other elements, such as '{data: [0.0, 1.5]}'",
-    )  # fmt: skip
-    group.add_argument(
-        "--command-period", type=finite, metavar="S",
-        help="send the last command again after this time, for an actuator that stops without",
-    )  # fmt: skip
-    group.add_argument(
-        "--at", type=finite, metavar="U", help="the present command, at which the process rests"
-    )
-    group.add_argument(
-        "--within", type=finite, nargs=2, metavar=("LOW", "HIGH"),
-        help="the tune ends where the measurement leaves these [y]",
-    )  # fmt: skip
-    group.add_argument(
-        "--command-within", type=finite, nargs=2, metavar=("LOW", "HIGH"),
-        help="no command beyond these is sent [u]",
-    )  # fmt: skip
-    group.add_argument(
-        "--verify", action=argparse.BooleanOptionalAction,
-        help="prove the gains with a step of the set-point, by a controller_node of its own; "
-        "without either flag it asks, with --yes it does not",
-    )  # fmt: skip
-    group.add_argument(
-        "--step", type=finite, metavar="Y",
-        help="height of that step [y]; default: half of the swing of the tune, at least twenty "
-        "times the noise, as far as --within and --command-within allow",
-    )  # fmt: skip
-    group.add_argument(
-        "--yes", action="store_true",
-        help="do not ask, for scripts; gains are then proven with --verify alone",
-    )  # fmt: skip
-    group.add_argument(
-        "--export", metavar="FILE", help="write the gains for ros2_controllers' pid_controller"
-    )
+    for name, how in _OF_NEW_LOOP.items():
+        group.add_argument(f"--{name.replace('_', '-')}", **how)
 
 
 def is_new_loop(options: argparse.Namespace) -> bool:
@@ -105,13 +105,11 @@ def is_new_loop(options: argparse.Namespace) -> bool:
     """
     if options.measurement and options.command:
         return True
-    for flag in (
-        "measurement", "command", "command_field", "command_message", "command_period", "at",
-        "within", "command_within", "verify", "step", "export",
-    ):  # fmt: skip
-        if getattr(options, flag) is not None:
+    for name, how in _OF_NEW_LOOP.items():
+        # One with a default is not told from one that is not given.
+        if "default" not in how and getattr(options, name) is not None:
             raise SelectionError(
-                f"--{flag.replace('_', '-')} is for a loop without nodes: give --measurement and "
+                f"--{name.replace('_', '-')} is for a loop without nodes: give --measurement and "
                 f"--command, too"
             )
     return False
