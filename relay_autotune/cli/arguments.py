@@ -33,6 +33,17 @@ def worst(*statuses: int) -> int:
     return max(statuses, key=_WORSE.index)
 
 
+def deserved(*, found: bool, doubtful: bool) -> int:
+    """Return the exit status that a result deserves.
+
+    :param found: whether there is what was asked for.
+    :param doubtful: whether it is doubtful.
+    """
+    if not found:
+        return NOTHING_FOUND
+    return DOUBTFUL if doubtful else DONE
+
+
 # Set to anything in the environment, it lets a defect end a command with its traceback.
 DEBUG = "RELAY_AUTOTUNE_DEBUG"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import Selection, read_experiments
-from relay_autotune.cli.arguments import DEBUG, DONE, DOUBTFUL, NOTHING_FOUND, USAGE
+from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.escape import visible
 from relay_autotune.verdict import Verdict
@@ -112,9 +112,10 @@ def status_of(analyses: Sequence[Analysis]) -> int:
 
     :param analyses: of its experiments.
     """
-    if not any(a.models and not a.judgement.contradicted for a in analyses):
-        return NOTHING_FOUND
-    return DOUBTFUL if any(a.verdict is Verdict.DOUBTFUL for a in analyses) else DONE
+    return deserved(
+        found=any(a.models and not a.judgement.contradicted for a in analyses),
+        doubtful=any(a.verdict is Verdict.DOUBTFUL for a in analyses),
+    )
 
 
 def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tuple[Analysis, ...]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, worst
+from relay_autotune.cli.arguments import DONE, deserved, worst
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.escape import cell
 from relay_autotune.exchange.fields import columns
@@ -201,9 +201,10 @@ def _for_spreadsheets(row: dict[str, Any]) -> dict[str, Any]:
 def _status(document: dict[str, Any]) -> int:
     """Return the exit status that a bag deserves, as when it was done."""
     found = document.get("experiments", [])
-    if not any(e.get("models") and not _contradicted(e) for e in found):
-        return NOTHING_FOUND
-    return DOUBTFUL if any(e.get("verdict") == "doubtful" for e in found) else DONE
+    return deserved(
+        found=any(e.get("models") and not _contradicted(e) for e in found),
+        doubtful=any(e.get("verdict") == "doubtful" for e in found),
+    )
 
 
 def _contradicted(experiment: dict[str, Any]) -> bool:

@@ -29,10 +29,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.arguments import (
     DONE,
-    DOUBTFUL,
     NOTHING_FOUND,
     USAGE,
     as_typed,
+    deserved,
     finite,
     guarded,
     say,
@@ -267,10 +267,7 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
     """Show the plan of a tune, and return whether it is to start."""
     with Working("looking at the loop"):
         while True:
-            client.ask(options.amplitude, dry_run=True)
-            while not client.done():
-                client.spin(_TICK)
-            checks = list(client.result.checks)
+            checks = list(client.check(options.amplitude).checks)
             # Right after its start the node does not know all of these yet.
             awaited = (NOT_KNOWN_YET,) if options.record_only else (NOT_KNOWN_YET, NO_MODEL)
             lacking = any(text in line for line in checks for text in awaited)
@@ -363,9 +360,8 @@ def _conclude(
             print(f"  {what:<26} {command}")
     complete = result.gains.experiment_id or options.record_only
     written = report or not options.report
-    if not (client.succeeded and complete and written) or proven is False:
-        return NOTHING_FOUND
-    return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
+    found = client.succeeded and complete and written and proven is not False
+    return deserved(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
 
 
 def _hand_over(

@@ -17,7 +17,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, say, worst
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, worst
 from relay_autotune.cli.export import Target, exported, exports_of
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.layout import WIDEST
@@ -293,10 +293,8 @@ class _LoopOnPage:
     def _check(self) -> None:
         """Ask whether a tune could start, and how."""
         self._live.tell(phase="checking", status="looking at the loop", tone="")
-        self._client.ask(self._options.amplitude, dry_run=True)
-        while not self._client.done():
-            self._client.spin(_TICK)
-        result, accepted = self._client.result, self._client.succeeded
+        result = self._client.check(self._options.amplitude)
+        accepted = self._client.succeeded
         self._live.forget_wishes()
         self._live.tell(
             phase="idle",
@@ -352,9 +350,7 @@ class _LoopOnPage:
             tone="good" if done else "bad",
             status="the tune is complete" if done else f"no gains: {result.reason}",
         )
-        if not done:
-            return NOTHING_FOUND
-        return DOUBTFUL if result.verdict == Verdict.DOUBTFUL else DONE
+        return deserved(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
 
     def _add_subject(self, result: Any) -> None:
         """Show the model of the tune, and let its gains be shaped."""

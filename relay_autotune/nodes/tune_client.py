@@ -28,6 +28,8 @@ from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 # Silence after which relay_node counts as lost during a tune [s], in addition to the middleware's
 # liveliness lease.
 _GONE = 1.0
+# How long messages are handled before the answer is looked for again [s].
+_TICK = 0.05
 # States of an ended goal; the safe command was sent before.
 _ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 # Parts of the refusals that nodes give after their start, until discovery is complete.
@@ -118,6 +120,17 @@ class TuneClient(LoopClient):
         if not self._goal.accepted:
             raise LoopError(f"{self.name} has rejected the request; its log says why")
         self._answer = self._goal.get_result_async()
+
+    def check(self, amplitude: float) -> Any:
+        """Ask whether a tune could start, and return the answer, a `Tune.Result`.
+
+        :param amplitude: as of `ask`.
+        :raises LoopError: if the node does not answer.
+        """
+        self.ask(amplitude, dry_run=True)
+        while not self.done():
+            self.spin(_TICK)
+        return self.result
 
     def spin(self, seconds: float) -> None:
         """Handle messages for a time, or until the result is there.
