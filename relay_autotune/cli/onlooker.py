@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
 import rclpy
@@ -47,12 +46,7 @@ class Onlooker:
     def __enter__(self) -> Onlooker:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._executor.shutdown(timeout_sec=0.0)
         self._node.destroy_node()
         self._context.try_shutdown()

@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
-from types import TracebackType
 
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import LoopError
@@ -81,12 +80,7 @@ class OwnNodes:
                 lines = self._log.read().decode(errors="replace").strip().splitlines()
                 raise LoopError(f"{name} has ended: {lines[-1] if lines else 'without a word'}")
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with Working("ending the nodes"):
             _end(self._running.values())
         self._log.close()

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from types import TracebackType
 
 from relay_autotune.cli.layout import width
 from relay_autotune.text import TOLD_EVERY, duration
@@ -82,12 +81,7 @@ class Working:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
 
