@@ -34,7 +34,7 @@ import numpy as np
 from markdown import table, three
 
 from relay_autotune.analysis import Analysis, analyse_alone
-from relay_autotune.bag.records import read_records
+from relay_autotune.bag.reader import read_records
 from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import ms_on

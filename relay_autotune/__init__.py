@@ -30,7 +30,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis, analyse, analyse_jointly
-    from relay_autotune.bag.records import read_records
+    from relay_autotune.bag.reader import read_records
     from relay_autotune.errors import RelayAutotuneError
     from relay_autotune.exchange.python_control import to_control
     from relay_autotune.experiment.experiment import RelayExperiment
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "analysis": ("Analysis", "analyse", "analyse_jointly"),
-    "bag.records": ("read_records",),
+    "bag.reader": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification.known": ("Known",),
     "identification.methods": ("METHODS", "identify"),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +25,7 @@ from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Step
 from relay_autotune.errors import FieldError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.loop.analysis import is_stable
-from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.loop.laws import OWN_LAW
-from relay_autotune.loop.sampled import Limits
+from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import (
     FIXED,
@@ -36,12 +33,17 @@ from relay_autotune.nodes.controller_parameters import (
     NONE_WAIT,
     OTHERS,
     PARAMETERS,
+    bounds_from,
+    gains_from,
+    limits_from,
+    range_from,
 )
 from relay_autotune.nodes.following import FOLLOW_EVERY, Following
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.gains_keeper import GainsKeeper
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.own_gains import OwnGains, controller_of, said, set_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
@@ -582,107 +584,6 @@ class ControllerNode(ServedNode):
         if names & {"command_min", "command_max"}:
             self._limits = limits_from(values)
             self._pid.limit(self._limits)
-
-
-class OwnGains:
-    """The controller of this node as a place for gains.
-
-    :param use: puts gains in force; None: the command is held.
-    """
-
-    name = "this node"
-    outlives = False
-    laws: tuple[str, ...] = ("", OWN_LAW)
-
-    def __init__(self, use: Callable[[GainSet | None], None]) -> None:
-        self._use = use
-
-    async def read(self) -> GainSet | None:
-        """Return None: no other node changes these gains."""
-        return None
-
-    async def put(self, gains: GainSet | None) -> None:
-        """Put gains in force, or hold the command."""
-        self._use(gains)
-
-    def set_of(self, controller: Controller) -> GainSet:
-        """Return the gains of a controller as a set."""
-        return set_of(controller)
-
-    def controller_of(self, gains: GainSet) -> Controller:
-        """Return the controller with these gains."""
-        return controller_of(gains)
-
-    def said(self, gains: GainSet | None) -> str:
-        """Say which gains are in force."""
-        if gains is None:
-            return "no gains are in force, the command is held"
-        return f"{said(controller_of(gains))} in force"
-
-
-def set_of(gains: Controller) -> GainSet:
-    """Return gains as the history keeps them.
-
-    :param gains: the controller.
-    """
-    return GainSet.of({entry.name: getattr(gains, entry.name) for entry in GAINS})
-
-
-def controller_of(gains: GainSet) -> Controller:
-    """Return gains that the history has kept.
-
-    :param gains: as `set_of` made them.
-    """
-    return Controller(**gains.by_name())
-
-
-def gains_from(values: dict[str, Any]) -> Controller | None:
-    """Return the gains that the parameters give, None if there are none.
-
-    :param values: the parameters by name.
-    :raises RelayAutotuneError: if they are not valid.
-    """
-    if values["kc"] == 0.0:
-        return None
-    return Controller(**{name: values[name] for name in ("kc", "ti", "td", "tf", "b")})
-
-
-def limits_from(values: dict[str, Any]) -> Limits:
-    """Return the range of the command.
-
-    :param values: the parameters by name.
-    :raises RelayAutotuneError: if the range is empty.
-    """
-    return Limits(values["command_min"], values["command_max"])
-
-
-def range_from(values: dict[str, Any]) -> Limits:
-    """Return the range of the measurement.
-
-    :param values: the parameters by name.
-    :raises ParameterError: if the range is empty.
-    """
-    low, high = values["measurement_min"], values["measurement_max"]
-    if not low < high:
-        raise ParameterError(
-            f"measurement_min {low:g} and measurement_max {high:g} leave no range"
-        )
-    return Limits(low, high)
-
-
-def bounds_from(values: dict[str, Any]) -> GainBounds:
-    """Return the bounds for new gains.
-
-    :param values: the parameters by name.
-    """
-    return GainBounds(values["kc_max"], values["ti_min"])
-
-
-def said(gains: Controller | None) -> str:
-    """Return gains in words."""
-    if gains is None:
-        return "no gains"
-    return f"kc {gains.kc:.6g}, ti {gains.ti:.6g} s, td {gains.td:.6g} s"
 
 
 def main(args: list[str] | None = None) -> int:

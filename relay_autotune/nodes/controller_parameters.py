@@ -1,13 +1,23 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The parameters of controller_node."""
+"""The parameters of controller_node, and what they give."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
-from relay_autotune.control.controller import LARGEST_GAIN, LARGEST_VALUE, LONGEST_TIME
+from relay_autotune.control.controller import (
+    LARGEST_GAIN,
+    LARGEST_VALUE,
+    LONGEST_TIME,
+    GainBounds,
+)
+from relay_autotune.errors import ParameterError
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.quantities import Quantity
@@ -158,3 +168,45 @@ FIXED = (
     ),
 )
 PARAMETERS = (*GAINS, *OTHERS, *FIXED)
+
+
+def gains_from(values: Mapping[str, Any]) -> Controller | None:
+    """Return the gains that the parameters give, None if there are none.
+
+    :param values: the parameters by name.
+    :raises RelayAutotuneError: if they are not valid.
+    """
+    if values["kc"] == 0.0:
+        return None
+    return Controller(**{entry.name: values[entry.name] for entry in GAINS})
+
+
+def limits_from(values: Mapping[str, Any]) -> Limits:
+    """Return the range of the command.
+
+    :param values: the parameters by name.
+    :raises RelayAutotuneError: if the range is empty.
+    """
+    return Limits(values["command_min"], values["command_max"])
+
+
+def range_from(values: Mapping[str, Any]) -> Limits:
+    """Return the range of the measurement.
+
+    :param values: the parameters by name.
+    :raises ParameterError: if the range is empty.
+    """
+    low, high = values["measurement_min"], values["measurement_max"]
+    if not low < high:
+        raise ParameterError(
+            f"measurement_min {low:g} and measurement_max {high:g} leave no range"
+        )
+    return Limits(low, high)
+
+
+def bounds_from(values: Mapping[str, Any]) -> GainBounds:
+    """Return the bounds for new gains.
+
+    :param values: the parameters by name.
+    """
+    return GainBounds(values["kc_max"], values["ti_min"])

@@ -37,7 +37,6 @@ from relay_autotune.nodes.checklist import (
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.following import FOLLOW_EVERY
-from relay_autotune.nodes.health import diagnostics
 from relay_autotune.nodes.last_samples import LastSamples
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
@@ -63,6 +62,7 @@ from relay_autotune.nodes.recordings import Recordings
 from relay_autotune.nodes.reports import (
     Counter,
     cycle_message,
+    diagnostics,
     experiment_message,
     losses,
     state_values,

@@ -1,13 +1,16 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of relay_node about a tune: cycles, record, state."""
+"""Messages of relay_node about a tune: cycles, record, state, diagnostics."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from relay_autotune.errors import RecordError
 from relay_autotune.exchange.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
@@ -135,3 +138,30 @@ def state_values(
         "lost samples": lost,
         "clock drift [s]": session.clocks.drift,
     }
+
+
+def diagnostics(
+    name: str, stamp_ns: int, problems: list[str], summary: str, values: Mapping[str, object]
+) -> DiagnosticArray:
+    """Build the array with one status.
+
+    :param name: the node's fully qualified name without the leading slash.
+    :param stamp_ns: the present time [ns since the epoch].
+    :param problems: problems that an operator must act on; empty: the status is OK.
+    :param summary: message if there is no problem.
+    :param values: facts by name.
+    """
+    status = DiagnosticStatus(
+        level=DiagnosticStatus.WARN if problems else DiagnosticStatus.OK,
+        name=f"{name}: experiment",
+        hardware_id="none",
+        message="; ".join(problems) or summary,
+        values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+    )
+    message = DiagnosticArray(status=[status])
+    set_stamp(message.header.stamp, stamp_ns)
+    return message
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
