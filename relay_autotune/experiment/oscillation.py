@@ -62,6 +62,10 @@ _CHATTER, _CHATTER_RATIO = 40, 10.0
 
 # Fast switching: this many cycles in a row are shorter than this part of the usual cycle.
 _FAST_CYCLES, _FAST = 3, 0.3
+# Or of the last stays at most one lasts half the time that the process took to respond to a kick
+# by the same amplitude: a process cannot answer faster, and noise leaves a long stay in each half
+# cycle.
+_MANY_STAYS, _OF_RESPONSE = 40, 0.5
 
 # If the levels started at a quarter, the swings are compared after this many cycles, once the
 # swing grows by less than this factor from one to the next.
@@ -151,6 +155,8 @@ class Oscillation:
         self._switches_before = 0
         self.switches = 0
         """Number of switches so far."""
+        self._kick_amplitude = levels.amplitude
+        self._answered: deque[bool] = deque(maxlen=_MANY_STAYS)
         self._shifts = self._borne = 0
         self._shifted_at = -math.inf
         self._furthest = math.inf
@@ -190,6 +196,7 @@ class Oscillation:
             self._on_the_way.append((due, relay.is_high, begins))
             self._switched_at.append(len(self._samples) - 1)
             self._look_for_noise()
+            self._look_for_chatter()
         elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
         elif self._runs_away(t, y):
@@ -239,6 +246,7 @@ class Oscillation:
         self.cycle_start.clear()
         self._on_the_way.clear()
         self._switched_at.clear()
+        self._answered.clear()
         self._switches_before = self.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
         self._turns = Turns(t, self._response_time)
@@ -317,6 +325,16 @@ class Oscillation:
             f"in those before"
         )
         return True
+
+    def _look_for_chatter(self) -> None:
+        """Fail if the process cannot have caused the last stays."""
+        self._answered.append(self._relay.last_stay >= _OF_RESPONSE * self._response_time)
+        known = self._levels.amplitude <= self._kick_amplitude
+        if known and len(self._answered) == _MANY_STAYS and sum(self._answered) <= 1:
+            self._end_fast(
+                f"{_MANY_STAYS} times with at most one stay of {_OF_RESPONSE:g} times the "
+                f"{self._response_time:.3g} s that the process took to respond"
+            )
 
     def _end_fast(self, how: str) -> None:
         self._end(

@@ -112,26 +112,29 @@ def test_fast_switching_after_slow_cycles_ends_it():
         if tune.finished:
             break
     assert tune.outcome is Outcome.FAILED
-    assert "the relay switches fast, each 0.04 s or sooner after 2 whole cycles" in tune.reason
+    assert "the relay switches fast" in tune.reason
     cycle = tune.cycles[0].period
     assert tune.elapsed < tune.cycles[-1].start + cycle + 3.0 * cycle + 2.0
 
 
-@pytest.mark.parametrize("after", [0.0, 0.11, 0.37, 0.52, 0.71, 0.93])
-def test_short_cycles_that_look_whole_are_fast_switching_too(after):
+@pytest.mark.parametrize("late", [0.0, 0.005])
+@pytest.mark.parametrize("seed", range(5))
+def test_short_cycles_that_look_whole_are_fast_switching_too(seed, late):
+    rng, t = np.random.default_rng(seed), 0.0
     plant, command, broken_at = FopdtPlant(2.0, 0.05, 0.025), 0.0, math.inf
     parameters = ExperimentParameters(
         amplitude=0.5, process_gain_sign=1, settle_time=0.1, min_cycles=100, max_cycles=100
     )
-    tune = RelayExperiment(parameters, 0.0)
+    tune, after = RelayExperiment(parameters, 0.0), rng.uniform()
     for k in range(4_000):
-        t = 0.005 * k
+        # Three of ten samples come late on a busy machine.
+        t += 0.005 + (rng.exponential(late) if rng.random() < 0.3 else 0.0)
         y = plant.advance(t, command) + 1e-4 * math.sin(7.0 * k**2)
-        if len(tune.cycles) == 3:
+        if tune.cycles:
             broken_at = min(broken_at, t + after)
         if t >= broken_at:
-            # Each sample lies on the other side of the relay's band, some by two.
-            y = 0.3 * (-1) ** (k // (1 if k % 7 else 2))
+            # Each sample lies on the other side of the relay's band.
+            y = 0.3 * (-1) ** k
         command = tune.step(t, y)
         if tune.finished:
             break
