@@ -10,7 +10,7 @@ import zlib
 
 from relay_autotune.bag.limits import LARGEST_WINDOW
 from relay_autotune.bag.mcap_records import DamageError, text, unsigned
-from relay_autotune.bag.packages import expanding_package
+from relay_autotune.bag.source import expanding_package
 
 # Times of the first and the last message, size of the content, its checksum.
 _HEAD = struct.Struct("<QQQI")

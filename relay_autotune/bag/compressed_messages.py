@@ -16,8 +16,7 @@ import numpy as np
 
 from relay_autotune.bag.locate import Content, Messages
 from relay_autotune.bag.mcap_records import DamageError
-from relay_autotune.bag.packages import expanding_package
-from relay_autotune.bag.source import ZSTD_MAGIC, Source
+from relay_autotune.bag.source import ZSTD_MAGIC, Source, expanding_package
 
 # Size of the expanded messages that are handed on together [bytes].
 _EXPANDED = 16 << 20

@@ -11,7 +11,9 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import BinaryIO
 
 from relay_autotune.bag.limits import (
@@ -22,7 +24,6 @@ from relay_autotune.bag.limits import (
     UNSUSPICIOUS,
 )
 from relay_autotune.bag.mcap_records import RECORD, DamageError
-from relay_autotune.bag.packages import expanding_package
 from relay_autotune.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -248,3 +249,19 @@ def record_body(source: Source, begin: int, end: int) -> bytes:
     if end - begin > LARGEST_SUMMARY:
         raise DamageError(f"a record of {end - begin} bytes")
     return source.read(begin, end)
+
+
+def expanding_package(name: str) -> ModuleType:
+    """Return a package that expands, imported only where a compressed recording is met.
+
+    :param name: such as ``zstandard`` or ``lz4.frame``.
+    :raises BagError: if it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        package = name.split(".", 1)[0]
+        raise BagError(
+            f"the recording is compressed; to read it install the Python package {package}, "
+            f"with: pip install {package}"
+        ) from None

@@ -8,19 +8,22 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 from rclpy.node import Node
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.experiment.narration import motion
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.settling import CONSTANT_SAMPLES, RestState, rest_state
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.last_samples import LastSamples
 from relay_autotune.nodes.readiness import NotReadyError
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
@@ -30,6 +33,8 @@ _T = TypeVar("_T")
 # Free space below which a recording is said to be at risk [bytes].
 _LITTLE = 100_000_000
 _NAME_WIDTH = 12
+# The last samples that are kept, and the time that they may cover [s].
+_KEPT, _WINDOW = 2000, 10.0
 
 
 class Mark(Enum):
@@ -111,6 +116,41 @@ class Checklist:
         if typed:
             found += f"; type: ros2 param set {self._node} {typed}"
         self.checks.append(ChecklistLine(mark, name, found))
+
+
+class LastSamples:
+    """Keep the last measurements with their time of arrival."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+
+    def add(self, value: float) -> None:
+        """Take a measurement [y] that has arrived now."""
+        self._kept.append((time.monotonic(), value))
+
+    def forget(self) -> None:
+        """Start again, since the command will change."""
+        self._kept.clear()
+
+    @property
+    def interval(self) -> float:
+        """Mean interval of the samples [s]; 0: not known."""
+        if len(self._kept) < 2:
+            return 0.0
+        return (self._kept[-1][0] - self._kept[0][0]) / (len(self._kept) - 1)
+
+    @property
+    def newest(self) -> float | None:
+        """The newest measurement [y]; None: none has come."""
+        return self._kept[-1][1] if self._kept else None
+
+    def rest(self) -> RestState | None:
+        """Return how the measurement rested over the last seconds; None: there are too few."""
+        since = time.monotonic() - _WINDOW
+        recent = np.array([sample for sample in self._kept if sample[0] >= since])
+        if len(recent) < CONSTANT_SAMPLES:
+            return None
+        return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))
 
 
 def look_at_rest(checks: Checklist, samples: LastSamples) -> None:

@@ -78,40 +78,33 @@ def for_bag(profile: QoSProfile) -> Qos:
     )
 
 
-def why_no_publisher(
-    node: Node, topic: str, kind: str = FLOAT64_TYPE, name: str = "measurement"
-) -> str:
-    """Return why nothing arrives on a topic, as far as the graph shows.
+def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
+    """Return why no measurement arrives on a topic, as far as the graph shows.
 
     :param node: the node that subscribes.
     :param topic: resolved name of the topic.
     :param kind: the expected message type.
-    :param name: its unresolved name.
     """
     ends = node.get_publishers_info_by_topic(topic)
     if not ends:
-        other = _other(node, topic, kind, name, node.get_publishers_info_by_topic)
+        other = _other(node, topic, kind, "measurement", node.get_publishers_info_by_topic)
         return f"{topic} has no publisher{other}"
     own = _own(node, node.get_subscriptions_info_by_topic(topic))
     problems = _problems(ends, kind, lambda offered: qos_check_compatible(offered, own))
-    if problems:
-        return f"{topic} has {_count(len(ends), 'publisher')}, but {'; '.join(problems)}"
-    return f"{topic} has {_count(len(ends), 'publisher')}, but nothing arrives"
+    why = "; ".join(problems) or "nothing arrives"
+    return f"{topic} has {_count(len(ends), 'publisher')}, but {why}"
 
 
-def why_no_subscriber(
-    node: Node, topic: str, kind: str = FLOAT64_TYPE, name: str = "command"
-) -> str:
-    """Return why a topic has no connected subscriber, as far as the graph shows.
+def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
+    """Return why no node takes the command from a topic, as far as the graph shows.
 
     :param node: the node that publishes.
     :param topic: resolved name of the topic.
     :param kind: the message type that is expected.
-    :param name: its unresolved name.
     """
     ends = node.get_subscriptions_info_by_topic(topic)
     if not ends:
-        other = _other(node, topic, kind, name, node.get_subscriptions_info_by_topic)
+        other = _other(node, topic, kind, "command", node.get_subscriptions_info_by_topic)
         return f"{topic} has no subscriber{other}"
     own = _own(node, node.get_publishers_info_by_topic(topic))
     problems = _problems(ends, kind, lambda wanted: qos_check_compatible(own, wanted))

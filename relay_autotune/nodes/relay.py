@@ -28,6 +28,7 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.nodes.checklist import (
     Checklist,
+    LastSamples,
     expected,
     look_at_identifier,
     look_at_limits,
@@ -37,7 +38,6 @@ from relay_autotune.nodes.checklist import (
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.following import FOLLOW_EVERY
-from relay_autotune.nodes.last_samples import LastSamples
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER

@@ -31,8 +31,7 @@ from relay_autotune.loop.sampled_loop import SampledLoop, circle, sampled_grid, 
 from relay_autotune.process.held import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import Candidates
-from relay_autotune.tuning.design_grid import design_grid
-from relay_autotune.tuning.frontier import Bounds, Responses, envelope, first_crossing
+from relay_autotune.tuning.frontier import Bounds, Responses, design_grid, envelope, first_crossing
 from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.search import Search
 

@@ -27,8 +27,7 @@ from relay_autotune.loop.noise import filter_for
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.candidates import Candidates, NoiseLimit, Optimum
-from relay_autotune.tuning.design_grid import design_grid
-from relay_autotune.tuning.frontier import Bounds, Responses
+from relay_autotune.tuning.frontier import Bounds, Responses, design_grid
 from relay_autotune.tuning.gain_range import stable_gains
 from relay_autotune.tuning.load_cost import load_iaes
 from relay_autotune.tuning.pattern_search import pattern_search
