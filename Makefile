@@ -22,7 +22,7 @@ setup:
 demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
-# two at a time, the longest first; few of the tests of nodes keep a processor busy
+# two at a time, the longest first
 test: setup
 	@$(MAKE) --no-print-directory --jobs=2 --keep-going --output-sync=target \
 		test-system test-core test-rest test-oldest
@@ -30,9 +30,9 @@ test: setup
 test-core: lint
 	@$(ENTER) && python3 -m pytest -q test/core
 
-# running nodes, over real DDS
+# running nodes, over real DDS; most of the time they wait, so two files at a time
 test-system: lint
-	@$(ENTER) && python3 -m pytest -q test/system
+	@$(ENTER) && python3 -m pytest -q --numprocesses=2 --dist=loadfile test/system
 
 test-rest: lint
 	@$(ENTER) && python3 -m pytest -q --ignore=test/core --ignore=test/system
