@@ -9,10 +9,10 @@ import math
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.control_law import ControlLaw
-from relay_autotune.loop.gains import Performance
-from relay_autotune.loop.margins import Margins, frequencies, margins, sensitivity_peaks
+from relay_autotune.loop.gains import Performance, StepFigures
+from relay_autotune.loop.margins import LoopMargins, frequencies, margins, sensitivity_peaks
 from relay_autotune.loop.noise import noise_gain
-from relay_autotune.loop.responses import StepFigures, step_figures
+from relay_autotune.loop.responses import step_figures
 from relay_autotune.loop.stability import closed_loop_unstable_poles
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -47,7 +47,7 @@ def analyse_loop(
     return performance_of(found, figures, noise)
 
 
-def performance_of(found: Margins, figures: StepFigures, noise: float) -> Performance:
+def performance_of(found: LoopMargins, figures: StepFigures, noise: float) -> Performance:
     """Join what was found of a loop.
 
     :param found: its margins.

@@ -132,11 +132,8 @@ class Controller:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Performance:
-    """Performance of a controller on a model.
-
-    :raises TuningError: if a number is negative, or one that is always computed is NaN.
-    """
+class Margins:
+    """Margins of a stable loop."""
 
     ms: float = told("", "Largest magnitude of the sensitivity function.", lower=0.0, column=1)
     mt: float = told(
@@ -155,6 +152,19 @@ class Performance:
     delay_margin: float = told(
         "s", "Dead time that may be added; inf: any.", lower=0.0, null=math.inf, column=1
     )
+    gain_margin_low: float = told(
+        "",
+        "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below.",
+        math.nan,
+        lower=0.0,
+        after="iae_load",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepFigures:
+    """Features of the responses of a loop to unit steps."""
+
     iae_load: float = told(
         "y s/u",
         "Integral of the absolute error after a unit step of the load at the process input; inf: "
@@ -162,12 +172,6 @@ class Performance:
         lower=0.0,
         null=math.inf,
         column=1,
-    )
-    gain_margin_low: float = told(
-        "",
-        "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below.",
-        math.nan,
-        lower=0.0,
     )
     iae_setpoint: float = told(
         "s",
@@ -193,6 +197,15 @@ class Performance:
     effort_load: float = told(
         "", "Total variation of the command after a unit step of the load.", math.nan, lower=0.0
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Performance(StepFigures, Margins):
+    """Performance of a controller on a model.
+
+    :raises TuningError: if a number is negative, or one that is always computed is NaN.
+    """
+
     noise_gain: float = told(
         "u/y",
         "Standard deviation of the command over that of white noise in the samples of the "

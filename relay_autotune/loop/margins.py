@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray
+from relay_autotune.loop.gains import Margins
 from relay_autotune.process.transfer_function import TransferFunction
 
 Loop = Callable[[ComplexArray], ComplexArray]
@@ -27,26 +28,14 @@ _FELT = 0.05
 _MOST_TURNS = 800.0 * math.pi
 
 
-@dataclass(frozen=True)
-class Margins:
-    """Margins of a stable loop.
+@dataclass(frozen=True, kw_only=True)
+class LoopMargins(Margins):
+    """Margins, and where the sensitivity is largest.
 
-    :param ms: largest magnitude of ``1/(1 + L)``.
     :param ms_frequency: frequency of that maximum [rad/s].
-    :param mt: largest magnitude of ``L/(1 + L)``.
-    :param gain_margin: factor by which the loop's gain may grow; infinite: no limit.
-    :param gain_margin_low: factor to which it may fall; 0: no limit.
-    :param phase_margin: lag that may be added [rad]; pi where the loop's gain is never 1.
-    :param delay_margin: dead time that may be added [s]; infinite: no limit.
     """
 
-    ms: float
     ms_frequency: float
-    mt: float
-    gain_margin: float
-    gain_margin_low: float
-    phase_margin: float
-    delay_margin: float
 
 
 def frequencies(*terms: TransferFunction) -> FloatArray:
@@ -143,7 +132,7 @@ def _roots(
     return np.asarray(np.exp(0.5 * (low + high)))
 
 
-def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> Margins:
+def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopMargins:
     """Return the margins of a stable loop.
 
     :param loop: L as a function of s.
@@ -164,7 +153,7 @@ def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> Margi
     lead = np.angle(-loop(1j * crossovers)) if crossovers.size else np.empty(0)
     delays = np.mod(lead, 2.0 * math.pi) / crossovers
     (ms, at), (mt, _) = peaks(loop, grid)
-    return Margins(
+    return LoopMargins(
         # ms tends to 1 for w -> infinity; mt tends to 1 for w -> 0 with integral action.
         ms=max(ms, 1.0),
         ms_frequency=at,

@@ -20,6 +20,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.control_law import ControlLaw
+from relay_autotune.loop.gains import StepFigures
 from relay_autotune.process.transfer_function import TransferFunction
 
 _POINTS = 4096
@@ -160,29 +161,6 @@ def step_responses(
         StepResponse(time, step(g / rest * f), step(f / rest, to.first_command())),
         StepResponse(time, step(g / rest), step(-c * g / rest)),
     )
-
-
-@dataclass(frozen=True)
-class StepFigures:
-    """Features of the responses to unit steps.
-
-    :param iae_load: integral of the absolute error after a step of the load [y s/u]; infinite
-        if an error remains.
-    :param iae_setpoint: integral of the absolute error after a step of the set-point [s].
-    :param overshoot: overshoot of the measurement after a step of the set-point, relative to its
-        final value.
-    :param settling_time: time after a step of the set-point until the measurement stays within
-        2 % of its final value [s].
-    :param effort_setpoint: total variation of the command after a step of the set-point [u/y].
-    :param effort_load: total variation of the command after a step of the load.
-    """
-
-    iae_load: float
-    iae_setpoint: float
-    overshoot: float
-    settling_time: float
-    effort_setpoint: float
-    effort_load: float
 
 
 def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> StepFigures:

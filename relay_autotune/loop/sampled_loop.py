@@ -19,13 +19,12 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import performance_of
-from relay_autotune.loop.gains import Controller, Performance
+from relay_autotune.loop.gains import Controller, Performance, StepFigures
 from relay_autotune.loop.laws import SampledLaw
-from relay_autotune.loop.margins import Margins, margins, peaks
+from relay_autotune.loop.margins import LoopMargins, margins, peaks
 from relay_autotune.loop.responses import (
     LONGEST,
     NO_OFFSET,
-    StepFigures,
     StepResponse,
     figures_of,
     has_settled,
@@ -154,7 +153,7 @@ class SampledLoop:
             return math.inf
         return max(peaks(self, self.grid)[0][0], 1.0 / abs(1.0 + self._end))
 
-    def margins(self) -> Margins:
+    def margins(self) -> LoopMargins:
         """Return the margins of the loop, which must be stable.
 
         The delay margin is the phase margin over its frequency, as of a continuous loop.
@@ -171,7 +170,7 @@ class SampledLoop:
             limit = "gain_margin" if end > -1.0 else "gain_margin_low"
             nearer = min if end > -1.0 else max
             more[limit] = nearer(more[limit], -1.0 / end)
-        return Margins(**more)
+        return LoopMargins(**more)
 
     def noise_gain(self) -> float:
         """Return the standard deviation of the command per that of white noise [u/y]."""
