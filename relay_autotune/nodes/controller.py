@@ -122,7 +122,9 @@ class ControllerNode(ServedNode):
         self._reported, setpoints = reported_by(values)
         if values["apply_to"]:
             mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
-            self._place = RemoteGains(self, values["apply_to"], mapping)
+            self._place = RemoteGains(
+                self, values["apply_to"], mapping, values["apply_feedforward"]
+            )
             self._remote = RemoteLoop(
                 self, self._place, self._setpoint, setpoints, self._verifier.interrupt
             )

@@ -152,6 +152,13 @@ FIXED = (
         "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d.",
     ),
     Quantity(
+        "apply_feedforward",
+        0.0,
+        "u/y",
+        "With apply_to: gain from the set-point to the command that the node adds to that of its "
+        "gains; a step of the set-point is predicted with it.",
+    ),
+    Quantity(
         "controller_command_field",
         "",
         "",

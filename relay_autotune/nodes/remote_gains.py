@@ -49,10 +49,12 @@ def mapping_of(texts: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def controller_of(gains: Mapping[str, float]) -> Controller:
+def controller_of(gains: Mapping[str, float], feedforward: float = 0.0) -> Controller:
     """Return the controller with gains given by name, in the ISA or the parallel form.
 
     :param gains: some of `NAMES`; defaults: no derivative, no filter, set-point weight 1.
+    :param feedforward: gain from the set-point to the command, beside these gains [u/y]; with
+        ``kc (b r - y)`` it is a set-point weight ``b + feedforward/kc``.
     :raises RelayAutotuneError: if they are not enough for a controller.
     """
     proportional = gains.get("kc", gains.get("p"))
@@ -67,7 +69,7 @@ def controller_of(gains: Mapping[str, float]) -> Controller:
         gains.get("ti", proportional / integral if integral else 0.0),
         gains.get("td", derivative / proportional if proportional else 0.0),
         gains.get("tf", 0.0),
-        gains.get("b", 1.0),
+        gains.get("b", 1.0) + (feedforward / proportional if proportional else 0.0),
     )
 
 
@@ -79,16 +81,20 @@ class RemoteGains:
     :param node: the calling node.
     :param target: name of the controlling node.
     :param mapping: its parameter name for each gain.
+    :param feedforward: its gain from the set-point to the command beside these [u/y].
     """
 
     outlives = True
     # Laws of nodes whose parameters are the gains themselves.
     laws: tuple[str, ...] = ("", *(name for name, law in LAWS.items() if law.sets_gains))
 
-    def __init__(self, node: Node, target: str, mapping: Mapping[str, str]) -> None:
+    def __init__(
+        self, node: Node, target: str, mapping: Mapping[str, str], feedforward: float = 0.0
+    ) -> None:
         self.name = target
         self._node = node
         self._mapping = dict(mapping)
+        self._feedforward = feedforward
         base = target.rstrip("/")
         # Answers must be handled while the callback that waits for them is still running.
         self._group = ReentrantCallbackGroup()
@@ -114,7 +120,8 @@ class RemoteGains:
         :raises RelayAutotuneError: if they are not enough for a controller.
         """
         values = gains.by_name()
-        return controller_of({name: values[target] for name, target in self._mapping.items()})
+        named = {name: values[target] for name, target in self._mapping.items()}
+        return controller_of(named, self._feedforward)
 
     def said(self, gains: GainSet | None) -> str:
         """Say which gains are in force."""
