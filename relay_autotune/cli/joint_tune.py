@@ -8,16 +8,17 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.apply_gains import apply_at
-from relay_autotune.cli.arguments import say
-from relay_autotune.cli.asking import asked, number_of, pair_of
+from relay_autotune.cli.apply_gains import apply_at, beside
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
+from relay_autotune.cli.asking import agrees, asked, number_of, pair_of
 from relay_autotune.cli.export import Target
-from relay_autotune.cli.layout import width
+from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, own_node, ros_arguments
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 _JOINT_STATES = "/joint_states"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _FLOATS = "std_msgs/msg/Float64MultiArray"
+# Height of the trajectory that verifies gains by hand, as a part of the joint's range.
+_PROOF = 0.05
 # Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
 _OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
 _OF_TOPICS = ("command", "command_field", "command_period", "verify", "step")
@@ -46,7 +49,10 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
         "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
         "applies and verifies the gains",
     )
-    group.add_argument("--controller", metavar="NAME", help="an active pid_controller")
+    group.add_argument(
+        "--controller", metavar="NAME",
+        help="an active pid_controller, or with --open a joint_trajectory_controller",
+    )  # fmt: skip
     group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
     group.add_argument(
         "--controller-manager", default="", metavar="NAME",
@@ -117,15 +123,14 @@ class JointTune:
             self._loop = joint_loop(client, self._manager, options.controller, options.joint)
             if options.open:
                 loaded = self._manager.controllers()
-                self._forward = forwarding(loaded, self._loop.interface, options.forward or "")
+                self._forward = forwarding(
+                    loaded, self._loop.interface, options.forward or "", self._limp
+                )
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
         loop = self._loop
-        if loop.is_chained and not options.open:
-            raise LoopError(
-                f"{loop.controller} takes its references from another controller, not from "
-                f"{loop.reference_topic}: give --open, or deactivate that controller"
-            )
+        if loop.why_not_moved and not options.open:
+            raise LoopError(f"{loop.controller} stays as it is: {self._why_not_closed()}")
         if not options.open and not math.isfinite(loop.state.reference):
             raise LoopError(
                 f"{loop.controller} has no reference for {loop.joint} yet: publish one on "
@@ -143,6 +148,26 @@ class JointTune:
             what = f"present {loop.commanded} of {loop.joint}, at which it rests [u]"
             self._baseline = asked(what, "--at", "", "0", number_of)
         self._command_within = self._range() if options.open else None
+
+    def _why_not_closed(self) -> str:
+        loop = self._loop
+        if not loop.above:
+            return f"{loop.why_not_moved}, which a relay cannot move; give --open"
+        typed = self._manager.command_for([], loop.above)
+        back = self._manager.command_for(loop.above, [])
+        return (
+            f"{loop.why_not_moved}, which has to be inactive for a tune of {loop.controller}: "
+            f"type: {typed}; publish the references on {loop.reference_topic}, and after the tune "
+            f"type: {back}; or give --open"
+        )
+
+    @property
+    def _limp(self) -> tuple[str, ...]:
+        """Command interfaces that have to be held while the controller is off."""
+        loop = self._loop
+        if loop.follows and loop.commanded == "effort":
+            return tuple(f"{dof}/{loop.commanded}" for dof in loop.dofs)
+        return ()
 
     # What is to happen.
 
@@ -201,11 +226,17 @@ class JointTune:
     def _applied(self) -> str:
         if self._options.keep_gains:
             return "stay, whatever is found (--keep-gains)"
-        first, *others = self._loop.parameters
-        return (
-            f"{'/'.join([first, *(name[-1] for name in others)])} at once, verified by a step of "
-            f"the reference; those of now come back where that fails"
+        why = self._loop.why_not_moved
+        return f"{self._places} at once, " + (
+            f"read back, not verified by a step: {why}"
+            if why
+            else "verified by a step of the reference; those of now come back where that fails"
         )
+
+    @property
+    def _places(self) -> str:
+        first, *others = self._loop.parameters
+        return "/".join([first, *(name[-1] for name in others)])
 
     def _notes(self) -> Iterator[tuple[str, str]]:
         """Say what the controller's settings do to the gains."""
@@ -230,10 +261,12 @@ class JointTune:
                 "i_clamp alone; the design is for that",
             }[loop.strategy],
         )
+        yield "law", f"{loop.law}, every {1000.0 * loop.period:.4g} ms"
         yield (
             "derivative",
-            f"of the second interface, without a filter; the design takes the difference of "
-            f"{loop.measured}"
+            f"of the second interface, without a filter. No law has that, since the rate is a "
+            f"measurement of its own: the design takes the difference of {loop.measured}, which "
+            f"is half a period later. Without derivative action it is exact"
             if loop.has_rate
             else "the plain difference of the error: noise passes, and PI is chosen where that "
             "is too much",
@@ -241,25 +274,37 @@ class JointTune:
         if loop.feedforward:
             yield (
                 "feed-forward",
-                f"{loop.feedforward:g} times the reference is added: the gains are right with it, "
-                f"but the step of the verification also moves it",
+                f"{loop.feedforward:g} times the velocity of the trajectory is added: it is 0 at "
+                f"rest, and the gains are right with it"
+                if loop.follows
+                else f"{loop.feedforward:g} times the reference is added: the gains are right "
+                f"with it, and the step of the verification is predicted with it",
             )
         if loop.wraps:
             yield "wraparound", "the error is wrapped to half a turn: keep the limits within one"
         if self._forward is None:
             return
-        yield (
-            "save_i_term",
-            "true: the integral goes on where it was when the controller is active again"
-            if loop.save_i_term
-            else "false: the integral begins at 0 when the controller is active again",
-        )
+        if loop.follows:
+            yield (
+                "switched off",
+                f"{loop.controller} then commands 0, until the relay's first command comes some "
+                f"hundredths of a second later; when it is active again it holds the joints where "
+                f"they are, and its integral begins at 0",
+            )
+        else:
+            yield (
+                "save_i_term",
+                "true: the integral goes on where it was when the controller is active again"
+                if loop.save_i_term
+                else "false: the integral begins at 0 when the controller is active again",
+            )
         without = sorted(
             set(loop.dofs) - {name.rpartition("/")[0] for name in self._forward.needs}
         )
         if without:
             told = ", ".join(without)
-            yield "no control", f"{told} keeps its last command, with no controller meanwhile"
+            kept = "command 0" if loop.follows else "its last command"
+            yield "no control", f"{told} keeps {kept}, with no controller meanwhile"
         typed = self._manager.command_for(self._former, [self._forward.name])
         yield "if killed", f"only kill -9 of this command leaves that; then type: {typed}"
 
@@ -410,11 +455,24 @@ class JointTune:
             yield self._manager.still_active(self._loop.controller)
             return
         try:
-            with Opened(self._manager, self._forward.name, self._former):
+            # Controllers that command 0 when they are switched off leave it to the next one.
+            with ExitStack() as stack:
+                with self._client.publishing(*self._first_command()) as command:
+                    stack.enter_context(Opened(self._manager, self._forward.name, self._former))
+                    command()
                 yield self._manager.still_active(self._forward.name)
         finally:
             if why := self._why_no_references():
                 say("tune_loop", why)
+
+    def _first_command(self) -> tuple[Any, str]:
+        """Return the message of the first command, and its topic."""
+        from relay_autotune.nodes.command_message import CommandMessage
+
+        topics, values = self._opened_ends()
+        beside = json.loads(values["command_message"])
+        message = CommandMessage(values["command_type"], values["command_field"], beside)
+        return message.written(self._baseline), topics["command"]
 
     def _why_no_references(self) -> str:
         """Publish the references of before, which the controller forgets when it is switched.
@@ -430,7 +488,7 @@ class JointTune:
         with suppress(LoopError):
             listed = self._manager.controllers()
             active = any(each.name == loop.controller and each.is_active for each in listed)
-        if loop.is_chained or not active:
+        if loop.why_not_moved or not active:
             return ""
         reference = loop.state.reference
         commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
@@ -472,10 +530,13 @@ class JointTune:
         if doubt and self._options.yes:
             raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
         loop = self._loop
+        if loop.why_not_moved:
+            return self._set()
         places = ",".join(map("{}:{}".format, GAINS, loop.parameters))
         values = self._of_state() | {
             "apply_to": loop.node,
             "apply_parameters": places,
+            "apply_feedforward": loop.feedforward,
             "initial_setpoint": loop.state.reference,
             "command_type": COMMAND_TYPE,
             "command_field": loop.reference_field,
@@ -496,3 +557,59 @@ class JointTune:
             stays=False,
             patience=START_WITHIN,
         )
+
+    def _set(self) -> int:
+        """Set the gains of a controller whose references nobody can move; return the status."""
+        from relay_autotune.exchange.messages import (
+            gains_from_message,
+            transfer_function_from_message,
+        )
+        from relay_autotune.nodes.joint_loop import put_gains, told
+        from relay_autotune.nodes.remote_gains import controller_of
+
+        loop, client = self._loop, self._client
+        found = client.result
+        gains = gains_from_message(found.gains)
+        model = transfer_function_from_message(found.transfer_function)
+        before = client.values(loop.node, loop.parameters)
+        wanted = {name: float(getattr(gains, name[-1])) for name in loop.parameters}
+        p, i, d = before.values()
+        present = controller_of({"p": p, "i": i, "d": d}) if p else None
+        print("\n".join(beside(present, gains, model)))
+        question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
+        if not agrees(question, yes=self._options.yes):
+            say("tune_loop", "nothing was changed")
+            return NOTHING_FOUND
+        put_gains(client, loop.node, wanted, before)
+        moved = f"move it by {loop.above[-1]}" if loop.above else "give it a short trajectory"
+        for label, text in (
+            ("gains", f"in force, read back: {told(wanted)}; before: {told(before)}"),
+            (
+                "not verified",
+                f"{loop.why_not_moved}: {moved}, and see in {loop.state_topic} that {loop.joint} "
+                f"follows",
+            ),
+        ):
+            print("\n".join(labelled(label, text, width())))
+        if loop.follows:
+            # In one line, so that it can be copied.
+            print(f"  {self._short_trajectory(gains.settling_time)}")
+        return DONE
+
+    def _short_trajectory(self, settling_time: float) -> str:
+        """Return what to type for a small motion of the joint.
+
+        :param settling_time: predicted [s].
+        """
+        loop = self._loop
+        low, high = self._within
+        now = [self._position_of(joint) for joint in loop.joints]
+        place = loop.joints.index(loop.joint)
+        # Towards the middle of its range.
+        now[place] += math.copysign(_PROOF * (high - low), 0.5 * (low + high) - now[place])
+        seconds = max(2, math.ceil(2.0 * settling_time)) if math.isfinite(settling_time) else 2
+        point = f"{{positions: [{', '.join(map('{:.4g}'.format, now))}], "
+        point += f"time_from_start: {{sec: {seconds}}}}}"
+        message = f"{{joint_names: [{', '.join(loop.joints)}], points: [{point}]}}"
+        words = ["ros2", "topic", "pub", "--once", f"{loop.node}/joint_trajectory"]
+        return shlex.join([*words, "trajectory_msgs/msg/JointTrajectory", message])

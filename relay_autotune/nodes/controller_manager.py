@@ -45,7 +45,6 @@ class ManagedController:
     :param rate: of its updates [Hz]; 0: not told.
     :param needs: the command interfaces that it writes, in its own order; (): not configured.
     :param claims: those that it owns now.
-    :param is_chained: True if another controller writes its references.
     """
 
     name: str
@@ -54,7 +53,6 @@ class ManagedController:
     rate: float
     needs: tuple[str, ...]
     claims: tuple[str, ...]
-    is_chained: bool
 
     @property
     def is_active(self) -> bool:
@@ -217,14 +215,33 @@ def _listed(found: Iterable[Any]) -> tuple[ManagedController, ...]:
             float(getattr(each, "update_rate", 0)),
             tuple(each.required_command_interfaces),
             tuple(each.claimed_interfaces),
-            each.is_chained,
         )
         for each in found
     )
 
 
+def above(controllers: Iterable[ManagedController], names: Iterable[str]) -> tuple[str, ...]:
+    """Return the active controllers that write the references of some others.
+
+    Those come first whose references others write, as a manager activates them.
+
+    :param controllers: all that are loaded.
+    :param names: of the others.
+    """
+    active = [each for each in controllers if each.is_active]
+    below, found = set(names), list[str]()
+    while more := [
+        each.name
+        for each in active
+        if each.name not in below and any(c.partition("/")[0] in below for c in each.claims)
+    ]:
+        found += more
+        below |= set(more)
+    return tuple(found)
+
+
 def in_the_way(
-    controllers: Iterable[ManagedController], interfaces: Iterable[str]
+    controllers: Collection[ManagedController], interfaces: Iterable[str]
 ) -> tuple[str, ...]:
     """Return the active controllers that own any of some command interfaces.
 
@@ -233,27 +250,23 @@ def in_the_way(
     :param controllers: all that are loaded.
     :param interfaces: the names of the command interfaces.
     """
-    active = [each for each in controllers if each.is_active]
     wanted = set(interfaces)
-    found: list[str] = []
-    while more := [
-        each.name
-        for each in active
-        if each.name not in found
-        and any(c in wanted or c.partition("/")[0] in found for c in each.claims)
-    ]:
-        found += more
-    return tuple(found)
+    own = [each.name for each in controllers if each.is_active and wanted & set(each.claims)]
+    return (*own, *above(controllers, own))
 
 
 def forwarding(
-    controllers: Iterable[ManagedController], interface: str, name: str
+    controllers: Iterable[ManagedController],
+    interface: str,
+    name: str,
+    beside: Collection[str] = (),
 ) -> ManagedController:
     """Return the controller that passes commands on to an interface.
 
     :param controllers: all that are loaded.
     :param interface: the command interface.
     :param name: that of the controller; empty: the one that writes the fewest interfaces.
+    :param beside: interfaces that it has to write as well, if none is named.
     :raises LoopError: with what to type, if there is none.
     """
     fits = [
@@ -261,16 +274,21 @@ def forwarding(
         for each in controllers
         if interface in each.needs and (each.name == name or each.type_name in _FORWARDING)
     ]
-    chosen = [each for each in fits if not name or each.name == name]
+    chosen = [
+        each for each in fits if (each.name == name if name else set(beside) <= set(each.needs))
+    ]
     if chosen:
         return min(chosen, key=lambda each: len(each.needs))
-    joint, _, kind = interface.rpartition("/")
+    kind = interface.rpartition("/")[2]
+    written = tuple(beside) if beside and not name else (interface,)
+    joints = ", ".join(each.rpartition("/")[0] for each in written)
     others = ", ".join(each.name for each in fits)
     raise LoopError(
         f"no configured controller {name or 'of type forward_command_controller'} writes "
-        f"{interface}"
+        f"{', '.join(written)}"
+        + (" (those that it does not write would be commanded 0)" if len(written) > 1 else "")
         + (f"; type --forward with one of {others}" if others else "")
-        + f"; load one with the parameters {{joints: [{joint}], interface_name: {kind}}} and "
+        + f"; load one with the parameters {{joints: [{joints}], interface_name: {kind}}} and "
         f"type: ros2 run controller_manager spawner {name or 'forward_command_controller'} "
         f"--inactive --param-file FILE"
     )

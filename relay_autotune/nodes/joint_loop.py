@@ -1,14 +1,15 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A joint under a pid_controller of ros2_control: topics, types, fields, gains and limits."""
+"""A joint under a controller of ros2_control: topics, types, fields, gains and limits."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -19,11 +20,13 @@ from relay_autotune.errors import LoopError
 from relay_autotune.nodes.controller_manager import (
     ControllerManager,
     ManagedController,
+    above,
     interface_class,
 )
 from relay_autotune.nodes.loop_client import LoopClient
 
 PID_CONTROLLER = "pid_controller/PidController"
+TRAJECTORY_CONTROLLER = "joint_trajectory_controller/JointTrajectoryController"
 STATE_TYPE = "control_msgs/msg/MultiDOFStateStamped"
 COMMAND_TYPE = "control_msgs/msg/MultiDOFCommand"
 GAINS = ("p", "i", "d")
@@ -31,8 +34,11 @@ GAINS = ("p", "i", "d")
 # For how long the controller's state is looked at, and how many messages are needed [s].
 _LOOK, _LEAST = 0.3, 5
 _DESCRIPTION_WITHIN = 2.0
-_LAWS = {
-    "back_calculation": "pid_controller",
+# What a trajectory controller commands, by its field in the points of its state.
+_POINTS = {"velocity": "velocities", "effort": "effort"}
+# The laws of control_toolbox, which both controllers run.
+LAWS = {
+    "back_calculation": "control_toolbox_back_calculation",
     "conditional_integration": "control_toolbox_conditional_integration",
     "none": "control_toolbox_none",
     "legacy": "control_toolbox_legacy",
@@ -43,6 +49,7 @@ _OPTIONAL: dict[str, Any] = {
     "tracking_time_constant": 0.0,
     "save_i_term": False,
     "feedforward_gain": 0.0,
+    "ff_velocity_scale": 0.0,
     "angle_wraparound": False,
     "u_clamp_min": -math.inf,
     "u_clamp_max": math.inf,
@@ -71,6 +78,7 @@ class JointLoop:
     :param node: full name of its node.
     :param joint: name of the joint, as the controller's state and reference have it.
     :param dof: its name in the parameter gains.
+    :param follows: True if its references are trajectories.
     :param joints: all that the controller has, in its own order.
     :param dofs: the names that these have in the command interfaces.
     :param interface: the command interface, such as ``left_wheel/effort``.
@@ -82,10 +90,10 @@ class JointLoop:
     :param strategy: against windup.
     :param tracking_time_constant: of that strategy [s]; 0: control_toolbox's own.
     :param save_i_term: True if the integral outlives a deactivation.
-    :param feedforward: gain from the reference to the command; 0: none.
+    :param feedforward: gain from the reference to the command [u/y]; 0: none.
     :param wraps: True if the error is wrapped to half a turn.
     :param clamps: limits of the command [u].
-    :param is_chained: True if another controller writes its references.
+    :param above: names of the active controllers that write its references.
     :param states: of all joints, in the same order.
     :param within: limits of the measurement in robot_description [y]; None: not told.
     :param command_within: likewise of the command [u].
@@ -95,6 +103,7 @@ class JointLoop:
     node: str
     joint: str
     dof: str
+    follows: bool
     joints: tuple[str, ...]
     dofs: tuple[str, ...]
     interface: str
@@ -109,7 +118,7 @@ class JointLoop:
     feedforward: float
     wraps: bool
     clamps: tuple[float, float]
-    is_chained: bool
+    above: tuple[str, ...]
     states: tuple[DofState, ...]
     within: tuple[float, float] | None
     command_within: tuple[float, float] | None
@@ -127,7 +136,16 @@ class JointLoop:
     @property
     def law(self) -> str:
         """The law that the gains are for."""
-        return _LAWS[self.strategy]
+        # The same law, by the name of the program that has a file of parameters.
+        is_own = self.strategy == "back_calculation" and not self.follows
+        return "pid_controller" if is_own else LAWS[self.strategy]
+
+    @property
+    def why_not_moved(self) -> str:
+        """Why nobody else can move its references; empty: they come as messages."""
+        if self.follows:
+            return "its references are trajectories"
+        return f"its references come from {', '.join(self.above)}" if self.above else ""
 
     @property
     def state_topic(self) -> str:
@@ -190,65 +208,190 @@ def joint_loop(
     if found is None:
         there = ", ".join(f"{each.name} ({each.type_name})" for each in loaded) or "none"
         raise LoopError(f"{manager.name} has no controller {controller}: found {there}")
-    if found.type_name != PID_CONTROLLER:
+    if found.type_name not in _PARTS:
         raise LoopError(
-            f"{controller} is a {found.type_name}, expected a {PID_CONTROLLER}: for another "
+            f"{controller} is a {found.type_name}, expected {' or '.join(_PARTS)}: for another "
             f"controller type tune_loop --measurement TOPIC --command TOPIC instead"
         )
     if not found.is_active:
         typed = manager.command_for([controller], [])
         raise LoopError(f"{controller} is {found.state}, expected active; type: {typed}")
     node = manager.node_of(controller)
-    wide = client.values(
-        node,
-        (
-            "dof_names",
-            "reference_and_state_dof_names",
-            "command_interface",
-            "reference_and_state_interfaces",
-            "enable_feedforward",
-            "use_sim_time",
-        ),
-    )
-    dofs = tuple(wide["dof_names"])
-    joints = tuple(wide["reference_and_state_dof_names"] or dofs)
+    parts = _PARTS[found.type_name](client, node)
+    joints, dofs = parts.joints, parts.dofs
     if joint not in (*joints, *dofs):
         raise LoopError(f"{controller} has no joint {joint}: expected one of {', '.join(joints)}")
     place = joints.index(joint) if joint in joints else dofs.index(joint)
-    interface = f"{dofs[place]}/{wide['command_interface']}"
+    interface = f"{dofs[place]}/{parts.commanded}"
     if interface not in manager.command_interfaces() and interface not in found.claims:
         raise LoopError(
             f"{manager.name} lists no command interface {interface}: type: ros2 control "
             f"list_hardware_interfaces -c {manager.name}"
         )
-    own = _of_dof(client, node, dofs[place])
-    states = _states(client, node, joints)
+    own = _of_dof(client, node, parts.keys[place])
     description = _description(client, manager.namespace)
-    measured = wide["reference_and_state_interfaces"][0]
     return JointLoop(
         controller,
         node,
         joints[place],
-        dofs[place],
+        parts.keys[place],
+        found.type_name == TRAJECTORY_CONTROLLER,
         joints,
         dofs,
         interface,
-        measured,
-        len(wide["reference_and_state_interfaces"]) > 1,
+        parts.measured,
+        parts.has_rate,
         1.0 / _rate(client, manager, found),
-        wide["use_sim_time"],
+        client.values(node, ["use_sim_time"])["use_sim_time"],
         (own["p"], own["i"], own["d"]),
         own["antiwindup_strategy"],
         own["tracking_time_constant"],
         own["save_i_term"],
-        own["feedforward_gain"] if wide["enable_feedforward"] else 0.0,
-        own["angle_wraparound"],
+        own[parts.feedforward] if parts.feedforward else 0.0,
+        own["angle_wraparound"] or (parts.unrolls and is_continuous(description, joints[place])),
         (own["u_clamp_min"], own["u_clamp_max"]),
-        found.is_chained,
-        states,
-        limits_in(description, joints[place], measured),
-        limits_in(description, dofs[place], wide["command_interface"]),
+        above(loaded, [controller]),
+        _states(client, node, parts),
+        limits_in(description, joints[place], parts.measured),
+        limits_in(description, dofs[place], parts.commanded),
     )
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What the parameters of a controller tell of its joints.
+
+    :param joints: their names in the controller's state and references.
+    :param dofs: those in the command interfaces.
+    :param keys: those in the parameter gains.
+    :param commanded: what is commanded, such as ``effort``.
+    :param measured: what is controlled.
+    :param has_rate: True if the derivative comes from a second state interface.
+    :param feedforward: name of the parameter of the feed-forward; empty: there is none.
+    :param unrolls: True if the errors of continuous joints are wrapped.
+    :param kind: name of the message of the controller's state.
+    :param state_of: the state of a joint by its name within one; None: it is not in there.
+    """
+
+    joints: tuple[str, ...]
+    dofs: tuple[str, ...]
+    keys: tuple[str, ...]
+    commanded: str
+    measured: str
+    has_rate: bool
+    feedforward: str
+    unrolls: bool
+    kind: str
+    state_of: Callable[[Any, str], DofState | None]
+
+
+def _of_pid(client: LoopClient, node: str) -> _Parts:
+    names = (
+        "dof_names",
+        "reference_and_state_dof_names",
+        "command_interface",
+        "reference_and_state_interfaces",
+        "enable_feedforward",
+    )
+    dofs, joints, commanded, measured, feeds = client.values(node, names).values()
+    has_rate = len(measured) > 1
+    return _Parts(
+        tuple(joints or dofs),
+        tuple(dofs),
+        tuple(dofs),
+        commanded,
+        measured[0],
+        has_rate,
+        # With a second interface it multiplies the reference's rate, which is 0 at a step.
+        "feedforward_gain" if feeds and not has_rate else "",
+        False,
+        "MultiDOFStateStamped",
+        _told_by_pid,
+    )
+
+
+def _told_by_pid(message: Any, joint: str) -> DofState | None:
+    told = [dof for dof in message.dof_states if dof.name == joint]
+    return DofState(told[0].reference, told[0].feedback, told[0].output) if told else None
+
+
+def _of_trajectories(client: LoopClient, node: str) -> _Parts:
+    names = ("joints", "command_joints", "command_interfaces")
+    joints, commands, kinds = client.values(node, names).values()
+    is_open = False
+    # Releases after Jazzy do not have it.
+    with suppress(LoopError):
+        is_open = client.values(node, ["open_loop_control"])["open_loop_control"]
+    if len(kinds) != 1 or kinds[0] not in _POINTS or (is_open and kinds[0] == "velocity"):
+        raise LoopError(
+            f"{node} commands {', '.join(kinds)}{' in open loop' if is_open else ''}, where its "
+            f"gains do nothing: they are used with velocity alone or effort alone"
+        )
+    # Fewer joints are commanded than measured: these have the same names.
+    moved = joints if len(commands or joints) == len(joints) else commands
+    field = _POINTS[kinds[0]]
+
+    def state_of(message: Any, joint: str) -> DofState | None:
+        if joint not in message.joint_names:
+            return None
+        place = list(message.joint_names).index(joint)
+        # The output is left out where the interfaces cannot be read.
+        return DofState(
+            *(
+                float(values[place]) if place < len(values) else math.nan
+                for values in (
+                    message.reference.positions,
+                    message.feedback.positions,
+                    getattr(message.output, field),
+                )
+            )
+        )
+
+    return _Parts(
+        tuple(moved),
+        tuple(commands or joints),
+        tuple(moved),
+        kinds[0],
+        "position",
+        True,
+        "ff_velocity_scale",
+        True,
+        "JointTrajectoryControllerState",
+        state_of,
+    )
+
+
+_PARTS = {PID_CONTROLLER: _of_pid, TRAJECTORY_CONTROLLER: _of_trajectories}
+
+
+def put_gains(
+    client: LoopClient, node: str, wanted: Mapping[str, float], before: Mapping[str, float]
+) -> None:
+    """Set the gains of a controller, all of them or none, and read them back.
+
+    :param client: a node of the graph.
+    :param node: full name of the controller's node.
+    :param wanted: the gains by the names of their parameters.
+    :param before: those in force, which are set again if others than the wanted are read.
+    :raises LoopError: if the controller does not have the wanted gains.
+    """
+    try:
+        client.set_values(node, wanted)
+        has = client.values(node, tuple(wanted))
+        if has != wanted:
+            raise LoopError(f"{node} has {told(has)}, expected {told(wanted)}")
+    except LoopError as error:
+        # An answer that is lost need not be a refusal.
+        try:
+            client.set_values(node, before)
+        except LoopError as left:
+            raise LoopError(f"{error}; and {left}: set {told(before)} again") from None
+        raise LoopError(f"{error}; the gains are those of before: {told(before)}") from None
+
+
+def told(gains: Mapping[str, float]) -> str:
+    """Return gains in words, by the last letter of their parameters."""
+    return ", ".join(f"{name[-1]} {value:.6g}" for name, value in gains.items())
 
 
 def _rate(client: LoopClient, manager: ControllerManager, found: ManagedController) -> float:
@@ -266,26 +409,25 @@ def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:
     return _OPTIONAL | {name: values[f"{prefix}.{name}"] for name in names}
 
 
-def _states(client: LoopClient, node: str, joints: tuple[str, ...]) -> tuple[DofState, ...]:
+def _states(client: LoopClient, node: str, parts: _Parts) -> tuple[DofState, ...]:
     """Return the state of all joints: the mean of some messages, and the newest reference."""
     topic = f"{node}/controller_state"
-    kind = interface_class("control_msgs", "msg", "MultiDOFStateStamped")
-    came = client.heard(kind, topic, _LOOK, _LEAST)
+    came = client.heard(interface_class("control_msgs", "msg", parts.kind), topic, _LOOK, _LEAST)
     if len(came) < _LEAST:
         raise LoopError(
             f"{topic} has told {len(came)} states within some seconds, expected one for each "
             f"update; type: ros2 topic hz {topic}"
         )
     found = []
-    for joint in joints:
-        told = [dof for message in came for dof in message.dof_states if dof.name == joint]
+    for joint in parts.joints:
+        told = [state for m in came if (state := parts.state_of(m, joint)) is not None]
         if not told:
             raise LoopError(f"{topic} does not tell the state of {joint}")
         found.append(
-            DofState(
-                told[-1].reference,
-                sum(dof.feedback for dof in told) / len(told),
-                sum(dof.output for dof in told) / len(told),
+            replace(
+                told[-1],
+                feedback=sum(each.feedback for each in told) / len(told),
+                output=sum(each.output for each in told) / len(told),
             )
         )
     return tuple(found)
@@ -301,6 +443,24 @@ def _description(client: LoopClient, namespace: str) -> str:
     return ""
 
 
+def _parsed(description: str) -> ElementTree.Element | None:
+    try:
+        return ElementTree.fromstring(description) if description else None
+    except ElementTree.ParseError:
+        return None
+
+
+def is_continuous(description: str, joint: str) -> bool:
+    """Return whether a joint turns without end.
+
+    :param description: the robot's description.
+    :param joint: name of the joint.
+    """
+    root = _parsed(description)
+    found = None if root is None else root.find(f"./joint[@name='{joint}']")
+    return found is not None and found.get("type") == "continuous"
+
+
 def limits_in(description: str, joint: str, interface: str) -> tuple[float, float] | None:
     """Return the limits of a joint's position, velocity or effort; None: not told.
 
@@ -308,10 +468,7 @@ def limits_in(description: str, joint: str, interface: str) -> tuple[float, floa
     :param joint: name of the joint.
     :param interface: what is limited.
     """
-    try:
-        root = ElementTree.fromstring(description) if description else None
-    except ElementTree.ParseError:
-        return None
+    root = _parsed(description)
     if root is None:
         return None
     low, high = -math.inf, math.inf

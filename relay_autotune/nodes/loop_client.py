@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, Self
 
 import rclpy
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
@@ -197,15 +198,29 @@ class LoopClient:
         ear = self._node.create_subscription(
             kind, answers, lambda m: shown.append(accepted(m)), qos_profile_sensor_data
         )
-        mouth = self._node.create_publisher(type(message), topic, quality.COMMAND)
         deadline = time.monotonic() + ANSWER_WITHIN
-        while not any(shown) and time.monotonic() < deadline:
-            if mouth.get_subscription_count():
-                mouth.publish(message)
-            self.wait(lambda: any(shown), _AGAIN)
-        self._node.destroy_publisher(mouth)
+        with self.publishing(message, topic) as publish:
+            while not any(shown) and time.monotonic() < deadline:
+                publish()
+                self.wait(lambda: any(shown), _AGAIN)
         self._node.destroy_subscription(ear)
         return any(shown)
+
+    @contextmanager
+    def publishing(self, message: Any, topic: str) -> Iterator[Callable[[], None]]:
+        """Return what publishes a message, as soon as the topic has a subscription.
+
+        :param message: what is published.
+        :param topic: its full name.
+        """
+        mouth = self._node.create_publisher(type(message), topic, quality.COMMAND)
+        try:
+            self.wait(lambda: mouth.get_subscription_count() > 0, ANSWER_WITHIN)
+            yield lambda: mouth.publish(message)
+            # What nobody has taken yet ends with its publisher.
+            mouth.wait_for_all_acked(Duration(seconds=_AGAIN))
+        finally:
+            self._node.destroy_publisher(mouth)
 
     def has_publisher(self, topic: str) -> bool:
         """Tell whether a topic has a publisher.

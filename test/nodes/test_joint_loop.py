@@ -5,11 +5,21 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from toolbox_pid import ToolboxPid
 
 from relay_autotune.errors import LoopError
-from relay_autotune.nodes.controller_manager import ManagedController, forwarding, in_the_way
-from relay_autotune.nodes.joint_loop import limits_in
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import law_named
+from relay_autotune.nodes.controller_manager import (
+    ManagedController,
+    above,
+    forwarding,
+    in_the_way,
+)
+from relay_autotune.nodes.joint_loop import LAWS, is_continuous, limits_in, put_gains
+from relay_autotune.nodes.remote_gains import controller_of
 
 DESCRIPTION = """<?xml version="1.0"?>
 <robot name="arm">
@@ -43,11 +53,18 @@ def test_the_narrower_of_joint_and_hardware_limits(joint, interface, limits) -> 
 def test_a_description_that_is_none_tells_no_limits() -> None:
     assert limits_in("", "arm_1", "effort") is None
     assert limits_in("<robot><joint", "arm_1", "effort") is None
+    assert not is_continuous("<robot><joint", "arm_1")
+
+
+def test_a_joint_that_turns_without_end_is_told_by_its_type() -> None:
+    assert is_continuous(DESCRIPTION, "wheel")
+    assert not is_continuous(DESCRIPTION, "arm_1")
+    assert not is_continuous(DESCRIPTION, "unknown")
 
 
 def controller(name: str, kind: str, *needs: str, active: bool = True) -> ManagedController:
     state = "active" if active else "inactive"
-    return ManagedController(name, kind, state, 100.0, needs, needs if active else (), False)
+    return ManagedController(name, kind, state, 100.0, needs, needs if active else ())
 
 
 FORWARD = "forward_command_controller/ForwardCommandController"
@@ -62,7 +79,10 @@ LOADED = (
 
 
 def test_a_chain_is_in_the_way_as_a_whole_and_nothing_else() -> None:
-    assert set(in_the_way(LOADED, ["left/effort"])) == {"base", "pid"}
+    # Who is written to stands before who writes, as a manager activates them.
+    assert in_the_way(LOADED, ["left/effort"]) == ("pid", "base")
+    assert above(LOADED, ["pid"]) == ("base",)
+    assert above(LOADED, ["arm"]) == ()
     assert set(in_the_way(LOADED, ["arm/effort"])) == {"arm"}
     assert in_the_way(LOADED, ["gripper/effort"]) == ()
 
@@ -74,3 +94,84 @@ def test_the_forwarding_controller_with_the_fewest_joints_or_the_one_that_is_nam
         forwarding(LOADED, "gripper/effort", "")
     with pytest.raises(LoopError, match="type --forward with one of all, one"):
         forwarding(LOADED, "left/effort", "wrong")
+
+
+def test_joints_that_would_go_limp_have_to_be_written_too() -> None:
+    both = ("left/effort", "right/effort")
+    assert forwarding(LOADED, "left/effort", "", both).name == "all"
+    assert forwarding(LOADED, "left/effort", "one", both).name == "one"
+    with pytest.raises(LoopError, match=r"commanded 0.*--forward with one of all, one.*arm, leg"):
+        forwarding(LOADED, "left/effort", "", ("left/effort", "arm/effort", "leg/effort"))
+
+
+@pytest.mark.parametrize("strategy", LAWS)
+def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str) -> None:
+    period, gains = 0.01, Controller(0.8, 0.4, 0.05)
+    running = law_named(LAWS[strategy]).at(gains, period).running()
+    law = ToolboxPid(gains.p, gains.i, gains.d, strategy)
+    measured = np.random.default_rng(3).normal(size=200)
+    ours = [running.step(1.0, y) for y in measured]
+    assert ours == pytest.approx([law.step(1.0 - y, period) for y in measured], rel=1e-9)
+
+
+def test_the_strategies_differ_at_a_limit_of_the_command() -> None:
+    left = {}
+    for strategy in LAWS:
+        law = ToolboxPid(1.0, 2.0, 0.0, strategy, u_clamp_min=-1.0, u_clamp_max=1.0)
+        for _ in range(100):
+            law.step(2.0, 0.01)
+        left[strategy] = law.integral
+    assert left["conditional_integration"] == 0.0
+    assert left["none"] == left["legacy"] == pytest.approx(4.0)
+    # p e + I - u = tracking i e, with e 2, u 1 and a tracking of p/i.
+    assert left["back_calculation"] == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_feedforward_is_a_weight_of_the_setpoint() -> None:
+    found = controller_of({"p": 0.5, "i": 1.0}, 0.2)
+    assert found == Controller(0.5, 0.5, b=1.4)
+    for setpoint, measured in ((2.0, 1.0), (-1.0, 0.3)):
+        law = law_named("controller_node").at(found, 0.01).running()
+        wanted = 0.5 * (setpoint - measured) + 1.0 * 0.01 * (setpoint - measured) + 0.2 * setpoint
+        assert law.step(setpoint, measured) == pytest.approx(wanted)
+
+
+class Taking:
+    """Stands for the client of a controller's node, which takes gains as it is told to."""
+
+    def __init__(self, *answers: str) -> None:
+        self.has, self._answers = {"g.p": 6.0, "g.i": 0.0}, list(answers)
+
+    def set_values(self, node, values):
+        answer = self._answers.pop(0)
+        if answer in ("takes", "answer lost"):
+            self.has = dict(values)
+        elif answer == "takes p alone":
+            self.has["g.p"] = values["g.p"]
+        if answer in ("answer lost", "refuses"):
+            raise LoopError(answer)
+
+    def values(self, node, names):
+        return {name: self.has[name] for name in names}
+
+
+@pytest.mark.parametrize(
+    ("answers", "told"),
+    [
+        (["takes"], ""),
+        (["refuses", "takes"], "refuses; the gains are those of before: p 6, i 0"),
+        (["answer lost", "takes"], "answer lost; the gains are those of before: p 6, i 0"),
+        (["takes p alone", "takes"], "/arm has p 2, i 0, expected p 2, i 1; the gains are those"),
+        (["answer lost", "refuses"], "answer lost; and refuses: set p 6, i 0 again"),
+    ],
+)
+def test_gains_are_set_all_or_none_and_those_before_come_back(answers, told) -> None:
+    client, wanted = Taking(*answers), {"g.p": 2.0, "g.i": 1.0}
+    before = dict(client.has)
+    if not told:
+        put_gains(client, "/arm", wanted, before)
+        assert client.has == wanted
+        return
+    with pytest.raises(LoopError, match=told):
+        put_gains(client, "/arm", wanted, before)
+    assert client.has == (wanted if "refuses: set" in told else before)

@@ -4,11 +4,11 @@
 """A robot under a stand-in for ros2_control: manager, controllers, and two wheels or an arm.
 
 It does what the sources of ros2_control and ros2_controllers (branch jazzy) do, and shares no code
-with them or with the package: strict switches, references that NaN leaves as they are, a state
-that may miss a message. Cycles are 10 ms apart by their stamps; a busy machine makes up for late
-ones, so that the joints and the law are the same on any machine.
+with them or with the package: strict switches, chains, references that NaN leaves as they are, a
+state that may miss a message. Cycles are 10 ms apart by their stamps; a busy machine makes up for
+late ones, so that the joints and the law are the same on any machine.
 
-    python3 robot.py [base|arm]
+    python3 robot.py [base|chain|arm|trajectory]
 
 What happens is ordered on the topic /trouble: `refuse`, `die NAME`; who is active is told on
 /active.
@@ -22,18 +22,26 @@ import sys
 import time
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import rclpy
-from control_msgs.msg import MultiDOFCommand, MultiDOFStateStamped, SingleDOFState
+from control_msgs.msg import (
+    JointTrajectoryControllerState,
+    MultiDOFCommand,
+    MultiDOFStateStamped,
+    SingleDOFState,
+)
 from controller_manager_msgs.msg import ControllerState, HardwareInterface
 from controller_manager_msgs.srv import ListControllers, ListHardwareInterfaces, SwitchController
 from fopdt_plant import FopdtPlant
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
+from toolbox_pid import ToolboxPid
 
 RATE = 100
 PERIOD = 1.0 / RATE
@@ -64,6 +72,8 @@ class Wheel:
 
     GAIN, TAU, DEAD, NOISE = 2.0, 0.5, 0.14, 0.01
 
+    velocity = math.nan
+
     def __init__(self, velocity: float) -> None:
         self.effort = velocity / self.GAIN
         self._plant = FopdtPlant(self.GAIN, self.TAU, self.DEAD)
@@ -83,16 +93,16 @@ class Link:
     TAU, DELAY, NOISE = 0.3, 3, 0.0005
 
     def __init__(self, position: float) -> None:
-        self.effort, self._velocity, self._position = 0.0, 0.0, position
+        self.effort, self.velocity, self._position = 0.0, 0.0, position
         self._on_the_way = deque([0.0] * self.DELAY)
 
     def measure(self, at: float, effort: float) -> float:
         self._on_the_way.append(effort)
         held = self._on_the_way.popleft()
         left = math.exp(-PERIOD / self.TAU)
-        away = self._velocity - held
+        away = self.velocity - held
         self._position += held * PERIOD + away * self.TAU * (1.0 - left)
-        self._velocity = held + away * left
+        self.velocity = held + away * left
         return self._position + random.gauss(0.0, self.NOISE)
 
 
@@ -100,11 +110,13 @@ class Link:
 class Kind:
     """What a robot has.
 
-    :param controller: name of its pid_controller.
+    :param controller: name of the controller of its joints.
     :param measured: the state interface.
     :param joints: its joints, each at its reference.
     :param gains: p and i that it begins with.
     :param forward: the forwarding controllers, with the joints that they command.
+    :param above: name of the controller that writes the references; empty: none does.
+    :param follows: True if the controller follows trajectories.
     """
 
     controller: str
@@ -112,6 +124,8 @@ class Kind:
     joints: dict[str, float]
     gains: tuple[float, float]
     forward: dict[str, tuple[str, ...]]
+    above: str = ""
+    follows: bool = False
 
     def joint(self, value: float) -> Wheel | Link:
         return Wheel(value) if self.measured == "velocity" else Link(value)
@@ -133,49 +147,101 @@ KINDS = {
         {"forward_arm": ("arm_2", "arm_1")},
     ),
 }
+KINDS["chain"] = replace(KINDS["base"], above="base_controller")
+KINDS["trajectory"] = replace(
+    KINDS["arm"],
+    follows=True,
+    forward={"forward_arm": ("arm_2", "arm_1"), "forward_one": ("arm_2",)},
+)
+
+# What both types of controllers declare of each joint.
+GAINS = {
+    "i": 0.0, "d": 0.0, "i_clamp_max": math.inf, "i_clamp_min": -math.inf,
+    "u_clamp_max": 4.0, "u_clamp_min": -4.0, "tracking_time_constant": 0.0,
+}  # fmt: skip
 
 
-class PidController:
+def toolbox_pid(node: Node, joint: str) -> ToolboxPid:
+    """Return the law with the gains that a node has for a joint."""
+    values = node.get_parameters_by_prefix(f"gains.{joint}")
+    names = ("p", *GAINS, "antiwindup_strategy")
+    return ToolboxPid(**{name: values[name].value for name in names})
+
+
+class Controller:
+    """What every controller has.
+
+    :param name: its name.
+    :param needs: the command interfaces that it writes.
+    """
+
+    type_name = ""
+    references: tuple[str, ...] = ()
+    is_chained = False
+
+    def __init__(self, name: str, needs: tuple[str, ...]) -> None:
+        self.name, self.needs = name, needs
+        self.node = Node(name)
+
+    def activate(self, measured: dict[str, float]) -> None: ...
+
+    def deactivate(self, commands: dict[str, float]) -> None: ...
+
+
+class ToolboxController(Controller):
+    """What has a control_toolbox::Pid for each joint, with parameters that may change.
+
+    :param kind: the robot.
+    """
+
+    def __init__(self, kind: Kind, defaults: dict[str, object]) -> None:
+        joints = tuple(kind.joints)
+        super().__init__(kind.controller, tuple(f"{joint}/effort" for joint in joints))
+        self.joints = joints
+        for joint in joints:
+            given = GAINS | {"p": kind.gains[0], "i": kind.gains[1]} | defaults
+            for key, value in given.items():
+                self.node.declare_parameter(f"gains.{joint}.{key}", value)
+        self.laws = [toolbox_pid(self.node, joint) for joint in joints]
+        self.node.add_post_set_parameters_callback(lambda _: self.read_gains())
+
+    def read_gains(self) -> None:
+        for k, joint in enumerate(self.joints):
+            self.laws[k] = replace(toolbox_pid(self.node, joint), **self.laws[k].memory)
+
+    def publish(self, publisher: Publisher, state: Any, stamp: float) -> None:
+        state.header.stamp.sec, state.header.stamp.nanosec = divmod(round(stamp * 1e9), 10**9)
+        # The real-time publisher leaves a message out where it cannot have its lock.
+        if random.random() > 0.005:
+            publisher.publish(state)
+
+
+class PidController(ToolboxController):
     """pid_controller with one state interface."""
 
     type_name = "pid_controller/PidController"
 
     def __init__(self, kind: Kind) -> None:
-        self.name, self.joints = kind.controller, tuple(kind.joints)
-        name, joints = self.name, self.joints
-        self.needs = tuple(f"{joint}/effort" for joint in joints)
-        self.node = Node(name)
+        own = {"save_i_term": True, "feedforward_gain": 0.0, "angle_wraparound": False}
+        super().__init__(kind, {"antiwindup_strategy": "back_calculation", **own})
         declare = self.node.declare_parameter
-        declare("dof_names", list(joints))
-        declare("reference_and_state_dof_names", list(joints))
+        declare("dof_names", list(self.joints))
+        declare("reference_and_state_dof_names", list(self.joints))
         declare("command_interface", "effort")
         declare("reference_and_state_interfaces", [kind.measured])
         declare("enable_feedforward", False)
-        for joint in joints:
-            for key, value in (
-                ("p", kind.gains[0]), ("i", kind.gains[1]), ("d", 0.0),
-                ("u_clamp_max", 4.0), ("u_clamp_min", -4.0),
-                ("antiwindup_strategy", "back_calculation"), ("tracking_time_constant", 0.0),
-                ("save_i_term", True), ("feedforward_gain", 0.0), ("angle_wraparound", False),
-            ):  # fmt: skip
-                declare(f"gains.{joint}.{key}", value)
-        self.read_gains()
-        self.node.add_post_set_parameters_callback(lambda _: self.read_gains())
-        count = len(joints)
-        self.reference, self.error = list(kind.joints.values()), [0.0] * count
-        self.integral = [kind.joint(value).effort for value in kind.joints.values()]
+        self.references = tuple(f"{self.name}/{joint}/{kind.measured}" for joint in self.joints)
+        self.reference = list(kind.joints.values())
+        for law, (joint, value) in zip(self.laws, kind.joints.items(), strict=True):
+            law.integral = kind.joint(value).effort - self.fed(joint, value)
         self.told: MultiDOFCommand | None = None
         self.states = self.node.create_publisher(MultiDOFStateStamped, "~/controller_state", 100)
         self.node.create_subscription(MultiDOFCommand, "~/reference", self.hear, BEST_EFFORT)
 
-    def read_gains(self) -> None:
-        self.gains = [
-            [
-                self.node.get_parameter(f"gains.{joint}.{key}").value
-                for key in ("p", "i", "d", "u_clamp_min", "u_clamp_max")
-            ]
-            for joint in self.joints
-        ]
+    def fed(self, joint: str, reference: float) -> float:
+        names = ("enable_feedforward", f"gains.{joint}.feedforward_gain")
+        feeds, gain = (self.node.get_parameter(name).value for name in names)
+        return feeds * gain * reference
 
     def hear(self, message: MultiDOFCommand) -> None:
         # The values are taken by their place, whatever the names say.
@@ -187,27 +253,21 @@ class PidController:
         self.told = None
         self.reference = [measured[joint] for joint in self.joints]
         for k, joint in enumerate(self.joints):
-            if not self.node.get_parameter(f"gains.{joint}.save_i_term").value:
-                self.integral[k] = 0.0
-            self.error[k] = 0.0
+            kept = self.node.get_parameter(f"gains.{joint}.save_i_term").value
+            self.laws[k].reset(save_integral=kept)
 
     def update(self, stamp: float, measured: dict[str, float], commands: dict[str, float]) -> None:
-        if self.told is not None:
+        if self.is_chained:
+            self.reference = [commands[name] for name in self.references]
+        elif self.told is not None:
             for k, value in enumerate(self.told.values):
                 if not math.isnan(value):
                     self.reference[k] = value
-            self.told = None
+        self.told = None
         state = MultiDOFStateStamped()
-        state.header.stamp.sec, state.header.stamp.nanosec = divmod(round(stamp * 1e9), 10**9)
         for k, joint in enumerate(self.joints):
-            p, i, d, low, high = self.gains[k]
             error = self.reference[k] - measured[joint]
-            wanted = p * error + self.integral[k] + d * (error - self.error[k]) / PERIOD
-            output = min(max(wanted, low), high)
-            if i:
-                tracking = math.sqrt(d / i) if d else p / i
-                self.integral[k] += PERIOD * (i * error + (output - wanted) / tracking)
-            self.error[k] = error
+            output = self.laws[k].step(error, PERIOD) + self.fed(joint, self.reference[k])
             commands[f"{joint}/effort"] = output
             state.dof_states.append(
                 SingleDOFState(
@@ -215,19 +275,67 @@ class PidController:
                     error=error, time_step=PERIOD, output=output,
                 )
             )  # fmt: skip
-        # The real-time publisher leaves a message out where it cannot have its lock.
-        if random.random() > 0.005:
-            self.states.publish(state)
+        self.publish(self.states, state, stamp)
 
 
-class ForwardController:
+class TrajectoryController(ToolboxController):
+    """joint_trajectory_controller that commands effort alone, and holds where it is."""
+
+    type_name = "joint_trajectory_controller/JointTrajectoryController"
+
+    def __init__(self, kind: Kind) -> None:
+        super().__init__(kind, {"antiwindup_strategy": "legacy", "ff_velocity_scale": 0.0})
+        declare = self.node.declare_parameter
+        declare("joints", list(self.joints))
+        declare("command_joints", list(self.joints))
+        declare("command_interfaces", ["effort"])
+        declare("state_interfaces", ["position", "velocity"])
+        declare("open_loop_control", False)
+        self.held = list(kind.joints.values())
+        kind_of_state = JointTrajectoryControllerState
+        self.states = self.node.create_publisher(kind_of_state, "~/controller_state", 10)
+
+    def activate(self, measured: dict[str, float]) -> None:
+        self.held = [measured[joint] for joint in self.joints]
+        for law in self.laws:
+            law.reset(save_integral=False)
+
+    def deactivate(self, commands: dict[str, float]) -> None:
+        commands.update(dict.fromkeys(self.needs, 0.0))
+
+    def update(self, stamp: float, measured: dict[str, float], commands: dict[str, float]) -> None:
+        now = [measured[joint] for joint in self.joints]
+        rates = [measured[f"{joint}/velocity"] for joint in self.joints]
+        for k, name in enumerate(self.needs):
+            error = self.held[k] - now[k]
+            commands[name] = self.laws[k].step(error, PERIOD, 0.0 - rates[k])
+        state = JointTrajectoryControllerState(joint_names=list(self.joints))
+        state.reference.positions, state.feedback.positions = self.held, now
+        state.feedback.velocities = rates
+        state.output.effort = [commands[name] for name in self.needs]
+        self.publish(self.states, state, stamp)
+
+
+class BaseController(Controller):
+    """diff_drive_controller, which drives straight on."""
+
+    type_name = "diff_drive_controller/DiffDriveController"
+
+    def __init__(self, kind: Kind, needs: tuple[str, ...]) -> None:
+        super().__init__(kind.above, needs)
+        self.speeds = list(kind.joints.values())
+
+    def update(self, stamp: float, measured: dict[str, float], commands: dict[str, float]) -> None:
+        commands.update(zip(self.needs, self.speeds, strict=True))
+
+
+class ForwardController(Controller):
     """forward_command_controller."""
 
     type_name = "forward_command_controller/ForwardCommandController"
 
     def __init__(self, name: str, needs: tuple[str, ...]) -> None:
-        self.name, self.needs = name, needs
-        self.node = Node(name)
+        super().__init__(name, needs)
         self.told: list[float] | None = None
         self.node.create_subscription(Float64MultiArray, "~/commands", self.hear, 10)
 
@@ -248,18 +356,24 @@ class Manager:
 
     def __init__(self, kind: Kind) -> None:
         self.measured = kind.measured
-        self.controllers = [
-            PidController(kind),
+        joints = TrajectoryController(kind) if kind.follows else PidController(kind)
+        # Who writes references is before who reads them.
+        self.controllers: list[Any] = [
+            *([BaseController(kind, joints.references)] if kind.above else []),
+            joints,
             *(
                 ForwardController(name, tuple(f"{joint}/effort" for joint in joints))
                 for name, joints in kind.forward.items()
             ),
         ]
-        self.active = {kind.controller}
+        self.active = set[str]()
         self.refuses = False
         self.joints = {name: kind.joint(value) for name, value in kind.joints.items()}
         self.commands = {f"{name}/effort": joint.effort for name, joint in self.joints.items()}
-        self.now = dict(kind.joints)
+        self.now = self.measure(PERIOD)
+        first = {kind.controller, kind.above} - {""}
+        self.active |= first
+        joints.is_chained = bool(kind.above)
         self.start, self.count = time.time(), 0
         self.node = Node("controller_manager")
         node = self.node
@@ -296,16 +410,20 @@ class Manager:
             self.count += 1
             self.cycle(PERIOD * self.count)
 
+    def measure(self, at: float) -> dict[str, float]:
+        found = {}
+        for name, joint in self.joints.items():
+            found[name] = joint.measure(at, self.commands[f"{name}/effort"])
+            found[f"{name}/velocity"] = joint.velocity
+        return found
+
     def cycle(self, at: float) -> None:
-        self.now = measured = {
-            name: joint.measure(at, self.commands[f"{name}/effort"])
-            for name, joint in self.joints.items()
-        }
+        self.now = measured = self.measure(at)
         stamp = self.start + at
         for controller in self.controllers:
             if controller.name in self.active:
                 controller.update(stamp, measured, self.commands)
-        names = random.sample(list(measured), len(measured))
+        names = random.sample(list(self.joints), len(self.joints))
         state = JointState(name=names)
         setattr(state, self.measured, [measured[name] for name in names])
         state.header.stamp.sec, state.header.stamp.nanosec = divmod(round(stamp * 1e9), 10**9)
@@ -324,6 +442,9 @@ class Manager:
                     update_rate=RATE,
                     required_command_interfaces=each.needs,
                     claimed_interfaces=each.needs if active else [],
+                    is_chainable=bool(each.references),
+                    is_chained=each.is_chained,
+                    reference_interfaces=each.references,
                 )
             )
         return response
@@ -334,6 +455,7 @@ class Manager:
         response.command_interfaces = [
             HardwareInterface(name=name, data_type="double", is_available=True)
             for name in self.commands
+            if name.count("/") == 1
         ]
         return response
 
@@ -343,11 +465,22 @@ class Manager:
         response.message = self.why_not(request)
         response.ok = not response.message
         if response.ok:
-            self.active -= set(request.deactivate_controllers)
+            on, off = set(request.activate_controllers), set(request.deactivate_controllers)
+            after = self.active - off | on
+            writes = {n for each in self.controllers if each.name in after for n in each.needs}
             for each in self.controllers:
-                if each.name in request.activate_controllers:
+                chained = bool(writes & set(each.references))
+                # Who gets its references from others, or no longer does, is begun again.
+                if each.name in self.active & after and chained != each.is_chained:
+                    off, on = off | {each.name}, on | {each.name}
+                each.is_chained = chained and each.name in after
+            for each in self.controllers:
+                if each.name in off:
+                    each.deactivate(self.commands)
+            for each in reversed(self.controllers):
+                if each.name in on:
                     each.activate(self.now)
-                    self.active.add(each.name)
+            self.active = after
             self.tell()
         return response
 
@@ -367,6 +500,9 @@ class Manager:
             return f"{off - self.active} is not active"
         after = self.active - off | on
         claimed = [n for each in self.controllers if each.name in after for n in each.needs]
+        for each in self.controllers:
+            if each.name not in after and set(each.references) & set(claimed):
+                return f"{each.name} is inactive, and another controller writes its references"
         return (
             "two controllers would own one interface" if len(claimed) > len(set(claimed)) else ""
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from loop_rig import LATCHED, Process, Rig
 from robot_interfaces import interfaces
@@ -16,19 +17,24 @@ ROBOT = Path(__file__).parent / "robot.py"
 # Controller, joint and further words for each robot.
 TUNED = {
     "base": ("wheel_controller", "left_wheel", "--within", "0", "4"),
+    "chain": ("wheel_controller", "left_wheel", "--within", "0", "4"),
     "arm": ("arm_controller", "arm_2"),
+    "trajectory": ("arm_controller", "arm_2"),
 }
 
 
 class Robot:
     """A robot, and tune_loop beside it."""
 
-    def __init__(self, rig: Rig, kind: str = "base") -> None:
+    def __init__(self, rig: Rig, kind: str = "base", **parameters: Any) -> None:
         self.rig = rig
         self.controller, self.joint, *self.words = TUNED[kind]
         rig.environment |= interfaces() | {"HOME": str(rig.folder)}
         self.active = rig.listen("/active", String, LATCHED)
-        self.process = rig._begin("robot", [sys.executable, str(ROBOT), kind], None)
+        given = [f"{self.controller}:{name}:={value}" for name, value in parameters.items()]
+        words = [word for each in given for word in ("-p", each)]
+        command = [sys.executable, str(ROBOT), kind, "--ros-args", *words]
+        self.process = rig._begin("robot", command, None)
         rig.until(lambda: self.active, "the robot")
 
     def gains(self) -> list[float]:
