@@ -12,10 +12,7 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
@@ -41,7 +38,7 @@ from relay_autotune.nodes.controller_parameters import (
 from relay_autotune.nodes.following import FOLLOW_EVERY, Following
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.gains_keeper import GainsKeeper
-from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.own_gains import OwnGains, controller_of, said, set_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
@@ -137,7 +134,7 @@ class ControllerNode(ServedNode):
             Float64,
             "controller_command",
             quality.COMMAND,
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_PUBLISHER,
         )
         sensor = Following(
             self,
@@ -150,9 +147,7 @@ class ControllerNode(ServedNode):
         measurement = sensor.subscription
         if not self._simulated:
             self.favour(measurement)
-        self.create_timer(
-            FOLLOW_EVERY, sensor.follow, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self.create_timer(FOLLOW_EVERY, sensor.follow, clock=STEADY)
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         if self._reported is None:

@@ -11,7 +11,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -60,10 +59,8 @@ class Ends:
         is_reported: bool = False,
     ) -> None:
         overridable = QoSOverridingOptions.with_default_policies()
-        # No event callbacks: each one costs time in every turn of the executor. /diagnostics and
-        # the answer to a start report an incompatible QoS.
-        quiet = PublisherEventCallbacks(use_default_callbacks=False)
-        unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
+        # /diagnostics and the answer to a start report an incompatible QoS.
+        quiet, unheard = quality.QUIET_PUBLISHER, quality.QUIET_SUBSCRIPTION
         plain = CommandMessage()
         self.is_reported = is_reported
         self.commands = commands

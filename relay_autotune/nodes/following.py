@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
@@ -48,14 +47,12 @@ class Following:
         self._topic = topic
         self._callback = callback
         self._renewed = renewed
-        # No event callbacks: each one costs time in every turn of the executor.
-        self._unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
         self.subscription: Subscription = node.create_subscription(
             kind,
             topic,
             callback,
             quality.MEASUREMENT,
-            event_callbacks=self._unheard,
+            event_callbacks=quality.QUIET_SUBSCRIPTION,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         """The subscription in force."""
@@ -95,7 +92,7 @@ class Following:
                 durability=profile.durability,
                 reliability=ReliabilityPolicy.BEST_EFFORT,
             ),
-            event_callbacks=self._unheard,
+            event_callbacks=quality.QUIET_SUBSCRIPTION,
         )
         if self._renewed is not None:
             self._renewed(self.subscription)

@@ -9,8 +9,6 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.task import Future
 from rclpy.timer import Timer
 
@@ -22,7 +20,7 @@ from relay_autotune.control.gains_history import (
 )
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.gains_journal import GainsJournal
-from relay_autotune.nodes.lifetime import ServedNode
+from relay_autotune.nodes.lifetime import STEADY, ServedNode
 
 # Time between attempts when the place of the gains does not answer [s].
 _ASK_AGAIN = 1.0
@@ -244,9 +242,7 @@ class GainsKeeper:
 
     def _ask_later(self, wait: float) -> None:
         if self._timer is None:
-            self._timer = self._node.create_timer(
-                max(wait, 1e-3), self._ask_again, clock=Clock(clock_type=ClockType.STEADY_TIME)
-            )
+            self._timer = self._node.create_timer(max(wait, 1e-3), self._ask_again, clock=STEADY)
 
     def _ask_again(self) -> None:
         if self._timer is not None:

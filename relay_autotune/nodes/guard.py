@@ -10,12 +10,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.nodes.lifetime import STEADY
 
 # Interval of the checks [s]; the graph is checked once in _GRAPH_EVERY of them.
 LOOK_EVERY = 0.05
@@ -111,9 +110,7 @@ class Guard:
         self._stop = stop
         self._looks = 0
         self._checks: list[Callable[[], str]] = []
-        self._timer = node.create_timer(
-            LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
-        )
+        self._timer = node.create_timer(LOOK_EVERY, self._look, clock=STEADY, autostart=False)
 
     def begin(self, checks: list[Callable[[], str]]) -> None:
         """Start the checks.

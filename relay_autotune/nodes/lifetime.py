@@ -25,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -35,6 +37,8 @@ from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.nodes.signals import ending_signals, never_wait_for, signal_name
 from relay_autotune.quantities import Quantity
 
+# The clock of timers that must go on whatever becomes of /clock.
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 # Longest delay of a measurement by a computing thread [s]; Python's default is 5 ms.
 _SWITCH_INTERVAL = 5e-5
 # Time limit for tasks at the end of a node, such as the answer to a goal [s].

@@ -11,9 +11,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from std_msgs.msg import Bool, Float64
 
 from relay_autotune.errors import FieldError
@@ -30,6 +27,7 @@ from relay_autotune.nodes.guard import (
     second_source,
 )
 from relay_autotune.nodes.handover import Handover
+from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.readiness import NotReadyError
 
 # In takeover, number of the node's own last commands; they return to it over the topic.
@@ -71,7 +69,6 @@ class LoopEnds:
         self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
         self._hold.publish(Bool(data=False))
         self._topic = ends.command.topic_name
-        unheard = SubscriptionEventCallbacks(use_default_callbacks=False)
         if takeover:
             ends.sent = self._note_own
             node.create_subscription(
@@ -79,7 +76,7 @@ class LoopEnds:
                 "command",
                 self._on_command,
                 quality.COMMAND,
-                event_callbacks=unheard,
+                event_callbacks=quality.QUIET_SUBSCRIPTION,
             )
         elif not ends.is_reported:
             self._controller = node.create_subscription(
@@ -87,18 +84,16 @@ class LoopEnds:
                 "controller_command",
                 self._on_controller,
                 quality.MEASUREMENT,
-                event_callbacks=unheard,
+                event_callbacks=quality.QUIET_SUBSCRIPTION,
             )
-            node.create_timer(
-                _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
-            )
+            node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._value("command_others") == "other_commands":
             node.create_subscription(
                 ends.commands.kind,
                 "other_commands",
                 self._on_others,
                 quality.MEASUREMENT,
-                event_callbacks=unheard,
+                event_callbacks=quality.QUIET_SUBSCRIPTION,
             )
         self.repeat_period: float = self._value("command_period")
         """Time without a command after which the last is sent again [s]; 0: never."""
@@ -107,14 +102,14 @@ class LoopEnds:
             node.create_timer(
                 0.5 * self.repeat_period,
                 self._send_again,
-                clock=Clock(clock_type=ClockType.STEADY_TIME),
+                clock=STEADY,
             )
         node.create_subscription(
             Float64,
             "command_feedback",
             self._on_feedback,
             quality.MEASUREMENT,
-            event_callbacks=unheard,
+            event_callbacks=quality.QUIET_SUBSCRIPTION,
         )
 
     def _value(self, name: str) -> Any:

@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-
+from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.text import TOLD_EVERY
 
 
@@ -28,9 +26,7 @@ class Narrator:
         self._node = node
         self._words = words
         self._tell = tell
-        self._timer = node.create_timer(
-            TOLD_EVERY, self.now, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
-        )
+        self._timer = node.create_timer(TOLD_EVERY, self.now, clock=STEADY, autostart=False)
 
     def now(self) -> None:
         """Tell the present sentence, and the next one a second later."""

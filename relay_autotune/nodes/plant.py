@@ -10,9 +10,6 @@ import time
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
@@ -22,7 +19,7 @@ from std_msgs.msg import Float64
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.process.actuator import Actuator
@@ -237,7 +234,7 @@ class PlantNode(ServedNode):
         self._position: Any = None
         # No event callbacks: each one costs time in every turn of the executor.
         overridable = QoSOverridingOptions.with_default_policies()
-        unseen = PublisherEventCallbacks(use_default_callbacks=False)
+        unseen = quality.QUIET_PUBLISHER
         # A value that is published only on change must be latched for late subscribers.
         depth = quality.MEASUREMENT.depth
         offered = quality.latched(depth) if values["on_change"] else quality.MEASUREMENT
@@ -262,10 +259,9 @@ class PlantNode(ServedNode):
             "command",
             received,
             QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_SUBSCRIPTION,
             qos_overriding_options=overridable,
         )
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._start = time.monotonic()
         self._timer: Timer
         if values["mode"] == "lockstep":
@@ -275,7 +271,7 @@ class PlantNode(ServedNode):
             self._pause = self._period / speed if speed > 0.0 else 0.0
             self._next = 0.0
             self._value = self._process.measure(0.0)
-            self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=self._steady)
+            self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=STEADY)
         elif values["mode"] == "clock":
             # Whether an answer to the last sample is expected, and whether it has come.
             self._waiting = self._answered = False
@@ -284,10 +280,10 @@ class PlantNode(ServedNode):
                 ClockMessage, "/clock", QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
             )
             self._timer = self.create_timer(
-                self._period / values["speed"], self._tick, clock=self._steady
+                self._period / values["speed"], self._tick, clock=STEADY
             )
         else:
-            self._timer = self.create_timer(self._period, self._sample, clock=self._steady)
+            self._timer = self.create_timer(self._period, self._sample, clock=STEADY)
         self.get_logger().info(
             f"mode {values['mode']}, sample period {self._period:g} s, "
             f"measurement on {self._measurement.topic_name}, command on {self._command.topic_name}"

@@ -10,6 +10,7 @@ from difflib import SequenceMatcher
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -47,6 +48,10 @@ def latched(depth: int) -> QoSProfile:
 
 
 RESULT = latched(1)
+
+# For ends whose events nobody looks at: each one costs time in every turn of the executor.
+QUIET_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
+QUIET_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
 
 # Topics of every node, and how many others are named where one is missing.
 _COMMON = {"/rosout", "/parameter_events"}

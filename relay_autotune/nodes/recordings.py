@@ -11,12 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
 from relay_autotune.bag.writer import Topic
+from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.quality import for_bag
 from relay_autotune.nodes.recorder import Recorder
 from relay_autotune.text import duration
@@ -63,7 +62,6 @@ class Recordings:
         self._node = node
         self._ends = ends
         self._names = {name: end.topic_name for name, end in ends().items()}
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._open: dict[str, _Recording] = {}
         self._paths: dict[str, str] = {}
         self._last: Recorder | None = None
@@ -194,7 +192,7 @@ class Recordings:
 
         recording.waits_since = time.monotonic()
         recording.until = recording.waits_since + LONGEST * timeout
-        recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=self._steady)
+        recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=STEADY)
 
     def close(self, experiment_id: str, why: str) -> None:
         """Close a recording; its thread finishes it.

@@ -13,8 +13,6 @@ from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -38,7 +36,7 @@ from relay_autotune.nodes.checklist import (
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.following import FOLLOW_EVERY
-from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
@@ -106,7 +104,6 @@ class RelayNode(ServedNode):
         self._held: float | None = None if math.isnan(initial) else initial
         self._after: Callable[[float], float] | None = None
         self._session: Session | None = None
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._counter = Counter()
         self._last_samples = LastSamples()
@@ -148,7 +145,7 @@ class RelayNode(ServedNode):
         self._topic = self._ends.measurement.topic_name
         if not self._simulated:
             self.favour(self._ends.measurement)
-        self.create_timer(FOLLOW_EVERY, self._follow_sensor, clock=self._steady)
+        self.create_timer(FOLLOW_EVERY, self._follow_sensor, clock=STEADY)
         self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
         self.create_service(StartTune, "~/start_tune", self._on_start)
@@ -156,7 +153,7 @@ class RelayNode(ServedNode):
         self._action = TuneAction(self, self._request, partial(self._stop_now, "cancelled"))
         self._awaits_results: Session | None = None
         self._narrator = Narrator(self, self._words, self._tell)
-        self.create_timer(1.0, self._publish_diagnostics, clock=self._steady)
+        self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         self.add_on_set_parameters_callback(self._on_set)
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(
@@ -238,7 +235,7 @@ class RelayNode(ServedNode):
                 self._send(command)
                 session.answered()
 
-        timer = self.create_timer(NO_REPEAT_AFTER, answer, clock=self._steady)
+        timer = self.create_timer(NO_REPEAT_AFTER, answer, clock=STEADY)
 
     # Starting.
 

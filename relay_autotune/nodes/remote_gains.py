@@ -11,14 +11,13 @@ from typing import Any
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
+from relay_autotune.nodes.lifetime import STEADY
 
 # Names of the gains that may be sent, of the ISA and of the parallel form.
 NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
@@ -184,7 +183,7 @@ class RemoteGains:
             TIMEOUT,
             give_up,
             callback_group=self._group,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
+            clock=STEADY,
         )
         try:
             return await answer

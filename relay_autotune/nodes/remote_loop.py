@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 
 from relay_autotune.control.controller import is_usable
@@ -84,14 +83,14 @@ class RemoteLoop:
             setpoints.kind,
             "setpoint",
             quality.COMMAND,
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_PUBLISHER,
         )
         node.create_subscription(
             setpoints.kind,
             "setpoint",
             self._on_setpoint,
             quality.COMMAND,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_SUBSCRIPTION,
         )
 
     def hear_command(self, command: float) -> None:

@@ -8,12 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.lifetime import STEADY
 
 TOPIC = "identifier_status"
 # Interval of the signs of life during a computation [s].
@@ -35,12 +33,10 @@ class SignsOfLife:
             DiagnosticStatus,
             TOPIC,
             quality.RESULT,
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_PUBLISHER,
         )
         self._working: list[str] = []
-        self._timer = node.create_timer(
-            EVERY, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
-        )
+        self._timer = node.create_timer(EVERY, self._tell, clock=STEADY, autostart=False)
 
     def work_on(self, experiment_id: str) -> None:
         """Give signs of life until the work is done.

@@ -11,15 +11,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.experiment.faults.repetition import Repetition
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import Reader
 from relay_autotune.nodes.reports import Counter
 
@@ -80,7 +78,7 @@ class Repeater:
             clock = node.get_clock()
             self._now: Callable[[], float] = lambda: float(clock.now().nanoseconds) * 1e-9
         else:
-            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            clock = STEADY
             self._now = time.monotonic
         wait = _LEAST_WAIT if self._simulated else period
         self._timer = node.create_timer(wait, self._look, clock=clock)
@@ -89,7 +87,7 @@ class Repeater:
             "measurement",
             self._on_kept,
             quality.RESULT,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_SUBSCRIPTION,
         )
         self._topic = self._ear.topic_name
         self._direct = False
@@ -172,7 +170,6 @@ class Sensor:
         """Silence after which a value is repeated [s]; 0: never."""
         self._repeater = Repeater(node, period, reader, repeat) if period > 0.0 else None
         self._timer: Timer | None = None
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.hear = self._repeater.hear if self._repeater else None
         """To be called with each measurement; None: no call needed."""
         self.misread = ""
@@ -195,7 +192,7 @@ class Sensor:
     def watch(self) -> None:
         """Watch on the steady clock until :meth:`rest`."""
         wait = self._timeout if self._repeater is None else _LOOK_EVERY
-        self._timer = self._node.create_timer(wait, self._look, clock=self._steady)
+        self._timer = self._node.create_timer(wait, self._look, clock=STEADY)
 
     def rest(self) -> None:
         """Stop watching."""

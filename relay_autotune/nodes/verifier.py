@@ -16,9 +16,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.action import ActionServer, CancelResponse
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.event_handler import PublisherEventCallbacks
 
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
@@ -29,7 +26,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import conclude
-from relay_autotune.nodes.lifetime import ServedNode
+from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.nodes.results import keep
 from relay_autotune.process.transfer_function import TransferFunction
@@ -192,15 +189,13 @@ class Verifier:
         self._until = self._advanced = 0.0
         self._period = 0.0
         self._beyond = 0
-        self._watch = node.create_timer(
-            _LOOK_EVERY, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False
-        )
+        self._watch = node.create_timer(_LOOK_EVERY, self._look, clock=STEADY, autostart=False)
         self._narrator = Narrator(node, self._words, self._tell)
         self._full = node.create_publisher(
             Verification,
             "verification",
             quality.latched(_STEPS_KEPT),
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            event_callbacks=quality.QUIET_PUBLISHER,
         )
         self._server = ActionServer(
             node,
