@@ -66,6 +66,8 @@ _FAST_CYCLES, _FAST = 3, 0.3
 # by the same amplitude: a process cannot answer faster, and noise leaves a long stay in each half
 # cycle.
 _MANY_STAYS, _OF_RESPONSE = 40, 0.5
+# Three stays as long as that show that the time to respond was not that of a gap.
+_SHOWN = 3
 
 # If the levels started at a quarter, the swings are compared after this many cycles, once the
 # swing grows by less than this factor from one to the next.
@@ -157,6 +159,7 @@ class Oscillation:
         """Number of switches so far."""
         self._kick_amplitude = levels.amplitude
         self._answered: deque[bool] = deque(maxlen=_MANY_STAYS)
+        self._long_stays = 0
         self._shifts = self._borne = 0
         self._shifted_at = -math.inf
         self._furthest = math.inf
@@ -247,6 +250,7 @@ class Oscillation:
         self._on_the_way.clear()
         self._switched_at.clear()
         self._answered.clear()
+        self._long_stays = 0
         self._switches_before = self.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
         self._turns = Turns(t, self._response_time)
@@ -328,8 +332,10 @@ class Oscillation:
 
     def _look_for_chatter(self) -> None:
         """Fail if the process cannot have caused the last stays."""
-        self._answered.append(self._relay.last_stay >= _OF_RESPONSE * self._response_time)
-        known = self._levels.amplitude <= self._kick_amplitude
+        is_long = self._relay.last_stay >= _OF_RESPONSE * self._response_time
+        self._answered.append(is_long)
+        self._long_stays += is_long
+        known = self._levels.amplitude <= self._kick_amplitude and self._long_stays >= _SHOWN
         if known and len(self._answered) == _MANY_STAYS and sum(self._answered) <= 1:
             self._end_fast(
                 f"{_MANY_STAYS} times with at most one stay of {_OF_RESPONSE:g} times the "
