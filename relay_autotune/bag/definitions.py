@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from relay_autotune.bag.names import FLOAT64
+from relay_autotune.bag.ros2msg import PRIMITIVE
 from relay_autotune.errors import BagError
 
 SEPARATOR = "=" * 80
@@ -27,7 +28,6 @@ _BUILT_IN = {
     )
 }
 
-_PRIMITIVE = re.compile(r"bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64)")
 _FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*")
 
 
@@ -99,7 +99,7 @@ def _dependencies(type_name: str, text: str) -> list[str]:
     found: list[str] = []
     for line in text.splitlines():
         match = _FIELD.match(line.split("#", 1)[0])
-        if match is None or _PRIMITIVE.fullmatch(match.group(1)):
+        if match is None or PRIMITIVE.fullmatch(match.group(1)):
             continue
         name = match.group(1)
         if name == "Header":

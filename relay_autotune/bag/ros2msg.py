@@ -16,7 +16,7 @@ _HEADING = re.compile(r"^={80}\nMSG: ([\w/]+)[ \t]*\n", re.MULTILINE)
 _LINE = re.compile(
     r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[((?:<=)?\d+)?(\]))?[ \t]+([A-Za-z]\w*)(?:[ \t]*(=|#)|[ \t]|$)"
 )
-_PRIMITIVE = re.compile(r"bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64)")
+PRIMITIVE = re.compile(r"bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64)")
 
 # Names of their own, from the time of ROS 1.
 _SHORT = {
@@ -58,7 +58,7 @@ def _fields(text: str, owner: str) -> Fields:
         kind, count, array, name, behind = match.groups()
         if behind == "=":
             continue
-        scalar = (1, (kind, 0)) if _PRIMITIVE.fullmatch(kind) else (2, _full(kind, owner))
+        scalar = (1, (kind, 0)) if PRIMITIVE.fullmatch(kind) else (2, _full(kind, owner))
         if not array:
             fields.append((name, scalar))
         elif count and count[0] != "<":

@@ -12,16 +12,12 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from relay_autotune.nodes.quality import latched
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import StartTune
 
-_LATCHED = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+_MOST_KEPT = 100
 
 
 class Onlooker:
@@ -53,7 +49,7 @@ class Onlooker:
 
     def _listen(self, topic: str, kind: Any) -> list[Any]:
         messages: list[Any] = []
-        self._node.create_subscription(kind, topic, messages.append, _LATCHED)
+        self._node.create_subscription(kind, topic, messages.append, latched(_MOST_KEPT))
         return messages
 
     def wait(self, condition: Callable[[], Any]) -> Any:

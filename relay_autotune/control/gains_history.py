@@ -24,6 +24,8 @@ from relay_autotune.errors import TuningError
 # Number of earlier sets, and of failed sets, that are kept.
 _KEPT = 20
 _KNOWN = 1000
+# Why no change of the gains may begin now.
+AT_WORK = "gains are being put in force; wait for the end of that"
 # Numbers with a smaller relative difference are equal.
 _EQUAL = 1e-9
 
@@ -283,7 +285,7 @@ class GainsHistory:
         if self.work is Work.VERIFY:
             raise HistoryError("a verification is running; wait for its end")
         if self.work is Work.APPLY:
-            raise HistoryError("gains are being put in force; wait for the end of that")
+            raise HistoryError(AT_WORK)
 
     def _with(self, entry: Entry | None) -> GainsHistory:
         """Put new gains in force, and keep the present ones if they are a whole set."""

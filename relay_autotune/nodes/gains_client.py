@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -60,22 +60,15 @@ _NOT_YET = (
 class GainsClient(LoopClient):
     """Show, apply and verify gains with one controller_node.
 
-    :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
+    :param namespace: namespace of the loop; empty: the root.
     :param node: name of the controller_node.
-    :param ros: arguments for ROS.
     :param beside: another client of the same loop, whose own node this one uses; ``node`` is then
         the full name. None: it has a node of its own.
     :raises ParameterError: if the name is not valid.
     """
 
-    def __init__(
-        self,
-        namespace: str,
-        node: str,
-        ros: Sequence[str] = (),
-        beside: LoopClient | None = None,
-    ) -> None:
-        super().__init__("apply_gains", namespace, node, ros, beside)
+    def __init__(self, namespace: str, node: str, beside: LoopClient | None = None) -> None:
+        super().__init__("apply_gains", namespace, node, beside=beside)
         self._verify = ActionClient(self._node, Verify, f"{node}/verify")
 
     def close(self) -> None:

@@ -13,6 +13,7 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 
 from relay_autotune.control.gains_history import (
+    AT_WORK,
     GainSet,
     GainsHistory,
     HistoryError,
@@ -140,8 +141,7 @@ class GainsKeeper:
 
         :raises RelayAutotuneError: if the gains failed a verification, or a change is in progress.
         """
-        if self._busy:
-            raise HistoryError("gains are being put in force; wait for the end of that")
+        self._require_idle()
         self.history.edit(gains)
 
     def edited(self, gains: GainSet | None) -> None:
@@ -189,10 +189,13 @@ class GainsKeeper:
 
     # Helpers.
 
+    def _require_idle(self) -> None:
+        if self._busy:
+            raise HistoryError(AT_WORK)
+
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
-        if self._busy:
-            raise HistoryError("gains are being put in force; wait for the end of that")
+        self._require_idle()
         if self._goal is not None:
             raise HistoryError(f"gains of before are being brought back{self._open()}")
         self._busy = True

@@ -25,7 +25,11 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lag_models import MODEL_4, Solution, model_text
+from relay_autotune.identification.methods.lag_models import (
+    MODEL_4,
+    Solution,
+    require_equal_lags,
+)
 from relay_autotune.identification.methods.symmetric_method import (
     Found,
     SymmetricMethod,
@@ -33,7 +37,7 @@ from relay_autotune.identification.methods.symmetric_method import (
     from_record,
 )
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle, require_switching
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Record
 
@@ -62,11 +66,7 @@ def phase_of_lags(
     :raises IdentificationError: if the hysteresis is not below the amplitude, or the dead time
         alone has more phase.
     """
-    if not hysteresis < amplitude:
-        raise IdentificationError(
-            f"an amplitude of {amplitude:g} is not above the hysteresis of {hysteresis:g}, so "
-            "that the relay cannot have switched: check the numbers"
-        )
+    require_switching(amplitude, hysteresis)
     phase = math.pi - math.asin(hysteresis / amplitude) - 2.0 * math.pi * dead_time / period
     if not phase > _LEAST_PHASE:
         raise IdentificationError(
@@ -214,11 +214,7 @@ def solve(model: Structure, cycle: SymmetricCycle, gain: float) -> Solution:
     k_u, w_u = ultimate_estimate(period, cycle.amplitude, cycle.relay)
     phase = phase_of_lags(period, cycle.dead_time, cycle.amplitude, cycle.hysteresis)
     if math.isnan(gain):
-        if not model.equal_lags:
-            raise IdentificationError(
-                f"{model_text(model)} needs the gain of the process: its two time constants take "
-                "both the period and the amplitude; give the gain, or use the method li"
-            )
+        require_equal_lags(model)
         tau = time_constant_from_phase(order, period, phase)
         return Solution(math.hypot(1.0, w_u * tau) ** order / k_u, (tau,))
     if model.equal_lags:

@@ -26,7 +26,12 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5, Solution, model_text
+from relay_autotune.identification.methods.lag_models import (
+    MODEL_4,
+    MODEL_5,
+    Solution,
+    require_equal_lags,
+)
 from relay_autotune.identification.methods.square_wave import level, peak, slope_sign
 from relay_autotune.identification.methods.symmetric_method import (
     SymmetricMethod,
@@ -34,7 +39,7 @@ from relay_autotune.identification.methods.symmetric_method import (
     from_record,
 )
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle, require_switching
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
@@ -196,12 +201,8 @@ def gain_and_time_constant(
         (1 - epsilon/a) P/4 < D < P/2 is needed.
     """
     _require_dead_time(period, dead_time)
+    require_switching(amplitude, hysteresis)
     share = hysteresis / amplitude
-    if not share < 1.0:
-        raise IdentificationError(
-            f"an amplitude of {amplitude:g} is not above the hysteresis of {hysteresis:g}, so "
-            "that the relay cannot have switched: check the numbers"
-        )
     if order == 1:
         _require_fopdt(period, dead_time, 0.25 * (1.0 - share))
     part = 1.0 - 2.0 * dead_time / period
@@ -348,11 +349,7 @@ def solve(
     """
     period, dead_time, h = cycle.period, cycle.dead_time, cycle.relay
     if math.isnan(gain):
-        if not model.equal_lags:
-            raise IdentificationError(
-                f"{model_text(model)} needs the gain of the process: its two time constants take "
-                "both the period and the amplitude; give the gain, or use the method li"
-            )
+        require_equal_lags(model)
         k, tau = gain_and_time_constant(
             model.order, period, cycle.amplitude, dead_time, h, cycle.level, harmonics
         )

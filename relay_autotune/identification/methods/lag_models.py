@@ -35,6 +35,18 @@ def model_text(model: Structure) -> str:
     return f"model {number} ({text})" if number else text
 
 
+def require_equal_lags(model: Structure) -> None:
+    """Refuse a model whose gain is not known, but for equal lags.
+
+    :raises IdentificationError: if the model has two time constants.
+    """
+    if not model.equal_lags:
+        raise IdentificationError(
+            f"{model_text(model)} needs the gain of the process: its two time constants take "
+            "both the period and the amplitude; give the gain, or use the method li"
+        )
+
+
 def lags_of(model: Structure, constants: tuple[float, ...]) -> tuple[float, ...]:
     """Return the time constants of all lags [s].
 

@@ -36,7 +36,7 @@ from relay_autotune.identification.shown.steady_state import (
     static_gain,
     steady_state,
 )
-from relay_autotune.identification.shown.symmetric_cycle import require_unbiased
+from relay_autotune.identification.shown.symmetric_cycle import known_gain, require_unbiased
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
 
@@ -262,11 +262,7 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     test = relay_test("wang_unbiased", record)
     require_unbiased("wang_unbiased", test.whole.settings)
     sign = -1 if test.whole.settings.reverse_acting else 1
-    if sign * known.gain < 0.0:
-        raise IdentificationError(
-            f"a gain of {known.gain:g} is against the direction of the relay: the known gain has "
-            "the wrong sign"
-        )
+    known_gain(known, sign)
     facts = _Facts(sign, known.gain, math.nan)
     run = partial(_identified, "wang_unbiased", test, record, _from_unbiased)
     if not math.isnan(known.gain):

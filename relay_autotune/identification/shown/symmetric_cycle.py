@@ -76,6 +76,20 @@ def require_unbiased(method: str, settings: RelaySettings) -> None:
         )
 
 
+def require_switching(amplitude: float, hysteresis: float) -> None:
+    """Refuse a limit cycle within the hysteresis.
+
+    :param amplitude: a [y].
+    :param hysteresis: epsilon [y].
+    :raises IdentificationError: if the hysteresis is not below the amplitude.
+    """
+    if not hysteresis < amplitude:
+        raise IdentificationError(
+            f"an amplitude of {amplitude:g} is not above the hysteresis of {hysteresis:g}, so "
+            "that the relay cannot have switched: check the numbers"
+        )
+
+
 def known_gain(known: Known, sign: int) -> float:
     """Return the size of the known gain, NaN if it is not known.
 
