@@ -603,7 +603,10 @@ class JointTune:
         """
         loop = self._loop
         low, high = self._within
-        now = [self._position_of(joint) for joint in loop.joints]
+        now = [
+            at if math.isfinite(at := self._position_of(joint)) else state.feedback
+            for joint, state in zip(loop.joints, loop.states, strict=True)
+        ]
         place = loop.joints.index(loop.joint)
         # Towards the middle of its range.
         now[place] += math.copysign(_PROOF * (high - low), 0.5 * (low + high) - now[place])

@@ -106,6 +106,21 @@ def test_a_chain_is_opened_as_a_whole_and_closed_again_when_the_tune_is_cancelle
     assert "wheel_controller, base_controller off and forward_left on" in tune.log
 
 
+@pytest.mark.nightly
+def test_gains_of_a_chained_controller_are_set_without_a_step(rig: Rig) -> None:
+    robot = Robot(rig, "chain")
+    before = robot.gains()
+    done = robot.tune("--open")
+    assert done.wait(240.0) == 0, done.log
+    said = " ".join(done.log.split())
+    assert "references come from base_controller: move it by base_controller, and see" in said
+    after = robot.gains()
+    assert after != before
+    assert "p {:.6g}, i {:.6g}, d {:.6g}; before: p 0.3, i 0.6, d 0".format(*after) in said
+    whole = "base_controller wheel_controller"
+    assert robot.history() == [whole, "forward_left", whole]
+
+
 PLAN = (
     "wheel_controller off and forward_left on, in one strict request; back after it",
     "right_wheel keeps its last command, with no controller meanwhile",
