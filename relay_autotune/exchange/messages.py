@@ -337,7 +337,6 @@ def fill_gains(
     gains: Gains,
     *,
     experiment_id: str = "",
-    final: bool = True,
     stamp_ns: int = 0,
     judgement: Judgement | None = None,
 ) -> None:
@@ -345,12 +344,11 @@ def fill_gains(
 
     :param message: the message to fill.
     :param gains: the gains with their predicted performance.
-    :param experiment_id: the id of the experiment they come from.
-    :param final: True once the experiment has ended.
+    :param experiment_id: the id of the experiment they come from, which has ended.
     :param stamp_ns: time of the experiment's first sample since the epoch [ns].
     :param judgement: of the experiment; None: it was not judged.
     """
-    _fill_envelope(message, experiment_id, final, stamp_ns, judgement)
+    _fill_envelope(message, experiment_id, True, stamp_ns, judgement)
     to_message(message, gains)
 
 

@@ -130,12 +130,7 @@ class ControllerNode(ServedNode):
         self._repeater: Repeater | None = None
         if values["repeat_period"] > 0.0:
             self._repeater = Repeater(self, values["repeat_period"], reader, self._on_silence)
-        self._commands = self.create_publisher(
-            Float64,
-            "controller_command",
-            quality.COMMAND,
-            event_callbacks=quality.QUIET_PUBLISHER,
-        )
+        self._commands = quality.publisher(self, Float64, "controller_command", quality.COMMAND)
         sensor = Following(
             self,
             reader.kind,

@@ -13,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from relay_autotune.nodes import quality, signs_of_life
@@ -58,9 +57,7 @@ class Ends:
         relay_on_setpoint: bool = False,
         is_reported: bool = False,
     ) -> None:
-        overridable = QoSOverridingOptions.with_default_policies()
         # /diagnostics and the answer to a start report an incompatible QoS.
-        quiet, unheard = quality.QUIET_PUBLISHER, quality.QUIET_SUBSCRIPTION
         plain = CommandMessage()
         self.is_reported = is_reported
         self.commands = commands
@@ -69,44 +66,30 @@ class Ends:
         self._written = passed.written
         self.setpoint = None
         if relay_on_setpoint:
-            self.setpoint = node.create_publisher(
-                self._setpoints.kind, "setpoint", quality.COMMAND, event_callbacks=quiet
+            self.setpoint = quality.publisher(
+                node, self._setpoints.kind, "setpoint", quality.COMMAND
             )
-        self.command = node.create_publisher(
-            passed.kind,
-            "command",
-            quality.COMMAND,
-            event_callbacks=quiet,
-            qos_overriding_options=overridable,
+        self.command = quality.publisher(
+            node, passed.kind, "command", quality.COMMAND, overridable=True
         )
-        self.cycles = node.create_publisher(
-            RelayCycle, "relay_cycle", quality.latched(cycles_kept), event_callbacks=quiet
+        self.cycles = quality.publisher(
+            node, RelayCycle, "relay_cycle", quality.latched(cycles_kept)
         )
-        self.progress = node.create_publisher(
-            RelayExperiment, "relay_progress", quality.RESULT, event_callbacks=quiet
+        self.progress = quality.publisher(node, RelayExperiment, "relay_progress", quality.RESULT)
+        self.experiments = quality.publisher(
+            node, RelayExperiment, "relay_experiment", quality.RESULT
         )
-        self.experiments = node.create_publisher(
-            RelayExperiment, "relay_experiment", quality.RESULT, event_callbacks=quiet
-        )
-        self.diagnostics = node.create_publisher(
-            DiagnosticArray, "/diagnostics", 1, event_callbacks=quiet
-        )
+        self.diagnostics = quality.publisher(node, DiagnosticArray, "/diagnostics", 1)
         self.reader = reader
         self._sensor = Following(
             node, reader.kind, reader.type_name, "measurement", on_measurement, on_renewed
         )
         self.models, self.gains = (
-            node.create_subscription(
-                kind, name, partial(on_result, name), quality.RESULT, event_callbacks=unheard
-            )
+            quality.subscription(node, kind, name, partial(on_result, name), quality.RESULT)
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
         )
-        node.create_subscription(
-            DiagnosticStatus,
-            signs_of_life.TOPIC,
-            on_status,
-            quality.RESULT,
-            event_callbacks=unheard,
+        quality.subscription(
+            node, DiagnosticStatus, signs_of_life.TOPIC, on_status, quality.RESULT
         )
         self.sent: Callable[[float], None] | None = None
         """Called with each command before it is published."""

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from relay_autotune.nodes import quality
@@ -47,13 +46,8 @@ class Following:
         self._topic = topic
         self._callback = callback
         self._renewed = renewed
-        self.subscription: Subscription = node.create_subscription(
-            kind,
-            topic,
-            callback,
-            quality.MEASUREMENT,
-            event_callbacks=quality.QUIET_SUBSCRIPTION,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        self.subscription: Subscription = quality.subscription(
+            node, kind, topic, callback, quality.MEASUREMENT, overridable=True
         )
         """The subscription in force."""
         name = self.subscription.topic_name
@@ -82,7 +76,8 @@ class Following:
         if not offered:
             return
         old, profile = self.subscription, self.subscription.qos_profile
-        self.subscription = self._node.create_subscription(
+        self.subscription = quality.subscription(
+            self._node,
             self._kind,
             self._topic,
             self._callback,
@@ -92,7 +87,6 @@ class Following:
                 durability=profile.durability,
                 reliability=ReliabilityPolicy.BEST_EFFORT,
             ),
-            event_callbacks=quality.QUIET_SUBSCRIPTION,
         )
         if self._renewed is not None:
             self._renewed(self.subscription)

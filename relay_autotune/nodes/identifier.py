@@ -25,8 +25,10 @@ from relay_autotune.exchange.messages import (
     record_from_message,
     start_nanoseconds,
 )
-from relay_autotune.experiment.early_end import ULTIMATE_GAIN
+from relay_autotune.experiment.early_end import ULTIMATE_GAIN, FitProgress
 from relay_autotune.identification.methods import ONLY_JOINT
+from relay_autotune.identification.result import Identification
+from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, known_from, options_from
 from relay_autotune.nodes.lifetime import ServedNode, run
@@ -35,6 +37,7 @@ from relay_autotune.nodes.results import Refusals
 from relay_autotune.nodes.signs_of_life import SignsOfLife
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.running_fit import RunningFit, Task
+from relay_autotune.verdict import Judgement
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
 
@@ -164,30 +167,14 @@ class IdentifierNode(ServedNode):
                 else f"the record could not be analysed: {defect(found)}"
             )
             return response
-        name, stamp = record.experiment_id, _last_stamp(record)
         response.success, response.reason = found.model is not None, found.reason
         # Only the selected model was judged.
         for number, identification in enumerate(found.models):
-            message = TransferFunction()
-            fill_transfer_function(
-                message,
-                identification,
-                experiment_id=name,
-                final=True,
-                stamp_ns=stamp,
-                judgement=found.judgement if number == found.selected else None,
-            )
-            response.models.append(message)
+            judgement = found.judgement if number == found.selected else None
+            response.models.append(_model_message(record, identification, judgement))
         for number, gains in enumerate(found.gains):
-            message = PidGains()
-            fill_gains(
-                message,
-                gains,
-                experiment_id=name,
-                stamp_ns=stamp,
-                judgement=found.judgement if number == found.recommended else None,
-            )
-            response.gains.append(message)
+            judgement = found.judgement if number == found.recommended else None
+            response.gains.append(_gains_message(record, gains, judgement))
         response.selected = found.selected or 0
         response.recommended = found.recommended or 0
         return response
@@ -272,15 +259,7 @@ class IdentifierNode(ServedNode):
         if gains is None:
             self.get_logger().warning(f"experiment {name}: {analysis.reason}")
             return analysis.reason
-        message = PidGains()
-        fill_gains(
-            message,
-            gains,
-            experiment_id=name,
-            stamp_ns=_last_stamp(record),
-            judgement=analysis.judgement,
-        )
-        self._gains.publish(message)
+        self._gains.publish(_gains_message(record, gains, analysis.judgement))
         self.get_logger().info(
             f"experiment {name}: {gains.rule} (form {gains.form}) kc {gains.kc:.6g}, "
             f"ti {gains.ti:.6g} s, td {gains.td:.6g} s, {analysis.verdict.name.lower()}"
@@ -301,18 +280,9 @@ class IdentifierNode(ServedNode):
         return Task(values["method"], values["rule"], known_from(values), options_from(values))
 
     def _publish_model(self, analysis: Analysis, *, final: bool) -> None:
-        identification = analysis.model
+        identification, finding = analysis.model, None if final else analysis.finding
         assert identification is not None
-        message = TransferFunction()
-        fill_transfer_function(
-            message,
-            identification,
-            experiment_id=analysis.record.experiment_id,
-            final=final,
-            stamp_ns=_last_stamp(analysis.record),
-            finding=None if final else analysis.finding,
-            judgement=analysis.judgement,
-        )
+        message = _model_message(analysis.record, identification, analysis.judgement, finding)
         self._models.publish(message)
         if final:
             self.get_logger().info(
@@ -335,6 +305,34 @@ class IdentifierNode(ServedNode):
 def _sought(progress: Any) -> tuple[str, float]:
     """Return the quantity whose interval ends an experiment, and the wanted width."""
     return progress.sought or ULTIMATE_GAIN, progress.sought_width
+
+
+def _model_message(
+    record: Record,
+    found: Identification,
+    judgement: Judgement | None,
+    finding: FitProgress | None = None,
+) -> TransferFunction:
+    """Return the message of a model; with a finding, of an experiment that still runs."""
+    message = TransferFunction()
+    fill_transfer_function(
+        message,
+        found,
+        experiment_id=record.experiment_id,
+        final=finding is None,
+        stamp_ns=_last_stamp(record),
+        finding=finding,
+        judgement=judgement,
+    )
+    return message
+
+
+def _gains_message(record: Record, gains: Gains, judgement: Judgement | None) -> PidGains:
+    message, stamp = PidGains(), _last_stamp(record)
+    fill_gains(
+        message, gains, experiment_id=record.experiment_id, stamp_ns=stamp, judgement=judgement
+    )
+    return message
 
 
 def _last_stamp(record: Record) -> int:

@@ -71,29 +71,17 @@ class LoopEnds:
         self._topic = ends.command.topic_name
         if takeover:
             ends.sent = self._note_own
-            node.create_subscription(
-                ends.commands.kind,
-                "command",
-                self._on_command,
-                quality.COMMAND,
-                event_callbacks=quality.QUIET_SUBSCRIPTION,
+            quality.subscription(
+                node, ends.commands.kind, "command", self._on_command, quality.COMMAND
             )
         elif not ends.is_reported:
-            self._controller = node.create_subscription(
-                Float64,
-                "controller_command",
-                self._on_controller,
-                quality.MEASUREMENT,
-                event_callbacks=quality.QUIET_SUBSCRIPTION,
+            self._controller = quality.subscription(
+                node, Float64, "controller_command", self._on_controller, quality.MEASUREMENT
             )
             node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._value("command_others") == "other_commands":
-            node.create_subscription(
-                ends.commands.kind,
-                "other_commands",
-                self._on_others,
-                quality.MEASUREMENT,
-                event_callbacks=quality.QUIET_SUBSCRIPTION,
+            quality.subscription(
+                node, ends.commands.kind, "other_commands", self._on_others, quality.MEASUREMENT
             )
         self.repeat_period: float = self._value("command_period")
         """Time without a command after which the last is sent again [s]; 0: never."""
@@ -104,12 +92,8 @@ class LoopEnds:
                 self._send_again,
                 clock=STEADY,
             )
-        node.create_subscription(
-            Float64,
-            "command_feedback",
-            self._on_feedback,
-            quality.MEASUREMENT,
-            event_callbacks=quality.QUIET_SUBSCRIPTION,
+        quality.subscription(
+            node, Float64, "command_feedback", self._on_feedback, quality.MEASUREMENT
         )
 
     def _value(self, name: str) -> Any:

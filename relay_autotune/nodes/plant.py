@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64
@@ -233,34 +232,26 @@ class PlantNode(ServedNode):
         self._sensor = ImperfectSensor(values)
         self._position: Any = None
         # No event callbacks: each one costs time in every turn of the executor.
-        overridable = QoSOverridingOptions.with_default_policies()
-        unseen = quality.QUIET_PUBLISHER
         # A value that is published only on change must be latched for late subscribers.
         depth = quality.MEASUREMENT.depth
         offered = quality.latched(depth) if values["on_change"] else quality.MEASUREMENT
-        self._measurement = self.create_publisher(
-            Float64,
-            "measurement",
-            offered,
-            event_callbacks=unseen,
-            qos_overriding_options=overridable,
+        self._measurement = quality.publisher(
+            self, Float64, "measurement", offered, overridable=True
         )
         if values["feedback"]:
-            self._position = self.create_publisher(
-                Float64, "command_feedback", quality.COMMAND, event_callbacks=unseen
-            )
+            self._position = quality.publisher(self, Float64, "command_feedback", quality.COMMAND)
         received = {
             "realtime": self._on_command_in_time,
             "clock": self._on_command_with_clock,
             "lockstep": self._on_command_in_lockstep,
         }[values["mode"]]
-        self._command = self.create_subscription(
+        self._command = quality.subscription(
+            self,
             Float64,
             "command",
             received,
             QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE),
-            event_callbacks=quality.QUIET_SUBSCRIPTION,
-            qos_overriding_options=overridable,
+            overridable=True,
         )
         self._start = time.monotonic()
         self._timer: Timer

@@ -21,6 +21,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
     qos_check_compatible,
 )
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from relay_autotune.bag.metadata import Qos
 
@@ -49,9 +50,7 @@ def latched(depth: int) -> QoSProfile:
 
 RESULT = latched(1)
 
-# For ends whose events nobody looks at: each one costs time in every turn of the executor.
-QUIET_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
-QUIET_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
+_OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 
 # Topics of every node, and how many others are named where one is missing.
 _COMMON = {"/rosout", "/parameter_events"}
@@ -68,6 +67,54 @@ STATUS = QoSProfile(
     liveliness_lease_duration=Duration(seconds=_ALIVE_WITHIN),
 )
 """Profile of the status that shows whether a tune runs, and whether relay_node lives."""
+
+
+def publisher(
+    node: Node, kind: Any, topic: str, profile: QoSProfile, *, overridable: bool = False
+) -> Any:
+    """Return a publisher without event callbacks: each costs time in every turn of the executor.
+
+    :param node: that publishes.
+    :param kind: the message class.
+    :param topic: name of the topic.
+    :param profile: its quality of service.
+    :param overridable: True: parameters may change the quality of service.
+    """
+    return node.create_publisher(
+        kind,
+        topic,
+        profile,
+        event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+        qos_overriding_options=_OVERRIDABLE if overridable else None,
+    )
+
+
+def subscription(
+    node: Node,
+    kind: Any,
+    topic: str,
+    callback: Any,
+    profile: QoSProfile,
+    *,
+    overridable: bool = False,
+) -> Any:
+    """Return a subscription without event callbacks, as :func:`publisher` has none.
+
+    :param node: that subscribes.
+    :param kind: the message class.
+    :param topic: name of the topic.
+    :param callback: takes each message.
+    :param profile: its quality of service.
+    :param overridable: True: parameters may change the quality of service.
+    """
+    return node.create_subscription(
+        kind,
+        topic,
+        callback,
+        profile,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        qos_overriding_options=_OVERRIDABLE if overridable else None,
+    )
 
 
 def for_bag(profile: QoSProfile) -> Qos:

@@ -79,19 +79,8 @@ class RemoteLoop:
         self._offset = 0.0
         # Own set-points that have not come back yet over the topic, where others may publish, too.
         self._on_the_way: list[float] = []
-        self._publisher = node.create_publisher(
-            setpoints.kind,
-            "setpoint",
-            quality.COMMAND,
-            event_callbacks=quality.QUIET_PUBLISHER,
-        )
-        node.create_subscription(
-            setpoints.kind,
-            "setpoint",
-            self._on_setpoint,
-            quality.COMMAND,
-            event_callbacks=quality.QUIET_SUBSCRIPTION,
-        )
+        self._publisher = quality.publisher(node, setpoints.kind, "setpoint", quality.COMMAND)
+        quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)
 
     def hear_command(self, command: float) -> None:
         """Take a command of the other node [u]."""

@@ -29,12 +29,7 @@ class SignsOfLife:
 
     def __init__(self, node: Node) -> None:
         self._name = node.get_fully_qualified_name().lstrip("/")
-        self._publisher = node.create_publisher(
-            DiagnosticStatus,
-            TOPIC,
-            quality.RESULT,
-            event_callbacks=quality.QUIET_PUBLISHER,
-        )
+        self._publisher = quality.publisher(node, DiagnosticStatus, TOPIC, quality.RESULT)
         self._working: list[str] = []
         self._timer = node.create_timer(EVERY, self._tell, clock=STEADY, autostart=False)
 

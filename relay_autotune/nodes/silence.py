@@ -82,12 +82,8 @@ class Repeater:
             self._now = time.monotonic
         wait = _LEAST_WAIT if self._simulated else period
         self._timer = node.create_timer(wait, self._look, clock=clock)
-        self._ear: Subscription | None = node.create_subscription(
-            reader.kind,
-            "measurement",
-            self._on_kept,
-            quality.RESULT,
-            event_callbacks=quality.QUIET_SUBSCRIPTION,
+        self._ear: Subscription | None = quality.subscription(
+            node, reader.kind, "measurement", self._on_kept, quality.RESULT
         )
         self._topic = self._ear.topic_name
         self._direct = False

@@ -191,11 +191,8 @@ class Verifier:
         self._beyond = 0
         self._watch = node.create_timer(_LOOK_EVERY, self._look, clock=STEADY, autostart=False)
         self._narrator = Narrator(node, self._words, self._tell)
-        self._full = node.create_publisher(
-            Verification,
-            "verification",
-            quality.latched(_STEPS_KEPT),
-            event_callbacks=quality.QUIET_PUBLISHER,
+        self._full = quality.publisher(
+            node, Verification, "verification", quality.latched(_STEPS_KEPT)
         )
         self._server = ActionServer(
             node,
