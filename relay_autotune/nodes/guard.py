@@ -106,7 +106,6 @@ class Guard:
     """
 
     def __init__(self, node: Node, stop: Callable[[str], None]) -> None:
-        self._node = node
         self._stop = stop
         self._looks = 0
         self._checks: list[Callable[[], str]] = []

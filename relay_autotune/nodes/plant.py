@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64
 
@@ -254,7 +253,6 @@ class PlantNode(ServedNode):
             overridable=True,
         )
         self._start = time.monotonic()
-        self._timer: Timer
         if values["mode"] == "lockstep":
             self.favoured = self._command
             self._waiting = True
@@ -262,7 +260,7 @@ class PlantNode(ServedNode):
             self._pause = self._period / speed if speed > 0.0 else 0.0
             self._next = 0.0
             self._value = self._process.measure(0.0)
-            self._timer = self.create_timer(REPEAT_AFTER, self._repeat, clock=STEADY)
+            self.create_timer(REPEAT_AFTER, self._repeat, clock=STEADY)
         elif values["mode"] == "clock":
             # Whether an answer to the last sample is expected, and whether it has come.
             self._waiting = self._answered = False
@@ -270,11 +268,9 @@ class PlantNode(ServedNode):
             self._clock = self.create_publisher(
                 ClockMessage, "/clock", QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
             )
-            self._timer = self.create_timer(
-                self._period / values["speed"], self._tick, clock=STEADY
-            )
+            self.create_timer(self._period / values["speed"], self._tick, clock=STEADY)
         else:
-            self._timer = self.create_timer(self._period, self._sample, clock=STEADY)
+            self.create_timer(self._period, self._sample, clock=STEADY)
         self.get_logger().info(
             f"mode {values['mode']}, sample period {self._period:g} s, "
             f"measurement on {self._measurement.topic_name}, command on {self._command.topic_name}"
