@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from toolbox_pid import ToolboxPid
@@ -18,7 +20,15 @@ from relay_autotune.nodes.controller_manager import (
     forwarding,
     in_the_way,
 )
-from relay_autotune.nodes.joint_loop import LAWS, is_continuous, limits_in, put_gains
+from relay_autotune.nodes.joint_loop import (
+    LAWS,
+    TRAJECTORY_CONTROLLER,
+    DofState,
+    is_continuous,
+    joint_loop,
+    limits_in,
+    put_gains,
+)
 from relay_autotune.nodes.remote_gains import controller_of
 
 DESCRIPTION = """<?xml version="1.0"?>
@@ -175,3 +185,98 @@ def test_gains_are_set_all_or_none_and_those_before_come_back(answers, told) -> 
     with pytest.raises(LoopError, match=told):
         put_gains(client, "/arm", wanted, before)
     assert client.has == (wanted if "refuses: set" in told else before)
+
+
+class Arm:
+    """Stands for the client and the manager of an arm under a trajectory controller."""
+
+    name, namespace = "/controller_manager", ""
+
+    def __init__(self, **parameters):
+        self._values = {
+            "joints": ["arm_1", "arm_2"], "command_joints": [], "command_interfaces": ["effort"],
+            "use_sim_time": False, "gains.arm_2.p": 5.0, "gains.arm_2.i": 1.0,
+            "gains.arm_2.d": 0.5, "gains.arm_2.antiwindup_strategy": "none",
+            "gains.arm_2.ff_velocity_scale": 0.7,
+        } | parameters  # fmt: skip
+
+    def controllers(self):
+        return (controller("arm", TRAJECTORY_CONTROLLER, "arm_1/effort", "arm_2/effort"),)
+
+    def command_interfaces(self):
+        return tuple(f"arm_{k}/{kind}" for k in (1, 2) for kind in ("effort", "velocity"))
+
+    def node_of(self, name):
+        return f"/{name}"
+
+    def values(self, node, names):
+        if lacking := [name for name in names if name not in self._values]:
+            raise LoopError(f"{node} does not have the parameters {', '.join(lacking)}")
+        return {name: self._values[name] for name in names}
+
+    def call(self, kind, service, request):
+        names = [name for name in self._values if name.startswith(request.prefixes[0])]
+        return SimpleNamespace(result=SimpleNamespace(names=names))
+
+    def heard(self, kind, topic, seconds, least):
+        def points(**values):
+            return SimpleNamespace(**values)
+
+        message = SimpleNamespace(
+            joint_names=["arm_2", "arm_1"],
+            reference=points(positions=[0.2, 0.1]),
+            feedback=points(positions=[0.25, 0.15]),
+            output=points(effort=[3.0, 1.0], velocities=[]),
+        )
+        return [message] * least
+
+    def has_publisher(self, topic):
+        return topic == "/robot_description"
+
+    def latched(self, kind, topic, wanted, patience):
+        return SimpleNamespace(data=DESCRIPTION.replace("free", "arm_2"))
+
+
+@pytest.fixture(autouse=True)
+def _messages_need_not_be_installed(monkeypatch):
+    monkeypatch.setattr("relay_autotune.nodes.joint_loop.interface_class", lambda *_: object)
+
+
+def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:
+    arm = Arm()
+    loop = joint_loop(arm, arm, "arm", "arm_2")
+    assert loop.joints == loop.dofs == ("arm_1", "arm_2")
+    assert (loop.interface, loop.measured, loop.period) == ("arm_2/effort", "position", 0.01)
+    assert loop.parameters == ("gains.arm_2.p", "gains.arm_2.i", "gains.arm_2.d")
+    assert (loop.gains, loop.feedforward) == ((5.0, 1.0, 0.5), 0.7)
+    assert (loop.law, loop.has_rate, loop.wraps) == ("control_toolbox_none", True, True)
+    # By the names of the message, whatever their order.
+    assert loop.state == DofState(0.2, pytest.approx(0.25), pytest.approx(3.0))
+    assert loop.why_not_moved == "its references are trajectories"
+
+
+def test_a_joint_that_is_commanded_by_another_name_or_tells_no_output() -> None:
+    arm = Arm(command_joints=["pid/a", "pid/b"], command_interfaces=["velocity"])
+    arm.command_interfaces = lambda: ("pid/b/velocity",)
+    loop = joint_loop(arm, arm, "arm", "arm_2")
+    assert (loop.interface, loop.dof) == ("pid/b/velocity", "arm_2")
+    assert np.isnan(loop.state.output)
+    # Fewer are commanded than measured.
+    assert joint_loop(Arm(command_joints=["arm_2"]), Arm(), "arm", "arm_2").joints == ("arm_2",)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "told"),
+    [
+        ({"command_interfaces": ["position"]}, "/arm commands position, where its gains do nothi"),
+        ({"command_interfaces": ["position", "effort"]}, "commands position, effort, where"),
+        (
+            {"command_interfaces": ["velocity"], "open_loop_control": True},
+            "commands velocity in open loop, where",
+        ),
+        ({"joints": ["arm_1", "arm_3"]}, "arm has no joint arm_2: expected one of arm_1, arm_3"),
+    ],
+)
+def test_a_trajectory_controller_without_gains_in_use_is_refused(parameters, told) -> None:
+    with pytest.raises(LoopError, match=told):
+        joint_loop(Arm(**parameters), Arm(), "arm", "arm_2")
