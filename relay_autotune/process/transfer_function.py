@@ -156,6 +156,11 @@ class TransferFunction:
         return self.integrators <= 0 and all(t.real > 0.0 for t in self.time_constants)
 
     @property
+    def grows(self) -> bool:
+        """True if a pole lies in the open right half plane; that of an integrator does not."""
+        return any(t.real < 0.0 for t in self.time_constants)
+
+    @property
     def numerator(self) -> tuple[float, ...]:
         """Coefficients of powers of s, highest first, without the dead time."""
         coefficients = self.gain * _real_product(self.zeros)

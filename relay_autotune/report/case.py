@@ -272,9 +272,7 @@ def true_value(parameter: str, model: TransferFunction, truth: TransferFunction 
 
 def _kind(model: TransferFunction) -> tuple[int, int, int, bool]:
     """Return what two models of one structure have in common; a document's truth has no name."""
-    poles = model.time_constants
-    unstable = any(t.real < 0.0 for t in poles)
-    return len(poles), len(model.zeros), model.integrators, unstable
+    return len(model.time_constants), len(model.zeros), model.integrators, model.grows
 
 
 def ultimate_estimates(

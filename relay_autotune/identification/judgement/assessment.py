@@ -73,7 +73,7 @@ def fit_of_model(model: TransferFunction, record: Record, rest: float) -> FitRep
     :param record: any record.
     :param rest: measurement about which it moves [y].
     """
-    if any(t.real < 0.0 for t in model.time_constants):
+    if model.grows:
         return FitReport(noise_std=record.noise_std)
     y = record.measurement
     answer = response(model, record.time, record.input())

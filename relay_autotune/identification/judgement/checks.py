@@ -56,7 +56,7 @@ def unequal_gains(
     :return: a sentence, or None where the two agree, or cannot be told apart.
     """
     settings = record.settings
-    if settings is None or any(t.real < 0.0 for t in model.time_constants):
+    if settings is None or model.grows:
         return None
     u = record.input()
     if u.initial != settings.baseline:
@@ -95,7 +95,7 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
     :return: None where the command has two levels alone, samples are few, or the process grows
         by itself.
     """
-    if any(t.real < 0.0 for t in model.time_constants) or len(record) < _LEAST_SAMPLES:
+    if model.grows or len(record) < _LEAST_SAMPLES:
         return None
     u = record.input()
     levels = np.unique(np.append(u.values, u.initial))
@@ -176,7 +176,7 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
     :param model: the model fitted to all of them, of a stable or integrating process.
     :return: a sentence, or None where all agree, or no amplitude is a fifth larger than another.
     """
-    if any(t.real < 0.0 for t in model.time_constants):
+    if model.grows:
         return None
     swings, gains, deviations = [], [], []
     for record in records:

@@ -74,7 +74,7 @@ def visible_error(model: TransferFunction, record: Record) -> VisibleError | Non
     :param model: any; an unstable one cannot be simulated in open loop.
     :param record: the record.
     """
-    if any(t.real < 0.0 for t in model.time_constants) or len(record) < _LEAST_SAMPLES:
+    if model.grows or len(record) < _LEAST_SAMPLES:
         return None
     u, time, y = record.input(), record.time, record.measurement
     error = y - response(model, time, u)

@@ -45,7 +45,7 @@ def named(model: TransferFunction) -> str:
     if model.structure != "general":
         return model.structure
     kind = "an integrating" if model.integrators > 0 else "a stable"
-    if any(t.real < 0.0 for t in model.time_constants):
+    if model.grows:
         kind = "an unstable"
     return f"{kind} process of order {model.order} with {len(model.zeros)} zeros"
 
@@ -66,7 +66,7 @@ def fopdt_of(rule: str, task: DesignTask) -> Fopdt:
     delay = task.options.added_delay
     model, note = task.model, ""
     if not is_first_order(model):
-        if any(t.real < 0.0 for t in model.time_constants):
+        if model.grows:
             raise TuningError(
                 f"the rule {rule} is for a stable FOPDT process, found {named(model)}, which is "
                 "unstable: use robust or unstable"
@@ -92,7 +92,7 @@ def own_point(rule: str, task: DesignTask) -> UltimatePoint:
     :raises TuningError: if it has none, or is unstable.
     """
     model = process_of(task)
-    if any(t.real < 0.0 for t in model.time_constants):
+    if model.grows:
         raise TuningError(
             f"the rule {rule} is for processes that are stable or integrate, found "
             f"{named(model)}, which is unstable: use robust or unstable"

@@ -186,7 +186,7 @@ def derivative(
 
 def _process(rule: str, task: DesignTask) -> TransferFunction:
     model = process_of(task)
-    if model.integrators != 1 or any(t.real < 0.0 for t in model.time_constants):
+    if model.integrators != 1 or model.grows:
         raise TuningError(
             f"the rule {rule} is for a process with one integrator, found {named(task.model)}: "
             "use a rule for that structure, or robust"

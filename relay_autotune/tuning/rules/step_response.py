@@ -44,8 +44,7 @@ def step_response(model: TransferFunction) -> ReactionCurve:
     :param model: a process with one integrator at most.
     :raises TuningError: if it is unstable, integrates twice, or does not rise steadily.
     """
-    unstable = any(t.real < 0.0 for t in model.time_constants)
-    if unstable or model.integrators not in (0, 1):
+    if model.grows or model.integrators not in (0, 1):
         raise TuningError(
             "a step response is told by its gain, lag and delay where the process is stable or "
             f"integrates once; found {named(model)}: use robust"
