@@ -35,10 +35,23 @@ from relay_autotune.verdict import Verdict
 
 PROGRAM = "tune_loop"
 _CONTROLLER = "controller_node"
+_UNFINISHED = "the proof did not end"
 # How long to wait for the record of the tune [s].
 _RECORD_WITHIN = 5.0
 # A loop may take this many settling times to come to rest, and at least a time [s].
 _TIMES_SETTLING, _REST_WITHIN = 5.0, 60.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is known of the gains in the end.
+
+    :param passed: whether a proof has passed; None: none was wanted.
+    :param against: what speaks against the gains; empty: nothing.
+    """
+
+    passed: bool | None
+    against: str
 
 
 @dataclass(frozen=True)
@@ -81,8 +94,8 @@ class _Proof:
         return told + (f" The gains are doubtful: {doubt}." if doubt else "")
 
 
-def prove(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> bool | None:
-    """Offer to prove the gains of a tune; return whether they passed, None if it is not wanted.
+def prove(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> Outcome:
+    """Offer to prove the gains of a tune; return what is known of them.
 
     However it ends, the command is then that at which the process rested before the tune.
 
@@ -90,32 +103,46 @@ def prove(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> b
     :param nodes: the nodes of this command.
     :param options: of the command line, with all answers.
     """
-    asks = options.verify is None and not options.yes and sys.stdin.isatty()
-    if not (asks or options.verify):
-        return None
+    against = _UNFINISHED
+    try:
+        try:
+            outcome = _offered(client, nodes, options)
+        except RelayAutotuneError as error:
+            say(PROGRAM, f"the gains are not proven: {error}")
+            outcome = Outcome(False, f"not proven: {error}")
+        against = outcome.against
+        return outcome
+    finally:
+        _say_what_is_left(nodes, options.at, against)
+
+
+def _offered(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> Outcome:
     result = client.result
     doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
+    unproven = Outcome(None, doubt)
+    asks = options.verify is None and not options.yes and sys.stdin.isatty()
+    if not (asks or options.verify):
+        print()
+        return unproven
+    with Working("choosing the step"):
+        proof = _planned(client.record(_RECORD_WITHIN), result, options)
+    step = proof.step
+    if asks:
+        middle = proof.rest.setpoint
+        low, high = proof.within.low - middle, proof.within.high - middle
+        step = agreed_step(proof.question(options, doubt), proof.step, low, high)
+        if not step:
+            print()
+            return unproven
+    elif doubt:
+        raise TuningError(f"doubtful gains are not proven unasked: {doubt}")
     try:
-        with Working("choosing the step"):
-            proof = _planned(client.record(_RECORD_WITHIN), result, options)
-        if asks:
-            middle = proof.rest.setpoint
-            low, high = proof.within.low - middle, proof.within.high - middle
-            step = agreed_step(proof.question(options, doubt), proof.step, low, high)
-            if not step:
-                return None
-        else:
-            step = proof.step
-            if doubt:
-                raise TuningError(f"doubtful gains are not proven unasked: {doubt}")
-        try:
-            return _made(client, nodes, options, proof, step, bool(doubt))
-        finally:
-            nodes.end(_CONTROLLER)
-            say_what_is_left(nodes, proof.rest.baseline)
-    except RelayAutotuneError as error:
-        say(PROGRAM, f"the gains are not proven: {error}")
-        return False
+        found = _made(client, nodes, options, proof, step, bool(doubt))
+    finally:
+        nodes.end(_CONTROLLER)
+    if found.passed:
+        return Outcome(True, "")
+    return Outcome(False, f"the step that was to prove them failed: {found.reason}")
 
 
 def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof:
@@ -147,8 +174,11 @@ def _made(
     proof: _Proof,
     step: float,
     doubtful: bool,
-) -> bool:
-    """Put the gains in force in a controller_node in front of relay_node, and make the step."""
+) -> Any:
+    """Put the gains in force in a controller_node in front of relay_node, and make the step.
+
+    :return: the `Verify.Result`.
+    """
     name = own_node(options, _CONTROLLER)
     kind = client.values(client.name, ["measurement_type"])["measurement_type"]
     shown = StatusLine()
@@ -182,7 +212,7 @@ def _made(
         finally:
             shown.clear()
         print("\n" + "\n".join(found_lines(found, width())), flush=True)
-        return bool(found.passed)
+        return found
 
 
 @contextmanager
@@ -213,19 +243,25 @@ def _noted(nodes: OwnNodes) -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt if came[0] == signal.SIGINT else SystemExit(128 + came[0])
 
 
-def say_what_is_left(nodes: OwnNodes, command: float) -> None:
+def _say_what_is_left(nodes: OwnNodes, command: float, against: str) -> None:
     """Say in which state the plant is, when only relay_node holds its command.
 
     :param nodes: of this command.
-    :param command: that at which the process rested before the tune [u].
+    :param command: that of relay_node [u].
+    :param against: what speaks against the gains; empty: nothing.
     """
     try:
         nodes.require_alive()
     except RelayAutotuneError as error:
         say(PROGRAM, f"{error}: the last command stays in force; see to the plant")
         return
+    then = (
+        "do not start a controller with these gains, they are not proven"
+        if against
+        else "start your own controller with these gains"
+    )
     told = (
-        f"the command stands at {command:.6g} u, as before the tune, and nobody controls the loop "
-        f"any more: start your own controller with these gains"
+        f"the command stands at {command:.6g} u, the command that you gave, and nobody controls "
+        f"the loop any more: {then}"
     )
     print("\n".join(labelled("left", told, width())), flush=True)

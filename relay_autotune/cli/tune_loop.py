@@ -371,22 +371,21 @@ def _hand_over(
 
     :return: whether they passed, or are in force with a joint; None: that was not wanted.
     """
-    result, proven = client.result, None
+    result, proven, unless = client.result, None, ""
     doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
     if joint is None:
         # Imported here, because it loads slowly and must not delay a tune.
-        from relay_autotune.cli.proof import prove, say_what_is_left
+        from relay_autotune.cli.proof import prove
 
-        proven = prove(client, nodes, options)
-        if proven is None:
-            print()
-            say_what_is_left(nodes, options.at)
+        outcome = prove(client, nodes, options)
+        proven = outcome.passed
+        doubt, unless = outcome.against or doubt, " all the same" * bool(outcome.against)
     how, file = exports_of(result.gains.law)[0], options.export
     if not (file or joint or options.yes) and sys.stdin.isatty():
         others = ", ".join(name for name in EXPORTS if name != how)
         told = f"{_prefix()}replay {shlex.quote(result.bag)} --export NAME, with NAME {others}"
         print("\n" + "\n".join(labelled("other programs", told, width())))
-        file = asked_for_file(f"Write the gains for {how} of ros2_controllers")
+        file = asked_for_file(f"Write the gains for {how} of ros2_controllers{unless}")
     if file:
         target = joint.target if joint else Target()
         write(exported(gains_from_message(result.gains), how, target, doubt=doubt), file)
