@@ -6,8 +6,9 @@
 The gains are those of the last tune, and go to the loop's controller_node; with --file they are
 written instead, for ros2_controllers' pid_controller or the law that they are for. Nothing is
 changed before you answer yes, or give --yes. The height of the step is --step, else verify_step
-of the node, else half of the swing that the tune made and at least twenty times the noise, as far
-as the limits of the node allow. If the step fails, the node takes the gains before back by itself.
+of the node, else half of the swing that the tune made and at least twenty times the noise (forty
+if that is within a third of the way to a limit), as far as the limits of the node allow. If the
+step fails, the node takes the gains before back by itself.
 
 Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
 command line is wrong.
@@ -38,6 +39,8 @@ PROGRAM = "apply_gains"
 _FIGURES = (
     ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
 )  # fmt: skip
+# An uncertainty of the overshoot that is worth showing, as a fraction of the step.
+_SEEN = 0.03
 # How long to look for the controller_node [s].
 _FOUND_WITHIN = 5.0
 # What a loop does, by the fields of `Performance`.
@@ -275,13 +278,14 @@ def verdict_lines(
     return found_lines(result, columns) + labelled("gains in force", f"{now}{after}", columns)
 
 
-def found_lines(result: Any, columns: int) -> list[str]:
+def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[str]:
     """Return verdict, response to each step and process of a verification.
 
     :param result: the `Verify.Result`.
     :param columns: that a line may have.
+    :param noise_std: of the measurement [y]; NaN: not known.
     """
-    from relay_autotune.control.verification import NARROWLY
+    from relay_autotune.control.verification import NARROWLY, NOISE_ALLOWANCE
 
     told = "passed: the loop does what the model predicts" if result.passed else result.reason
     reasons = [step.reason.partition("; ")[0] for step in result.steps]
@@ -290,11 +294,14 @@ def found_lines(result: Any, columns: int) -> list[str]:
     lines = labelled("verdict", told, columns)
     for step in result.steps:
         setpoint = step.kind == step.SETPOINT
+        moved = NOISE_ALLOWANCE * noise_std / abs(step.step) if setpoint else 0.0
+        unsure = f" +- {100.0 * moved:.0f}" if moved > _SEEN else ""
         lines += labelled(
             "set-point step" if setpoint else "load step",
-            f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot {100.0 * step.overshoot:.0f} % "
+            f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot "
+            f"{100.0 * step.overshoot:.0f}{unsure} % "
             f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled after "
-            f"{duration(step.settling_time)} ({duration(step.settling_time_predicted)})",
+            f"{duration(step.settling_time)} (predicted {duration(step.settling_time_predicted)})",
             columns,
         )
     if result.steps:

@@ -59,7 +59,9 @@ def agreed_step(
         other = number_of(answer)
         if other and low <= other <= high:
             return other
-        told = f"from {low:g} to {high:g}" if math.isfinite(high - low) else "other than 0"
+        told = "other than 0"
+        if math.isfinite(high - low):
+            told = f"from {low:g} to {high:g} y, with whose overshoot it stays within the limits"
         print(f"expected y, n, or the height of the step, {told}", file=sys.stderr)
 
 

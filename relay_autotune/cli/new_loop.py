@@ -73,7 +73,8 @@ _OF_NEW_LOOP: dict[str, dict[str, Any]] = {
     "step": {
         "type": finite, "metavar": "Y",
         "help": "height of that step [y]; default: half of the swing of the tune, at least twenty "
-        "times the noise, as far as --within and --command-within allow",
+        "times the noise (forty if that is within a third of the way to a limit), as far as "
+        "--within and --command-within allow",
     },
     "yes": {
         "default": False, "action": "store_true",

@@ -22,7 +22,14 @@ from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, own_node, ros_arguments
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import StatusLine, Working
-from relay_autotune.control.verification import LEAST_OF_NOISE, Step, plan, proving_step
+from relay_autotune.control.verification import (
+    LEAST_OF_NOISE,
+    Step,
+    allowed_steps,
+    noise_of,
+    plan,
+    proving_step,
+)
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.sampled import Limits
@@ -59,6 +66,8 @@ class _Proof:
     """What is to be done.
 
     :param step: of the set-point [y].
+    :param allowed: lowest and highest step that the limits allow [y].
+    :param expected: predicted range of the command [u].
     :param takes: about how long all of it takes [s].
     :param settles: how long the loop takes to settle with the gains [s].
     :param rest: set-point and baseline of the tune.
@@ -68,6 +77,8 @@ class _Proof:
     """
 
     step: float
+    allowed: tuple[float, float]
+    expected: tuple[float, float]
     takes: float
     settles: float
     rest: RelaySettings
@@ -77,14 +88,14 @@ class _Proof:
 
     def question(self, options: argparse.Namespace, doubt: str) -> str:
         """Say what will move, how far and how long."""
-        rest = self.rest
+        rest, (least, most) = self.rest, self.expected
         told = (
             f"Prove the gains now? A controller_node of this command takes the loop at "
             f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
-            f"{options.measurement} by {self.step:+g} y and back, with {options.command} from "
-            f"{self.commands.low:g} to {self.commands.high:g} u, and ends at "
-            f"{rest.baseline:.6g} u after about {duration(self.takes)}. Ctrl-C ends it at once, "
-            f"likewise."
+            f"{options.measurement} by {self.step:+g} y and back, and ends at "
+            f"{rest.baseline:.6g} u after about {duration(self.takes)}. {options.command} is "
+            f"expected from {least:.3g} to {most:.3g} u, never beyond "
+            f"{self.commands.low:g} to {self.commands.high:g} u. Ctrl-C ends it at once, likewise."
         )
         if abs(self.step) < LEAST_OF_NOISE * self.noise_std:
             told += (
@@ -128,9 +139,7 @@ def _offered(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -
         proof = _planned(client.record(_RECORD_WITHIN), result, options)
     step = proof.step
     if asks:
-        middle = proof.rest.setpoint
-        low, high = proof.within.low - middle, proof.within.high - middle
-        step = agreed_step(proof.question(options, doubt), proof.step, low, high)
+        step = agreed_step(proof.question(options, doubt), proof.step, *proof.allowed)
         if not step:
             print()
             return unproven
@@ -153,18 +162,26 @@ def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof
     within = Limits(*options.within)
     # Without limits the process has seen the levels of the relay.
     commands = Limits(*(options.command_within or (rest.low, rest.high)))
-    step = options.step or proving_step(record, model, within, commands)
-    if not step or not within.low <= rest.setpoint + step <= within.high:
-        raise TuningError(
-            f"a step of {step:g} y leads from {rest.setpoint:.6g} out of {within.low:g} to "
-            f"{within.high:g} y: give another --step"
-        )
+    noise = noise_of(record, result.transfer_function.residual_rms)
+    step = options.step or proving_step(record, model, within, commands, noise)
+    if not step:
+        raise TuningError("the limits leave no room for a step: widen --within")
     wanted = plan(gains, model, Step(setpoint=step), record.mean_interval)
+    peak = wanted.peak / abs(step)
+    low, high = allowed_steps(record, model, within, commands, peak, noise)
+    if not options.step:
+        step = min(max(step, low), high)
+    if not step or not low <= step <= high:
+        raise TuningError(
+            f"a step of {step:g} y from {rest.setpoint:.6g} y, with the overshoot that the model "
+            f"predicts, leads beyond the limits: give a --step from {low:g} to {high:g}"
+        )
     settles = gains.settling_time
     if not math.isfinite(settles):
         settles = wanted.duration
+    least, most = (commands.clip(rest.baseline + end) for end in wanted.command)
     takes = wanted.duration + 2.0 * settles
-    return _Proof(step, takes, settles, rest, within, commands, record.noise_std)
+    return _Proof(step, (low, high), (least, most), takes, settles, rest, within, commands, noise)
 
 
 def _made(
@@ -211,7 +228,7 @@ def _made(
                 loop.let_settle(proof.settles, shown, "the loop goes back", leave)
         finally:
             shown.clear()
-        print("\n" + "\n".join(found_lines(found, width())), flush=True)
+        print("\n" + "\n".join(found_lines(found, width(), proof.noise_std)), flush=True)
         return found
 
 

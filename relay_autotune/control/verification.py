@@ -34,7 +34,7 @@ IAE_RATIO = 1.6
 GAIN_RANGE = (0.6, 1.7)
 MS_RATIO = 1.3
 # Allowance for noise in each comparison, in standard deviations.
-_NOISE = 3.0
+NOISE_ALLOWANCE = 3.0
 # A deviation this many times the largest predicted one ends the step at once.
 RUNAWAY = 3.0
 
@@ -42,9 +42,12 @@ RUNAWAY = 3.0
 _NARROW = 0.75
 NARROWLY = "narrowly: "
 
-# The step that proves most: multiples of the tune's swing and of the noise, whichever is larger.
+# The step that proves most: multiples of the tune's swing and of the noise, whichever is larger;
+# and the multiple at which the noise does not decide the overshoot, if it takes but a part of the
+# way to a limit.
 _OF_SWING = 0.5
 _OF_NOISE = 20.0
+_CLEAR_OF_NOISE, _OF_WIDE_ROOM = 40.0, 1.0 / 3.0
 # With a step of fewer standard deviations of the noise, the comparison is loose.
 LEAST_OF_NOISE = 10.0
 # Part of the way to a limit that a step may go, for its overshoot.
@@ -119,41 +122,112 @@ class Plan:
     :param step: the step.
     :param duration: how long to observe it [s].
     :param runaway: deviation from rest that ends the step at once [y].
+    :param peak: largest deviation of the measurement that the model predicts [y].
+    :param command: predicted range of the command with the step and back without it, relative to
+        rest [u].
     """
 
     step: Step
     duration: float
     runaway: float
+    peak: float
+    command: tuple[float, float]
+
+
+def noise_of(record: Record, residual_rms: float) -> float:
+    """Return the noise in which a step is seen: the larger of two, NaN if none is known [y].
+
+    :param record: of the tune, with the noise at rest.
+    :param residual_rms: what the model leaves of its measurement [y].
+    """
+    return float(np.fmax(record.noise_std, residual_rms))
 
 
 def proving_step(
-    record: Record, model: TransferFunction, measurement: Limits, command: Limits
+    record: Record,
+    model: TransferFunction,
+    measurement: Limits,
+    command: Limits,
+    noise_std: float,
 ) -> float:
     """Return the step of the set-point that proves gains best [y], in two digits; 0: not known.
 
     It is half of the swing that the tune made, at least twenty times the noise, upward if the
-    limits allow. The process then rests at most at 0.8 of the way to a limit.
+    limits allow; the process then rests at most at 0.8 of the way to a limit. It is forty times
+    the noise if that is a third of the way at most.
 
     :param record: of the tune, about whose set-point and mean command the loop rests.
     :param model: the process.
     :param measurement: its range [y].
     :param command: its range [u].
+    :param noise_std: of :func:`noise_of` [y].
     """
     if record.settings is None or len(record.cycle_start) < 2:
         return 0.0
     first, stop = record.cycle_start[-2:]
     swing = 0.5 * float(np.ptp(record.measurement[first : stop + 1]))
-    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
+    noise = 0.0 if math.isnan(noise_std) else noise_std
     wanted = max(_OF_SWING * swing, _OF_NOISE * noise)
-    setpoint = record.settings.setpoint
-    baseline = float(np.mean(record.command[first:stop]))
-    up, down = measurement.high - setpoint, setpoint - measurement.low
-    if model.integrators == 0:
-        ends = sorted(model.gain * (end - baseline) for end in (command.low, command.high))
-        up, down = min(up, ends[1]), min(down, -ends[0])
+    down, up = _ways(record, model, measurement, command)
     sign = 1.0 if _OF_ROOM * up >= wanted or up >= down else -1.0
-    room = max(_OF_ROOM * (up if sign > 0.0 else down), 0.0)
-    return sign * float(f"{min(wanted, room):.2g}")
+    room = max(up if sign > 0.0 else down, 0.0)
+    height = max(min(wanted, _OF_ROOM * room), min(_CLEAR_OF_NOISE * noise, _OF_WIDE_ROOM * room))
+    return sign * float(f"{height:.2g}")
+
+
+def allowed_steps(
+    record: Record,
+    model: TransferFunction,
+    measurement: Limits,
+    command: Limits,
+    peak: float,
+    noise_std: float,
+) -> tuple[float, float]:
+    """Return the lowest and highest step of the set-point that limits allow [y], in two digits.
+
+    The predicted peak, with an allowance for the noise, stays within the limits of the
+    measurement, and the command can hold the new set-point.
+
+    :param record: of the tune, with its settings.
+    :param model: the process.
+    :param measurement: its range [y].
+    :param command: its range [u].
+    :param peak: largest predicted deviation of the measurement, for a step of 1.
+    :param noise_std: of :func:`noise_of` [y].
+    """
+    assert record.settings is not None
+    setpoint = record.settings.setpoint
+    spared = NOISE_ALLOWANCE * (0.0 if math.isnan(noise_std) else noise_std)
+    down, up = _ways(record, model, measurement, command)
+    return (
+        0.0 - _rounded_down(min(down, (setpoint - measurement.low - spared) / peak)),
+        _rounded_down(min(up, (measurement.high - setpoint - spared) / peak)),
+    )
+
+
+def _ways(
+    record: Record, model: TransferFunction, measurement: Limits, command: Limits
+) -> tuple[float, float]:
+    """Return how far below and above its set-point a loop can rest [y]."""
+    assert record.settings is not None
+    setpoint = record.settings.setpoint
+    down, up = setpoint - measurement.low, measurement.high - setpoint
+    if model.integrators == 0:
+        baseline = record.settings.baseline
+        if len(record.cycle_start) > 1:
+            first, stop = record.cycle_start[-2:]
+            baseline = float(np.mean(record.command[first:stop]))
+        ends = sorted(model.gain * (end - baseline) for end in (command.low, command.high))
+        down, up = min(down, -ends[0]), min(up, ends[1])
+    return down, up
+
+
+def _rounded_down(value: float) -> float:
+    """Return a number in two digits that is at most a value, 0 for a negative one."""
+    if not 0.0 < value < math.inf:
+        return max(value, 0.0)
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.floor(value / unit * (1.0 + 1e-9)) * unit:.2g}")
 
 
 def plan(
@@ -179,7 +253,10 @@ def plan(
         response = describe(time, run.measurement, step)
         if response.settling_time < 0.6 * horizon:
             duration = max(WATCHED * response.settling_time, LEAST_SAMPLES * period)
-            return Plan(step, duration, RUNAWAY * response.largest + 10.0 * noise_std)
+            runaway = RUNAWAY * response.largest + 10.0 * noise_std
+            low, high, last = run.command.min(), run.command.max(), run.command[-1]
+            command = float(min(low, last - high, 0.0)), float(max(high, last - low, 0.0))
+            return Plan(step, duration, runaway, response.largest, command)
         horizon *= 2.0
     raise TuningError("the predicted response does not settle in any reasonable time")
 
@@ -195,7 +272,7 @@ def describe(
     :param noise_std: standard deviation of the noise, which does not count as error [y].
     """
     error = step.setpoint - deviation
-    allowed = _NOISE * noise_std
+    allowed = NOISE_ALLOWANCE * noise_std
     if step.setpoint != 0.0:
         way = deviation / step.setpoint
         overshoot = max(0.0, float(way.max()) - 1.0 - allowed / abs(step.setpoint))

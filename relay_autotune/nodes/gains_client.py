@@ -16,7 +16,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
-from relay_autotune.control.verification import proving_step
+from relay_autotune.control.verification import noise_of, proving_step
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -231,7 +231,10 @@ class GainsClient(LoopClient):
         if found is None:
             return None
         within, commands = Limits(low, high), Limits(least, most)
-        return proving_step(record_from_message(found), self.model(), within, commands) or None
+        record = record_from_message(found)
+        told = self._result(ModelMessage, "transfer_function")
+        model, noise = transfer_function_from_message(told), noise_of(record, told.residual_rms)
+        return proving_step(record, model, within, commands, noise) or None
 
     def prove(
         self,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from relay_autotune.cli import apply_gains
-from relay_autotune.cli.apply_gains import beside, verdict_lines
+from relay_autotune.cli.apply_gains import beside, found_lines, verdict_lines
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
@@ -56,10 +56,17 @@ def test_a_verdict_has_five_lines() -> None:
     lines = verdict_lines(result, Controller(0.6, 0.75, 0.2, 0.02), 99)
     assert len(lines) == 5
     assert "passed: the loop does what the model predicts" in lines[0]
-    assert "+0.5 y: overshoot 10 % (predicted 11 %), settled after 3.8 s (4.2 s)" in lines[1]
+    told = "overshoot 10 % (predicted 11 %), settled after 3.8 s (predicted 4.2 s)"
+    assert f"+0.5 y: {told}" in lines[1]
     assert "+0.3 u" in lines[2]
     assert "gain 0.96 and 1.01 times the model's, Ms 1.37 and 1.37 (predicted 1.39)" in lines[3]
     assert "kc 0.6000, ti 0.7500, td 0.2000; apply_gains --revert" in lines[4]
+
+
+def test_an_overshoot_that_the_noise_could_move_has_its_uncertainty() -> None:
+    result = Verify.Result(passed=True, reason="long", steps=[step()])
+    assert "overshoot 10 +- 6 % (predicted 11 %)" in "\n".join(found_lines(result, 99, 0.01))
+    assert "overshoot 10 % (predicted 11 %)" in "\n".join(found_lines(result, 99, 0.004))
 
 
 def test_what_passed_close_to_a_limit_is_called_narrow() -> None:

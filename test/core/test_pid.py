@@ -17,8 +17,10 @@ from relay_autotune.control.controller import GainBounds, PidController, run_loo
 from relay_autotune.control.verification import (
     NARROWLY,
     Step,
+    allowed_steps,
     compare,
     describe,
+    noise_of,
     plan,
     proving_step,
 )
@@ -189,9 +191,11 @@ def test_what_is_close_to_its_limit_passes_narrowly_with_the_limit(factor, step)
     ("noise_std", "high", "command_high", "height"),
     [
         (0.001, 50.0, 5.0, 0.15),  # half of the swing of 0.3
-        (0.02, 50.0, 5.0, 0.4),  # twenty times the noise
-        (0.02, 40.25, 5.0, -0.4),  # more room below
-        (0.02, 50.0, 2.1, -0.4),  # the command would not reach it above
+        (0.02, 50.0, 5.0, 0.8),  # forty times the noise
+        (0.02, 41.5, 5.0, 0.5),  # a third of the way to the limit
+        (0.02, 40.6, 5.0, 0.4),  # twenty times the noise
+        (0.02, 40.25, 5.0, -0.8),  # more room below
+        (0.02, 50.0, 2.1, -0.8),  # the command would not reach it above
     ],
 )
 def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
@@ -204,10 +208,31 @@ def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
     )  # fmt: skip
     model = TransferFunction.fopdt(1.65, 1.0, 0.5)
     room = Limits(30.0, high)
-    assert proving_step(record, model, room, Limits(0.0, command_high)) == height
+    noise = noise_of(replace(record, noise_std=0.5 * noise_std), noise_std)
+    assert noise == noise_of(record, math.nan) == noise_std
+    commands = Limits(0.0, command_high)
+    assert proving_step(record, model, room, commands, noise) == height
     # Without room on either side it goes as far as it can.
-    tight = proving_step(record, model, Limits(39.9, 40.1), Limits(0.0, command_high))
+    tight = proving_step(record, model, Limits(39.9, 40.1), commands, noise)
     assert abs(tight) == pytest.approx(0.08)
+
+
+def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
+    record = Record(
+        time=np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
+        settings=RelaySettings(40.0, 2.0, 1.0), noise_std=0.02, cycle_start=(0, 200, 400),
+    )  # fmt: skip
+    model, gains = TransferFunction.fopdt(1.65, 1.0, 0.5), Controller(kc=0.9, ti=0.9)
+    wanted = plan(gains, model, Step(setpoint=1.0), 0.01)
+    assert 1.1 < wanted.peak < 2.0
+    limits = Limits(30.0, 42.0)
+    low, high = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted.peak, 0.02)
+    # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
+    assert low == -3.3
+    at_peak = [plan(gains, model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)]
+    assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
+    narrow = allowed_steps(record, model, Limits(39.9, 40.05), Limits(0.0, 5.0), 1.2, 0.02)
+    assert narrow == (-0.033, 0.0)
 
 
 def test_a_longer_dead_time_fails():
