@@ -169,6 +169,7 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         options.command_within = asked(what, "--command-within", "", "0 5", pair_of)
     values: dict[str, Any] = {
         "baseline": options.at,
+        "baseline_is_present": True,
         # Also where a controller_node in front of it has ended.
         "safe_command": options.at,
         "measurement_min": options.within[0],

@@ -64,6 +64,8 @@ from relay_autotune.cli.tune_view import (
 )
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError
 from relay_autotune.exchange.messages import gains_from_message
+from relay_autotune.experiment.experiment import OUTSIDE_LIMITS
+from relay_autotune.experiment.settling import NO_REST_AT
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -341,8 +343,8 @@ def _conclude(
     if not options.json:
         paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
         new = nodes is not None and joint is None
-        safe = f" {options.at:.6g} u" if new else ""
-        print("\n".join(result_lines(result, cancelled, paint, width(), safe)), flush=True)
+        left = _left(result, options.at) if new else ""
+        print("\n".join(result_lines(result, cancelled, paint, width(), left)), flush=True)
     flags, report = _afterwards(client, options)
     # Gains of nodes that end with this command cannot be asked for later.
     controllers = client.controllers() if nodes is None else []
@@ -362,6 +364,19 @@ def _conclude(
     written = report or not options.report
     found = client.succeeded and complete and written and proven is not False
     return deserved(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
+
+
+def _left(result: Any, command: float) -> str:
+    """Return at which command a loop of two topics is left, and whether that is the right one."""
+    if result.reason.startswith(NO_REST_AT):
+        return (
+            f"the command stands at {command:.6g} u, which is not the one at which the process "
+            f"rested: set the right one now"
+        )
+    left = f"the plant is left at the safe command {command:.6g} u"
+    if OUTSIDE_LIMITS in result.reason:
+        left += ": look whether the process rests there, else set the right one now"
+    return left
 
 
 def _hand_over(
@@ -410,6 +425,14 @@ def _repeated(
         return [("prove the gains", f"{again} --verify")] if new and proven is None else []
     if result.outcome == result.COMPLETED:
         return []
+    if new and result.reason.startswith(NO_REST_AT):
+        # The same command again would drive the process away again.
+        return [("once it rests", "start again with --at and the command at which it rests")]
+    if new and OUTSIDE_LIMITS in result.reason:
+        told = (
+            "start again with the --at at which it rests, a smaller --amplitude, or wider --within"
+        )
+        return [("once it rests", told)]
     steps = [("run it again", again)]
     if result.reason.startswith("no measurement on "):
         topic = result.reason.split()[3]

@@ -159,7 +159,7 @@ def check_lines(checks: Sequence[str], width: int) -> list[str]:
 
 
 def result_lines(
-    result: Any, cancelled: bool, paint: Paint, columns: int = WIDEST, safe: str = ""
+    result: Any, cancelled: bool, paint: Paint, columns: int = WIDEST, left: str = ""
 ) -> list[str]:
     """Return the result of a tune.
 
@@ -167,7 +167,7 @@ def result_lines(
     :param cancelled: True if this command cancelled it.
     :param paint: the look of text.
     :param columns: that a line may have.
-    :param safe: the safe command, where it is known.
+    :param left: at which command the plant is left, where that is known.
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
@@ -176,8 +176,8 @@ def result_lines(
     first, *rest = labelled("tune", told, columns)
     lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]
     if outcome != "completed":
-        left = f"the plant is left at the safe command{safe}; no gains are given"
-        lines += labelled("", left, columns)
+        left = left or "the plant is left at the safe command"
+        lines += labelled("", f"{left}; no gains are given", columns)
     if result.transfer_function.experiment_id:
         lines += ["", *model_lines(result.transfer_function, paint, columns)]
     if result.transfer_function.experiment_id:

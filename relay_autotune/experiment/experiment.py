@@ -34,6 +34,8 @@ _OUTCOMES = {
 }
 
 
+OUTSIDE_LIMITS = "is outside its limits"
+"""What the reason contains if the measurement left its limits."""
 _BASELINE = SafePolicy()
 
 
@@ -67,6 +69,9 @@ class RelayExperiment:
     :param from_small: True: a given amplitude begins at a quarter for a cycle, and the experiment
         fails if the measurement swings no wider at the full amplitude: the actuator is then at
         its ends. It has no effect where the experiment finds the amplitude.
+    :param before: the last measurements before it [y], where the baseline is the present command:
+        it fails if the measurement leaves that rest while settling. None: the baseline may lead
+        the process to another operating point.
     :raises ParameterError: if a parameter is out of range, or some contradict each other.
     """
 
@@ -79,6 +84,7 @@ class RelayExperiment:
         policy: SafePolicy = _BASELINE,
         until_converged: bool = True,
         from_small: bool = False,
+        before: Sequence[float] | None = None,
     ) -> None:
         parameters.validate(baseline)
         self.parameters = parameters
@@ -98,6 +104,7 @@ class RelayExperiment:
             self._samples,
             until_converged=until_converged,
             from_small=from_small,
+            before=before,
         )
         self._origin = math.nan
 
@@ -395,7 +402,7 @@ class RelayExperiment:
         if not p.measurement_min <= y <= p.measurement_max:
             procedure.end(
                 State.ABORTED,
-                f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
+                f"the measurement {y:g} at {t:g} s {OUTSIDE_LIMITS}, {p.measurement_min:g} "
                 f"to {p.measurement_max:g}",
             )
         elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:

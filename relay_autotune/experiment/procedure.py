@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from relay_autotune.experiment.faults.process import count_cycles
@@ -41,7 +41,14 @@ from relay_autotune.experiment.oscillation import Oscillation
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Relay
 from relay_autotune.experiment.samples import Samples
-from relay_autotune.experiment.settling import NOT_SETTLED, RestState, Settling, rest_state
+from relay_autotune.experiment.settling import (
+    NOISE_SAMPLES,
+    NOT_SETTLED,
+    RestState,
+    RestWatch,
+    Settling,
+    rest_state,
+)
 from relay_autotune.record.record import Cycle, Outcome, RelaySettings
 
 SETTLING_LIMIT = 600.0
@@ -93,6 +100,8 @@ class Procedure:
     :param samples: the samples so far; each is appended before it is answered.
     :param until_converged: False: agreement of the cycles does not end it.
     :param from_small: True: a given amplitude begins at a quarter of that.
+    :param before: measurements before the first command, where the baseline is the present command
+        [y]; None: the baseline may lead the process elsewhere.
     """
 
     def __init__(
@@ -103,6 +112,7 @@ class Procedure:
         *,
         until_converged: bool = True,
         from_small: bool = False,
+        before: Sequence[float] | None = None,
     ) -> None:
         self.state = State.SETTLING
         """The present state."""
@@ -126,6 +136,7 @@ class Procedure:
         self._baseline = baseline
         self._levels = Levels(parameters, baseline, from_small=from_small)
         self._until_converged = until_converged
+        self._watch = None if before is None else RestWatch(before)
         self._sign = parameters.process_gain_sign
         self._oscillation: Oscillation | None = None
         self._notes: list[str] = []
@@ -217,8 +228,15 @@ class Procedure:
 
     # SETTLING
 
-    def _settle(self, settling: Settling, t: float, _: float) -> float:
+    def _settle(self, settling: Settling, t: float, y: float) -> float:
         n = len(self._samples)
+        if self._watch is not None and (told := self._watch.leaves(y)):
+            return self.end(
+                State.FAILED,
+                f"{told}, {t:.3g} s after {self._baseline:g} u was commanded: {self._baseline:g} "
+                f"u is not the present command, or a load came; set the command at which the "
+                f"process rests",
+            )
         settle_time = self._parameters.settle_time
         if settle_time > 0.0:
             if t >= settle_time and n >= _LEAST_SETTLING_SAMPLES:
@@ -227,7 +245,8 @@ class Procedure:
         if not settling.is_due(n):
             return self._baseline
         rest, settled = settling.look(*self._samples.columns(0, n)[:2])
-        if settled:
+        # A constant measurement may not have responded to a wrong baseline yet.
+        if settled and (self._watch is None or n >= NOISE_SAMPLES):
             return self._settled(rest)
         if t > SETTLING_LIMIT and n >= SETTLING_SAMPLES and not self._parameters.max_duration:
             return self.end(

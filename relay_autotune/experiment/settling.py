@@ -1,11 +1,12 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Judge whether the measurement is at rest, and how noisy it is."""
+"""Judge whether the measurement is at rest, how noisy it is, and whether it leaves its rest."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,20 @@ _FURTHEST = 20.0
 
 # Rounding of a constant: differences below this many units in the last place are no signal.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+
+# A measurement has left its rest when this many samples in a row are further away on one side than
+# so many standard deviations, and so many times its resolution.
+_OUTSIDE_SAMPLES = 5
+_OUTSIDE_STD = 5.0
+_OUTSIDE_STEPS = 5.0
+# The earlier half of the samples before is not rest if without it this many times less is left
+# about the line.
+_MOVED = 3.0
+# Relative to the measurement: what rounding in a sensor or a simulation may add up to.
+_UNSEEN = 1e-9
+
+NO_REST_AT = "the measurement rested at"
+"""How the reason begins if the process does not rest at the baseline."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +120,91 @@ def rest_state(time: FloatArray, measurement: FloatArray, window: int) -> RestSt
     if noise <= rounding:
         noise = 0.0
     return RestState(mean, rise / span, noise, span, window, range_seen)
+
+
+class RestWatch:
+    """See that the measurement leaves the rest that it showed before the first command.
+
+    A straight line through the n samples before gives the mean, the slope and the noise. At a
+    distance of x samples from their middle, the process at rest may be as far from the mean as::
+
+        |slope| x + 5 noise sqrt(1 + 1/m + 12 x^2 / (m n^2)) + resolution (5 + x/n)
+
+    which is a drift that was there before, either way, the error of the line, and the steps of the
+    sensor. m is the number of independent samples among the n: fewer than n if the noise is slow.
+    The resolution is the smallest step between two samples that differ. Time is counted in
+    samples, since those before may have come by another clock. Where the earlier half of the n
+    scatters far more, only the later half counts.
+
+    :param before: measurements before the first command, the newest last [y]; where they are fewer
+        than 20, the first samples of the experiment complete them.
+    """
+
+    def __init__(self, before: Sequence[float]) -> None:
+        self._before = [float(value) for value in before]
+        self._last = self._before[-1] if self._before else math.nan
+        steps = (abs(b - a) for a, b in zip(self._before, self._before[1:], strict=False))
+        self._resolution = min((step for step in steps if step > 0.0), default=math.inf)
+        self._rest = NOT_SETTLED
+        self._independent = math.nan
+        self._since = 0
+        self._outside = 0
+
+    def leaves(self, measurement: float) -> str:
+        """Take a sample [y]; return where the measurement rested and is, empty while it rests."""
+        step = abs(measurement - self._last)
+        if step > 0.0:
+            self._resolution = min(self._resolution, step)
+        self._last = measurement
+        if len(self._before) < CONSTANT_SAMPLES:
+            self._before.append(measurement)
+            return ""
+        if not self._rest.samples:
+            self._learn()
+        self._since += 1
+        rest, n = self._rest, self._rest.samples
+        away = measurement - rest.mean
+        if abs(away) <= self._allowed(0.5 * (n - 1) + self._since):
+            self._outside = 0
+            return ""
+        side = 1 if away > 0.0 else -1
+        self._outside = side * (max(side * self._outside, 0) + 1)
+        if abs(self._outside) < _OUTSIDE_SAMPLES:
+            return ""
+        return f"{NO_REST_AT} {rest.mean:.6g} y and is at {measurement:.6g} y"
+
+    def _learn(self) -> None:
+        y = np.array(self._before)
+        self._rest = rest = _about_line(y)
+        while len(y) >= 2 * CONSTANT_SAMPLES:
+            later = _about_line(y[len(y) // 2 :])
+            if _MOVED * later.noise_std >= rest.noise_std:
+                break
+            # It came to rest only lately.
+            y, self._rest, rest = y[len(y) // 2 :], later, later
+        n = len(y)
+        at = np.arange(n, dtype=np.float64)
+        residual = y - rest.mean - rest.slope * (at - 0.5 * (n - 1))
+        squares = float(np.sum(residual * residual))
+        alike = float(np.sum(residual[1:] * residual[:-1])) / squares if squares > 0.0 else 0.0
+        alike = max(alike, 0.0)
+        self._independent = max(n * (1.0 - alike) / (1.0 + alike), 2.0)
+
+    def _allowed(self, x: float) -> float:
+        rest, m = self._rest, self._independent
+        n = rest.samples
+        line = math.sqrt(1.0 + 1.0 / m + 12.0 * x * x / (m * n * n))
+        steps = self._resolution if math.isfinite(self._resolution) else 0.0
+        steps = max(steps, _UNSEEN * abs(rest.mean))
+        return (
+            abs(rest.slope) * x
+            + _OUTSIDE_STD * rest.noise_std * line
+            + steps * (_OUTSIDE_STEPS + x / n)
+        )
+
+
+def _about_line(measurement: FloatArray) -> RestState:
+    return rest_state(np.arange(len(measurement), dtype=np.float64), measurement, len(measurement))
 
 
 class Settling:

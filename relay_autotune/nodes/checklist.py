@@ -144,10 +144,20 @@ class LastSamples:
         """The newest measurement [y]; None: none has come."""
         return self._kept[-1][1] if self._kept else None
 
+    def _recent(self) -> list[tuple[float, float]]:
+        since = time.monotonic() - _WINDOW
+        return [sample for sample in self._kept if sample[0] >= since]
+
+    def before(self) -> list[float]:
+        """Return the measurements of the last seconds, or the last 20 of a slow sensor [y]."""
+        recent = self._recent()
+        if len(recent) < CONSTANT_SAMPLES:
+            recent = list(self._kept)[-CONSTANT_SAMPLES:]
+        return [value for _, value in recent]
+
     def rest(self) -> RestState | None:
         """Return how the measurement rested over the last seconds; None: there are too few."""
-        since = time.monotonic() - _WINDOW
-        recent = np.array([sample for sample in self._kept if sample[0] >= since])
+        recent = np.array(self._recent())
         if len(recent) < CONSTANT_SAMPLES:
             return None
         return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))

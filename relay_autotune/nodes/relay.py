@@ -354,6 +354,7 @@ class RelayNode(ServedNode):
         kind: Callable[..., Session] = Session
         if self._on_setpoint:
             kind = partial(SetpointSession, actual=lambda: self._loop.handover.last)
+        present = self.get_parameter("baseline_is_present").value
         session = kind(
             RelayExperiment(
                 parameters,
@@ -362,6 +363,7 @@ class RelayNode(ServedNode):
                 policy=policy,
                 until_converged=converged,
                 from_small=ready.from_small,
+                before=self._last_samples.before() if present else None,
             ),
             identity,
             sample_period=parameters.sample_period,

@@ -29,6 +29,13 @@ NODE_PARAMETERS = (
         "else the command held now, else initial_command.",
     ),
     Quantity(
+        "baseline_is_present",
+        False,
+        "",
+        "True: the process rests at the baseline already; a tune fails as soon as the measurement "
+        "leaves, while settling, the rest that it showed before.",
+    ),
+    Quantity(
         "safe_command",
         math.nan,
         "u",

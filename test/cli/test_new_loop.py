@@ -70,6 +70,7 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
         "measurement": "/tank/level",
         "command": "/tank/valve",
         "baseline": "2.0",
+        "baseline_is_present": "True",
         "safe_command": "2.0",
         "measurement_min": "30.0",
         "measurement_max": "50.0",

@@ -197,6 +197,26 @@ def test_if_the_command_is_killed_its_nodes_end_with_the_safe_command(rig: Rig) 
     rig.until(lambda: heard[-1].data == 2.0, "the safe command")
 
 
+def test_a_command_at_which_the_process_does_not_rest_ends_the_tune(rig: Rig) -> None:
+    heard = rig.listen("/tank/valve", Float64, RELIABLE)
+    slow = {"time_constants": [5.0], "sample_period": 0.02, "gain": 5.0}
+    rig.start("plant_node", *TOPICS, **FAST | slow)
+    # The plant rests at 40 with 2, and would go to 55, beyond the limit of 50, with 5.
+    process = begun(rig, "--at", "5", "--command-within", "0", "9", "--record-only")
+    rig.until(lambda: process.poll() is not None, "its end", timeout=90.0)
+    output = process.stdout.read()
+    assert process.returncode == 1
+    told = " ".join(output.split())
+    number = r"(\d+\.?\d*) y"
+    found = re.search(f"failed: the measurement rested at {number} and is at {number}", told)
+    assert float(found[1]) == pytest.approx(40.0, abs=0.05)
+    assert float(found[2]) < 43.0
+    assert "5 u is not the present command" in told
+    assert "the command stands at 5 u, which is not the one at which the process rested" in told
+    assert "run it again" not in told
+    assert {message.data for message in heard} == {5.0}
+
+
 def test_a_topic_that_is_not_there_is_told_with_the_nearest(rig: Rig) -> None:
     rig.start("plant_node", *TOPICS, **FAST)
     words = [word.replace("/tank/level", "/tank/levle") for word in WORDS]

@@ -1,0 +1,98 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A baseline that is said to be the present command, and is not."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, State
+from relay_autotune.experiment.settling import RestWatch
+from relay_autotune.process.structures import structure_named
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.record import Outcome
+
+# A pressure that falls when the valve opens further: 6 bar at 1200, 9.2 bar at 1040.
+PROCESS = structure_named("fopdt").of_fields(gain=-0.02, time_constants=[8.0], dead_time=2.0)
+PERIOD = 0.1
+PARAMETERS = ExperimentParameters(amplitude=40.0, measurement_min=3.0, measurement_max=9.0)
+
+
+def tuned(
+    baseline: float, seed: int, samples: int, *, watched: bool = True, **acting: float
+) -> tuple[RelayExperiment, float]:
+    """Return an experiment up to its first kick or its end, and the largest measurement."""
+    plant = VirtualProcess(
+        PROCESS, rest_measurement=6.0, rest_command=1200.0,
+        disturbances=Disturbances(**acting), seed=seed,
+    )  # fmt: skip
+    before = [plant.measure(k * PERIOD) for k in range(samples)]
+    tune = RelayExperiment(PARAMETERS, baseline, before=before if watched else None)
+    highest = -np.inf
+    for k in range(samples, samples + 6000):
+        y = plant.measure(k * PERIOD)
+        highest = max(highest, y)
+        plant.command(tune.step(k * PERIOD, y), k * PERIOD)
+        if tune.state is not State.SETTLING:
+            break
+    return tune, highest
+
+
+@pytest.mark.parametrize("acting", [{}, {"quantisation": 0.02}, {"noise_std": 0.02}])
+@pytest.mark.parametrize("baseline", [1040.0, 1100.0])
+def test_a_wrong_baseline_ends_the_tune_before_the_process_is_far_away(acting, baseline):
+    for seed in range(20 if acting else 1):
+        tune, highest = tuned(baseline, seed, 50, **acting)
+        assert tune.outcome is Outcome.FAILED
+        assert re.match(r"the measurement rested at (6|6\.0\d+|5\.9\d+) y", tune.reason)
+        assert f"{baseline:g} u is not the present command" in tune.reason
+        # It would go to 9.2 or 8.
+        assert highest < 6.6
+        assert tune.settings is None
+
+
+def test_without_the_word_that_it_is_the_present_command_a_baseline_may_lead_elsewhere():
+    tune, _ = tuned(1100.0, 1, 50, watched=False, noise_std=0.02)
+    assert tune.state is State.KICK
+    assert tune.rest_measurement == pytest.approx(8.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    "acting",
+    [
+        {},
+        {"quantisation": 0.02},
+        {"noise_std": 0.02},
+        {"noise_std": 0.02, "drift": 0.003},
+        {"noise_std": 0.02, "quantisation": 0.05, "drift": -0.003},
+        {"quantisation": 0.02, "drift": 0.002},
+    ],
+)
+@pytest.mark.parametrize("samples", [0, 25, 100])
+def test_the_right_baseline_starts_the_relay_in_spite_of_noise_and_drift(acting, samples):
+    for seed in range(20 if "noise_std" in acting else 1):
+        tune, _ = tuned(1200.0, seed, samples, **acting)
+        assert tune.outcome is not Outcome.FAILED, (seed, tune.reason)
+
+
+def test_slow_noise_and_the_rest_of_a_transient_are_no_departure():
+    for seed in range(40):
+        draw = np.random.default_rng(seed)
+        noise, slow = draw.standard_normal(1000), np.zeros(1000)
+        for k in range(1, 1000):
+            slow[k] = 0.9 * slow[k - 1] + 0.1 * noise[k]
+        for y in (6.0 + slow, 6.0 + np.exp(-np.arange(1000) / 100.0) + 0.01 * noise):
+            watch = RestWatch(y[:100])
+            assert not any(watch.leaves(value) for value in y[100:]), seed
+
+
+def test_what_moved_before_the_rest_does_not_hide_that_it_leaves():
+    noise = 0.02 * np.random.default_rng(3).standard_normal(300)
+    moved = np.where(np.arange(200) < 80, 100.0, 6.0) + noise[:200]
+    watch = RestWatch(moved)
+    told = [watch.leaves(6.0 + 0.01 * k + noise[200 + k]) for k in range(60)]
+    assert told[-1].startswith("the measurement rested at 6")
