@@ -8,22 +8,43 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any
 
 from relay_autotune.cli.layout import broken, width
 from relay_autotune.errors import LoopError
 
-# What people type between two numbers; a single point belongs to a number.
-_BETWEEN = re.compile(r"\.{2,}|[,;]|\b(?:to|and)\b")
+# A number as people type it: with a unit, which counts for nothing. A thousand is no unit.
+_UNIT = r"\s*(?!to\b|and\b|k\b|e\b)[^\W\d_][\w/^*]*|\s*[%°][a-z]*"
+_NUMBER = rf"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(?:{_UNIT})?"
+# What stands between two; a single point belongs to a number, and so does a dash before which
+# there is a blank alone.
+_BETWEEN = r"\s*(?:\.{2,}|[,;]|\bto\b|\band\b|-(?=\s)|(?<!\s)-|\s)\s*"
+_ONE = re.compile(_NUMBER, re.IGNORECASE)
+_TWO = re.compile(_NUMBER + _BETWEEN + _NUMBER, re.IGNORECASE)
+# Dashes of other keyboards.
+_DASHES = str.maketrans(dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}", "-"))
 
 
-def asked_for_file(what: str) -> str:
+def asked_for_file(what: str, others: Collection[str], how: str) -> str:
     """Ask for a file to write; return its name, empty for none.
 
     :param what: what would be written.
+    :param others: what can be written by another command only.
+    :param how: that command, with NAME in place of one of these.
     """
-    return _input(f"{what}, to which file? [none]: ") if sys.stdin.isatty() else ""
+    while True:
+        answer = _input(f"{what}, to which file? [none]: ")
+        if answer.lower() in ("n", "no", "none"):
+            return ""
+        if answer.lower() in ("y", "yes"):
+            told = "expected the name of a file, such as gains.yaml, or Enter for none"
+        elif answer.lower() in others:
+            told = f"{answer} is no file; after this command type {how.replace('NAME', answer)}"
+        else:
+            return str(Path(answer).expanduser()) if answer else ""
+        print(told, file=sys.stderr)
 
 
 def agrees(question: str, *, yes: bool) -> bool:
@@ -95,16 +116,14 @@ def _input(shown: str) -> str:
 
 
 def number_of(text: str) -> float | None:
-    """Return a finite number, or None if a text is something else."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
+    """Return a finite number, such as 2.5 or 35 %, or None if a text is something else."""
+    found = _ONE.fullmatch(text.strip().translate(_DASHES))
+    value = float(found[1]) if found else math.nan
     return value if math.isfinite(value) else None
 
 
 def pair_of(text: str) -> list[float] | None:
-    """Return two finite numbers in order, such as 0 5, 0 to 5, 0,5 or 0..5; None: other text."""
-    numbers = [number_of(word) for word in _BETWEEN.sub(" ", text.strip(" ()[]")).split()]
-    found = [number for number in numbers if number is not None]
-    return found if len(found) == len(numbers) == 2 and found[0] < found[1] else None
+    """Return two finite numbers in order, such as 0 5, 0-5, 0 to 5 % or 0..5; None: other text."""
+    found = _TWO.fullmatch(text.strip(" ()[]").translate(_DASHES))
+    low, high = map(float, found.groups()) if found else (math.nan, math.nan)
+    return [low, high] if -math.inf < low < high < math.inf else None

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -157,6 +158,8 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         except ParameterError as error:
             raise SelectionError(_as_flags(str(error))) from None
         client.require_uncontrolled()
+    if sys.stdin.isatty() and None in (options.at, options.within, options.command_within):
+        print("u is the command's unit, y the measurement's", file=sys.stderr)
     told = "" if math.isnan(present) else f"{present:.6g}"
     if options.at is None:
         what = "present command, at which the process rests [u]"

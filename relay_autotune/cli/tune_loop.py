@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.arguments import (
@@ -95,6 +96,8 @@ def main(args: Sequence[str] | None = None) -> int:
             "--web has check, result, report and exports on its page: leave out --dry-run, "
             "--json, --report and --export"
         )
+    if options.export in EXPORTS:
+        parser.error(f"--export takes a file to write, such as gains.yaml, not {options.export}")
     if options.verify and (options.web or options.json or options.record_only or options.dry_run):
         parser.error(
             "--verify proves the gains of a tune that prints them: leave out --web, --json, "
@@ -397,14 +400,18 @@ def _hand_over(
         doubt, unless = outcome.against or doubt, " all the same" * bool(outcome.against)
     how, file = exports_of(result.gains.law)[0], options.export
     if not (file or joint or options.yes) and sys.stdin.isatty():
-        others = ", ".join(name for name in EXPORTS if name != how)
-        told = f"{_prefix()}replay {shlex.quote(result.bag)} --export NAME, with NAME {others}"
-        print("\n" + "\n".join(labelled("other programs", told, width())))
-        file = asked_for_file(f"Write the gains for {how} of ros2_controllers{unless}")
+        replay = f"{_prefix()}replay {shlex.quote(result.bag)}"
+        other = f"{replay} --export NAME --sample-period S > FILE"
+        names = ", ".join(name for name in EXPORTS if name != how)
+        told = f"{other}, with NAME {names}, and S the time between two runs of the controller [s]"
+        # What replay writes does not say that these gains have failed.
+        print("\n" + "\n".join([] if unless else labelled("other programs", told, width())))
+        what = f"Write the gains for {how} of ros2_controllers{unless}"
+        file = asked_for_file(what, EXPORTS, other)
     if file:
         target = joint.target if joint else Target()
         write(exported(gains_from_message(result.gains), how, target, doubt=doubt), file)
-        print(f"  {'gains for':<16} {how}: {file}")
+        print(f"  {'gains for':<16} {how}: {Path(file).resolve()}")
     if joint is not None and joint.applies:
         print()
         return joint.apply(nodes, doubt) == DONE

@@ -8,15 +8,21 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 
-from relay_autotune.cli import tune_loop
-from relay_autotune.cli.asking import agrees, pair_of
+from relay_autotune.cli import proof, tune_loop
+from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
+from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
+from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains
 
@@ -103,11 +109,41 @@ def test_the_command_that_is_heard_needs_only_enter(typed: list[str]) -> None:
     [
         ("0 5", [0, 5]), ("0 to 5", [0, 5]), ("0,5", [0, 5]), ("0..5", [0, 5]),
         (" [0; 5.5] ", [0, 5.5]), ("-1.5 .. -.5", [-1.5, -0.5]), ("1e-3 and 2", [0.001, 2]),
+        ("0-100", [0, 100]), ("800 - 1600 rpm", [800, 1600]), ("0 to 100 %", [0, 100]),
+        ("0%-100%", [0, 100]), ("-5 5", [-5, 5]), ("-5 to 5", [-5, 5]), ("-5--1", [-5, -1]),
+        ("-5 -1", [-5, -1]), ("20 °C, 30 °C", [20, 30]), ("0.5\N{EN DASH}2 m/s", [0.5, 2]),
+        ("10 -20", None), ("0 to", None), ("0-", None), ("1k 2k", None), ("1e-3", None),
         ("5 0", None), ("0 5 6", None), ("0 five", None), ("", None),
     ],
 )  # fmt: skip
 def test_two_numbers_are_taken_as_people_type_them(text: str, pair: list[float] | None) -> None:
     assert pair_of(text) == pair
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1200 rpm", 1200.0), ("35 %", 35.0), ("-1e-3", -0.001), ("\N{MINUS SIGN}2.5degC", -2.5),
+        (".5", 0.5), ("5.", 5.0), ("two", None), ("5 6", None), ("5 to 6", None), ("nan", None),
+        ("2k", None), ("", None), ("1e999", None),
+    ],
+)  # fmt: skip
+def test_a_number_is_taken_with_its_unit(text: str, value: float | None) -> None:
+    assert number_of(text) == value
+
+
+def test_neither_yes_nor_a_law_becomes_the_name_of_a_file(
+    typed: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed += ["y", "iec_61131_3_pid", "~/gains.yaml", "no"]
+    how = "replay bag --export NAME --sample-period S > FILE"
+    assert asked_for_file("Write", EXPORTS, how) == str(Path("~/gains.yaml").expanduser())
+    yes, law = capsys.readouterr().err.splitlines()
+    assert "such as gains.yaml" in yes
+    assert law.endswith("type replay bag --export iec_61131_3_pid --sample-period S > FILE")
+    assert asked_for_file("Write", EXPORTS, how) == ""
+    with pytest.raises(SystemExit):
+        tune_loop.main(["--export", "iec_61131_3_pid"])
 
 
 def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> None:
@@ -183,3 +219,36 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     found = ended("", gains=PidGains(experiment_id="x"))
     assert tune_loop._repeated(found, given, None) == [("prove the gains", f"{again} --verify")]
     assert tune_loop._repeated(found, given, True) == []
+
+
+def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
+    typed: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    message = PidGains()
+    task = DesignTask(model=TransferFunction.fopdt(1.65, 1.0, 0.5), options=DesignOptions())
+    fill_gains(message, design(task, "imc"), experiment_id="x")
+    client = SimpleNamespace(
+        result=Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
+    )
+    given = tune_loop._parser().parse_args([])
+    nodes: Any = SimpleNamespace(require_alive=lambda: None)
+    given.at = 35.0
+    monkeypatch.chdir(tmp_path)
+
+    def shown(passed: bool | None, against: str, file: str) -> str:
+        typed.append(file)
+        monkeypatch.setattr(proof, "_offered", lambda *_: proof.Outcome(passed, against))
+        assert tune_loop._hand_over(client, given, nodes, None) is passed
+        return " ".join(capsys.readouterr().out.split())
+
+    failed = shown(False, "the step that was to prove them failed: it runs away", "failed.yaml")
+    assert "the command stands at 35 u" in failed and "start your own" not in failed
+    assert f"pid_controller: {tmp_path / 'failed.yaml'}" in failed
+    first = (tmp_path / "failed.yaml").read_text().splitlines()[0]
+    assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
+    assert "they are not proven" in shown(None, "few cycles", "")
+    assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
+    assert "DOUBTFUL" not in (tmp_path / "passed.yaml").read_text()
