@@ -82,7 +82,7 @@ def agreed_step(
             return other
         told = "other than 0"
         if math.isfinite(high - low):
-            told = f"from {low:g} to {high:g} y, with whose overshoot it stays within the limits"
+            told = f"from {low:g} to {high:g} y: the limits allow no more, with the overshoot"
         print(f"expected y, n, or the height of the step, {told}", file=sys.stderr)
 
 
