@@ -173,7 +173,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     """
     settles = 0.0
     with Working("asking for the gains"):
-        present, model = client.in_force(), client.model()
+        present, model, noise = client.in_force(), client.model(), client.noise()
         gains, doubt = client.waiting()
     if not options.verify_only:
         settles = gains.settling_time if math.isfinite(gains.settling_time) else 0.0
@@ -202,7 +202,8 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
         result = client.prove(step, options.load, settles, options.wait, shown)
     finally:
         shown.clear()
-    print("\n".join(verdict_lines(result, client.in_force(), width(), stays=options.stays)))
+    lines = verdict_lines(result, client.in_force(), width(), stays=options.stays, noise_std=noise)
+    print("\n".join(lines))
     return DONE if result.passed else NOTHING_FOUND
 
 
@@ -262,7 +263,12 @@ def _performance(present: Controller | None, model: TransferFunction) -> Perform
 
 
 def verdict_lines(
-    result: Any, present: Controller | None, columns: int, *, stays: bool = True
+    result: Any,
+    present: Controller | None,
+    columns: int,
+    *,
+    stays: bool = True,
+    noise_std: float = math.nan,
 ) -> list[str]:
     """Return what a verification has found, in a line for each step and three more.
 
@@ -270,12 +276,15 @@ def verdict_lines(
     :param present: the gains in force after it.
     :param columns: that a line may have.
     :param stays: True if the controller_node goes on running.
+    :param noise_std: of the measurement [y]; NaN: not known.
     """
     now = "none, the command is held"
     if present is not None:
         now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
     after = f"; {PROGRAM} --revert takes those before" if result.passed and stays else ""
-    return found_lines(result, columns) + labelled("gains in force", f"{now}{after}", columns)
+    return found_lines(result, columns, noise_std) + labelled(
+        "gains in force", f"{now}{after}", columns
+    )
 
 
 def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[str]:

@@ -162,7 +162,7 @@ def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof
     within = Limits(*options.within)
     # Without limits the process has seen the levels of the relay.
     commands = Limits(*(options.command_within or (rest.low, rest.high)))
-    noise = noise_of(record, result.transfer_function.residual_rms)
+    noise = noise_of(record.noise_std, result.transfer_function.residual_rms)
     step = options.step or proving_step(record, model, within, commands, noise)
     if not step:
         raise TuningError("the limits leave no room for a step: widen --within")

@@ -134,13 +134,13 @@ class Plan:
     command: tuple[float, float]
 
 
-def noise_of(record: Record, residual_rms: float) -> float:
+def noise_of(noise_std: float, residual_rms: float) -> float:
     """Return the noise in which a step is seen: the larger of two, NaN if none is known [y].
 
-    :param record: of the tune, with the noise at rest.
-    :param residual_rms: what the model leaves of its measurement [y].
+    :param noise_std: of the measurement at rest [y].
+    :param residual_rms: what the model leaves of the measurement [y].
     """
-    return float(np.fmax(record.noise_std, residual_rms))
+    return float(np.fmax(noise_std, residual_rms))
 
 
 def proving_step(

@@ -130,6 +130,16 @@ class GainsClient(LoopClient):
         """
         return transfer_function_from_message(self._result(ModelMessage, "transfer_function"))
 
+    def noise(self) -> float:
+        """Return the noise in which a step is seen, that at rest or the residual [y].
+
+        NaN: neither is known.
+
+        :raises LoopError: if there is no model.
+        """
+        message = self._result(ModelMessage, "transfer_function")
+        return noise_of(message.noise_std, message.residual_rms)
+
     def _result(self, kind: Any, topic: str) -> Any:
         found = self.latched(kind, topic, lambda m: m.final, _RESULT_WITHIN)
         if found is None:
@@ -232,9 +242,7 @@ class GainsClient(LoopClient):
             return None
         within, commands = Limits(low, high), Limits(least, most)
         record = record_from_message(found)
-        told = self._result(ModelMessage, "transfer_function")
-        model, noise = transfer_function_from_message(told), noise_of(record, told.residual_rms)
-        return proving_step(record, model, within, commands, noise) or None
+        return proving_step(record, self.model(), within, commands, self.noise()) or None
 
     def prove(
         self,

@@ -208,8 +208,8 @@ def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
     )  # fmt: skip
     model = TransferFunction.fopdt(1.65, 1.0, 0.5)
     room = Limits(30.0, high)
-    noise = noise_of(replace(record, noise_std=0.5 * noise_std), noise_std)
-    assert noise == noise_of(record, math.nan) == noise_std
+    noise = noise_of(0.5 * noise_std, noise_std)
+    assert noise == noise_of(noise_std, math.nan) == noise_std
     commands = Limits(0.0, command_high)
     assert proving_step(record, model, room, commands, noise) == height
     # Without room on either side it goes as far as it can.
