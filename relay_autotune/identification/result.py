@@ -21,6 +21,9 @@ from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import told, told_fields
 from relay_autotune.text import process_text
 
+NOT_AT_REST = "the process was not at rest at the baseline when the test began"
+"""How the warning begins that a model carries whose record did not begin at rest."""
+
 
 @dataclass(frozen=True)
 class Validation:

@@ -20,8 +20,9 @@ from relay_autotune.identification.judgement.checks import followed_share, lost_
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.identification.judgement.refits import other_sign
+from relay_autotune.identification.result import NOT_AT_REST
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.text import process_text
+from relay_autotune.text import digits, process_text
 from relay_autotune.verdict import Check, Measured
 
 _FREQUENCIES = 300
@@ -83,10 +84,14 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
     validation = evidence.found.validation
     if validation is None or not evidence.settled:
         return None
-    return Measured(
-        math.inf if validation.reason else abs(validation.period),
-        f" ({validation.reason})" if validation.reason else "",
-    )
+    away = abs(validation.period)
+    said = f"oscillates with another period, {digits(away, 3)} off"
+    if validation.reason:
+        away, said = math.inf, f"does not oscillate as recorded: {validation.reason}"
+    first = ""
+    if any(warning.startswith(NOT_AT_REST) for warning in evidence.found.warnings):
+        first = f"{NOT_AT_REST}, so that the baseline may be wrong, and "
+    return Measured(away, f"{first}the same relay on the model {said}")
 
 
 def _ultimate(evidence: Evidence) -> Measured | None:
@@ -295,7 +300,7 @@ MODEL_CHECKS = (
         "recorded one",
         unit="",
         doubtful=0.1,
-        sentence="the same relay on the model oscillates with another period, {value} off{detail}",
+        sentence="{detail}",
         remedy="look at the limit cycle in the report; a valve that sticks or a saturated "
         "actuator is not in the model",
         measure=_limit_cycle,

@@ -17,6 +17,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
 from relay_autotune.identification.result import (
+    NOT_AT_REST,
     FitReport,
     Identification,
     Rival,
@@ -308,8 +309,8 @@ def _warnings(
         )
     if (fit.problem.relaxation or fit.problem.past) and any(map(_from_baseline, records)):
         found.append(
-            "the process was not at rest at the baseline when the test began, and its way there "
-            "was fitted with the model; check the baseline, or wait longer before a test"
+            f"{NOT_AT_REST}, and its way there was fitted with the model; check the baseline, or "
+            f"wait longer before a test"
         )
     if fit.loss != "squares":
         found.append(f"the {fit.loss} loss was minimised, as asked for, in place of the squares")
