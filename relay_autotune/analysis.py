@@ -512,7 +512,8 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
         options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
     if options.sample_period == 0.0 and len(record) > 1:
         period = record.interval if before is None else before.interval
-        options = replace(options, sample_period=period)
+        # Further digits are jitter of the stamps, and no program is set to them.
+        options = replace(options, sample_period=float(f"{period:.3g}"))
     return options
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.laws import LAWS, Law
+from relay_autotune.loop.laws import LAWS, OWN_LAW, Law
 from relay_autotune.quantities import told_fields
 
 _DIGITS = 10
@@ -130,11 +130,14 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     limits = (target.command_min, target.command_max)
     low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
     set_there = f"; set them to {low} and {high}" if any(map(math.isfinite, limits)) else ""
-    told = (
+    told: tuple[str, ...] = (
         f"For {law.program}.",
         f"Command: {law.command}.",
         f"Limits of the command are set in the program{set_there}. At them: {law.limits}.",
     )
+    if law.sign:
+        sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
+        told += (f"{sign}, with kc {gains.kc:.6g}.",)
     lines = _comments(gains, told, law.remark)
     lines += [law.line.format(name=name, value=value) for name, value in _values(gains, law)]
     return "\n".join(lines) + "\n"
@@ -208,7 +211,13 @@ def _comments(gains: Gains, more: Sequence[str], remark: str) -> list[str]:
         f"tf {gains.tf:.6g} s, b {gains.b:g}.",
     ]
     if gains.law:
-        told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
+        told += [
+            f"Designed for {gains.law} every {gains.law_period:.6g} s.",
+            "That is --sample-period, else the interval of the recording: give --sample-period "
+            "if the program runs at another.",
+        ]
+        if gains.law != OWN_LAW:
+            told.append("A proof with controller_node was of other gains: those for its own law.")
     return [f"{remark} {line}" for line in (*told, *more)]
 
 

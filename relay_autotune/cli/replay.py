@@ -16,6 +16,7 @@ from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
 from relay_autotune.cli.design_arguments import add_export, export_target
+from relay_autotune.cli.export import write
 from relay_autotune.cli.layout import width
 from relay_autotune.cli.page import add_web, check_web, show
 from relay_autotune.cli.progress import ProgressLine
@@ -90,9 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_present(parser)
     parser.add_argument(
-        "--output", metavar="FILE",
+        "-o", "--output", metavar="FILE",
         help="write results as they come to a .jsonl, .csv or .parquet file instead; "
-        "bags that it already has are left out",
+        "bags that it already has are left out; with --export the file of the gains",
     )  # fmt: skip
     parser.add_argument(
         "--jobs", type=_count, metavar="N", default=1, help="bags at a time (%(default)s)"
@@ -114,6 +115,10 @@ def _count(text: str) -> int:
 
 
 def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    file = None
+    if options.export:
+        # With --export, --output is the file of the gains.
+        file, options.output = options.output, None
     jobs = _jobs(options)
     for flag, wanted in (("--report", options.report), ("--web", options.web)):
         if wanted and (options.output or options.scheduler or options.jobs > 1):
@@ -129,7 +134,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     for done, found in _in_order(jobs, options):
         _tell(done)
         if done.text:
-            print(done.text, flush=True)
+            write(f"{done.text}\n", file if found else None)
         status = worst(status, done.status)
         analyses += [(done.name, analysis) for analysis in found]
     if analyses and (options.report or options.web):
@@ -157,9 +162,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         jobs = [replace(j, paths=tuple(str(Path(p).absolute()) for p in j.paths)) for j in jobs]
     if options.export:
         if len(jobs) > 1 or not with_table:
-            raise SelectionError(
-                "--export writes the gains of one bag alone, without --json and --output"
-            )
+            raise SelectionError("--export writes the gains of one bag alone, without --json")
         target = export_target(options)
         jobs = [
             replace(

@@ -238,6 +238,7 @@ class Law:
     :param needs_integral: True if it does not run without integral action.
     :param line: how a setting is written, with ``{name}`` and ``{value}``.
     :param remark: beginning of a line that is a comment.
+    :param sign: what to know where its gains have not the sign of kc; ``{sign}`` is theirs.
     """
 
     name: str
@@ -256,6 +257,7 @@ class Law:
     needs_integral: bool = False
     line: str = "{name}: {value}"
     remark: str = "#"
+    sign: str = ""
 
     @property
     def sets_gains(self) -> bool:
@@ -516,6 +518,7 @@ _ROWS = (
         weights=(0.0, 1.0),
         line="const auto {name} = {value};",
         remark="//",
+        sign="Its gains are never negative: ControllerDirection says the sign",
     ),
     Law(
         "simple_pid",
@@ -653,6 +656,7 @@ _ROWS = (
         needs_integral=True,
         line="{name} := {value};",
         remark="//",
+        sign="This block forms ERROR = PV - SP, so KP is {sign} here",
     ),
     Law(
         "oscat_ft_pid",

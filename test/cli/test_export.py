@@ -185,9 +185,11 @@ def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
     assert tune.main([*OVEN, "--pid", "--rule", "imc", "--export", name]) == 0
     text = capsys.readouterr().out
     law = LAWS[name]
-    assert all(line.startswith(law.remark) for line in text.splitlines()[:5])
+    lines = text.splitlines()
+    assert all(line.startswith(law.remark) for line in lines[:6])
     assert f"Designed for {name} every 0.5 s." in text
-    found = settings_of("\n".join(text.splitlines()[5:]))
+    assert ("controller_node was of other gains" in text) == (name != "controller_node")
+    found = settings_of("\n".join(line for line in lines if not line.startswith(law.remark)))
     assert list(found) == [each.name for each in law.settings]
     gains = tune_model(
         TransferFunction.fopdt(1.65, 20.0, 10.0),
@@ -198,6 +200,25 @@ def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
         value = each.of(law.at(gains, 0.5))
         told = found[each.name]
         assert told == value if isinstance(value, str) else float(told) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(("gain", "kp"), [("1.65", "negative"), ("-1.65", "positive")])
+def test_a_block_with_the_other_error_says_the_sign_of_its_gain(gain, kp, capsys):
+    asked = [*OVEN, "--gain", gain, "--rule", "imc", "--export", "iec_61131_3_pid"]
+    assert tune.main(asked) == 0
+    text = capsys.readouterr().out
+    assert f"// This block forms ERROR = PV - SP, so KP is {kp} here, with kc " in text
+    assert (float(settings_of(text)["KP"]) > 0.0) == (kp == "positive")
+
+
+def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path, capsys):
+    file = tmp_path / "fb.txt"
+    asked = ["--rule", "imc", "--export", "iec_61131_3_pid", "-o", str(file), "bags/step_test"]
+    assert replay.main(asked) == 0
+    assert capsys.readouterr().out == ""
+    text = file.read_text()
+    assert "CYCLE := T#98.5ms;" in text
+    assert "else the interval of the recording: give --sample-period" in text
 
 
 def test_gains_for_one_law_are_not_exported_for_another(capsys):

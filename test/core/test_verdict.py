@@ -85,5 +85,5 @@ def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest
     assert said(none).startswith(told)
     assert "inf" not in said(none)
     assert said(none, f"{NOT_AT_REST}, and so on").startswith(NOT_AT_REST)
-    other = "the same relay on the model oscillates with another period, 0.25 off"
+    other = "the same relay on the model oscillates with another period, 0.250 off"
     assert said(Validation(period=-0.25)) == other
