@@ -296,7 +296,9 @@ def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[
     """
     from relay_autotune.control.verification import NARROWLY, NOISE_ALLOWANCE
 
-    told = "passed: the loop does what the model predicts" if result.passed else result.reason
+    told = f"failed: {result.reason}"
+    if result.passed:
+        told = "passed: the loop does what the model predicts"
     reasons = [step.reason.partition("; ")[0] for step in result.steps]
     if narrow := [r.removeprefix(NARROWLY) for r in reasons if r.startswith(NARROWLY)]:
         told = f"passed, {NARROWLY}{'; '.join(narrow)}" if result.passed else told

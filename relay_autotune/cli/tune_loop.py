@@ -405,7 +405,8 @@ def _hand_over(
         names = ", ".join(name for name in EXPORTS if name != how)
         told = f"{other}, with NAME {names}, and S the time between two runs of the controller [s]"
         # What replay writes does not say that these gains have failed.
-        print("\n" + "\n".join([] if unless else labelled("other programs", told, width())))
+        lines = [] if unless else labelled("other programs", told, width())
+        print("\n".join(["", *lines]))
         what = f"Write the gains for {how} of ros2_controllers{unless}"
         file = asked_for_file(what, EXPORTS, other)
     if file:

@@ -81,7 +81,7 @@ def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
 def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
     failed = Verify.Result(passed=False, reason="it settles later; kc 0.1 in force again")
     text = "\n".join(verdict_lines(failed, Controller(0.1, 3.0), 60))
-    assert "it settles later" in text
+    assert "failed: it settles later" in text
     assert "kc 0.1000" in text and "--revert" not in text
     assert "the command is held" in "\n".join(verdict_lines(failed, None, 60))
 
