@@ -272,6 +272,11 @@ class Procedure:
     def _settled(self, rest: RestState) -> float:
         p = self._parameters
         self.rest = rest
+        if self._watch is not None and (told := self._watch.moved_to(rest.mean)):
+            self._notes.append(
+                f"{told} under the baseline {self._baseline:g} u: look whether that is the "
+                f"present command"
+            )
         self._settled_at = self._samples.seen[-1]
         self.kicked_at = self._samples.time[-1]
         self._setpoint = rest.mean if math.isnan(p.setpoint) else p.setpoint

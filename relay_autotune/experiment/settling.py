@@ -173,6 +173,20 @@ class RestWatch:
             return ""
         return f"{NO_REST_AT} {rest.mean:.6g} y and is at {measurement:.6g} y"
 
+    def moved_to(self, mean: float) -> str:
+        """Return how far the measurement has gone in the settling, empty where it is no distance.
+
+        A drift that the samples before cannot exclude is no reason to end the tune, but to tell.
+
+        :param mean: measurement at the end of the settling [y].
+        """
+        rest = self._rest
+        steps = self._resolution if math.isfinite(self._resolution) else 0.0
+        least = max(_OUTSIDE_STD * rest.noise_std, _OUTSIDE_STEPS * steps, _UNSEEN * abs(mean))
+        if not rest.samples or abs(mean - rest.mean) <= least:
+            return ""
+        return f"{NO_REST_AT} {rest.mean:.6g} y before the first command, and at {mean:.6g} y"
+
     def _learn(self) -> None:
         y = np.array(self._before)
         self._rest = rest = _about_line(y)

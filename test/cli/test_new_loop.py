@@ -252,3 +252,34 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     assert "they are not proven" in shown(None, "few cycles", "")
     assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
     assert "DOUBTFUL" not in (tmp_path / "passed.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("reason", "left", "next_step"),
+    [
+        (
+            "the measurement rested at 6 y and is at 6.2 y",
+            "which is not the one at",
+            "once it rests",
+        ),
+        (
+            "the measurement 9.1 at 3 s is outside its limits, 3 to 9",
+            "look whether",
+            "once it rests",
+        ),
+        ("cancelled", "the plant is left at the safe command 1040 u", "run it again"),
+    ],
+)
+def test_after_the_process_was_driven_away_the_same_command_is_not_offered_again(
+    reason, left, next_step
+):
+    words = ["--measurement", "/y", "--command", "/u", "--at", "1040", "--within", "3", "9"]
+    given = tune_loop._parser().parse_args(words)
+    given.typed = words
+    result = SimpleNamespace(
+        reason=reason, outcome=1, COMPLETED=2, gains=SimpleNamespace(experiment_id="")
+    )
+    assert left in tune_loop._left(result, 1040.0)
+    ((name, told),) = tune_loop._repeated(result, given, None)
+    assert name == next_step
+    assert ("1040" in told) == (next_step == "run it again")

@@ -79,6 +79,17 @@ def test_the_right_baseline_starts_the_relay_in_spite_of_noise_and_drift(acting,
         assert tune.outcome is not Outcome.FAILED, (seed, tune.reason)
 
 
+def test_a_small_error_that_may_be_a_drift_is_told():
+    for seed in range(6):
+        tune, _ = tuned(1190.0, seed, 22, noise_std=0.01)
+        tune.abort("enough")
+        assert "the measurement rested at" in tune.reason, (seed, tune.reason)
+        assert "present command" in tune.reason
+        tune, _ = tuned(1200.0, seed, 22, noise_std=0.01)
+        tune.abort("enough")
+        assert "rested" not in tune.reason
+
+
 def test_slow_noise_and_the_rest_of_a_transient_are_no_departure():
     for seed in range(40):
         draw = np.random.default_rng(seed)
