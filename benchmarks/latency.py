@@ -5,14 +5,16 @@
 
 Usage, after `. ./env.sh`:
 
-    python3 benchmarks/latency.py [--seconds 60] [--rate 1000] [--phases 6] [--quick]
+    python3 benchmarks/latency.py [--seconds 60] [--rate 1000] [--phases 6] [--joints 0] [--quick]
 
 Three processes besides this one: a sender that publishes measurements at a fixed rate, whatever
 becomes of them; the installed relay_node in the midst of a tune, recording; and a bare rclpy node
 that publishes what it receives. The sender feeds one of the two at a time, in phases that take
 turns, so that both meet the same machine. The latency of a sample is from just before its
-measurement is published to the arrival of its command here. The table is Markdown; the exit
-status is 1 if a target is missed. With --quick a few seconds are run and the status is 0.
+measurement is published to the arrival of its command here. With --joints the measurement is the
+position of the last joint of a JointState, found by its name, and the command its element of an
+array of all joints. The table is Markdown; the exit status is 1 if a target is missed. With
+--quick a few seconds are run and the status is 0.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Float64
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
 
@@ -48,25 +51,51 @@ def measurement(t: float) -> float:
     return 0.0 if t < SETTLE + 0.2 else math.sin(2.0 * math.pi * (t - SETTLE - 0.2))
 
 
-def echo() -> None:
+def types(joints: int) -> tuple[Any, Any]:
+    """Return the types of measurement and command."""
+    return (JointState, Float64MultiArray) if joints else (Float64, Float64)
+
+
+def of_joints(joints: int) -> list[str]:
+    """Return the relay's parameters for the last one of some joints; 0: none."""
+    if not joints:
+        return []
+    others = ", ".join("0.0" for _ in range(joints))
+    given = {
+        "measurement_type": "sensor_msgs/msg/JointState",
+        "measurement_field": f"position[joint_{joints - 1}]",
+        "command_type": "std_msgs/msg/Float64MultiArray",
+        "command_field": f"data[{joints - 1}]",
+        "command_message": f"'{{data: [{others}]}}'",
+    }
+    return [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+
+
+def echo(joints: int) -> None:
     """Run the bare node."""
     rclpy.init()
     node = Node("echo", namespace="bare")
-    publisher = node.create_publisher(Float64, "command", QOS)
-    node.create_subscription(Float64, "measurement", publisher.publish, QOS)
+    measured, commanded = types(joints)
+    publisher = node.create_publisher(commanded, "command", QOS)
+
+    def answer(message: JointState) -> None:
+        value = message.position[message.name.index(f"joint_{joints - 1}")]
+        publisher.publish(Float64MultiArray(data=[*[0.0] * (joints - 1), value]))
+
+    node.create_subscription(measured, "measurement", answer if joints else publisher.publish, QOS)
     with contextlib.suppress(ExternalShutdownException):
         rclpy.spin(node)
 
 
-def send(rate: float) -> None:
+def send(rate: float, joints: int) -> None:
     """Run the sender: for each line "namespace count file" publish and note the times."""
     rclpy.init()
     node = Node("sender")
     publishers = {
-        name: node.create_publisher(Float64, f"/{name}/measurement", QOS)
+        name: node.create_publisher(types(joints)[0], f"/{name}/measurement", QOS)
         for name in ("bare", "tuned")
     }
-    message = Float64()
+    message, names = Float64(), [f"joint_{k}" for k in range(joints)]
     print("ready", flush=True)
     for line in sys.stdin:
         name, count, file = line.split()
@@ -77,7 +106,11 @@ def send(rate: float) -> None:
             wait = start + k / rate - time.monotonic()
             if wait > 0.0:
                 time.sleep(wait)
-            message.data = measurement(k / rate)
+            value = measurement(k / rate)
+            if joints:
+                message = JointState(name=names, position=[*[0.0] * (joints - 1), value])
+            else:
+                message.data = value
             sent[k] = time.monotonic_ns()
             publisher.publish(message)
         np.save(file, sent)
@@ -87,7 +120,9 @@ def send(rate: float) -> None:
 class Bench:
     """Starts the processes, runs the phases and keeps the times."""
 
-    def __init__(self, rate: float, folder: Path, environment: dict[str, str]) -> None:
+    def __init__(
+        self, rate: float, folder: Path, environment: dict[str, str], joints: int = 0
+    ) -> None:
         self.folder = folder
         self.rate = rate
         self.arrived: dict[str, list[int]] = {"bare": [], "tuned": []}
@@ -96,8 +131,9 @@ class Bench:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         for name, times in self.arrived.items():
-            self.node.create_subscription(Float64, f"/{name}/command", self._noting(times), DEEP)
-        this = [sys.executable, __file__]
+            topic = f"/{name}/command"
+            self.node.create_subscription(types(joints)[1], topic, self._noting(times), DEEP)
+        this = [sys.executable, __file__, "--joints", str(joints)]
         start = {"env": environment, "text": True}
         self.processes = [
             subprocess.Popen([*this, "--role", "echo"], **start),
@@ -109,6 +145,7 @@ class Bench:
                     *("-p", "min_cycles:=1000", "-p", "max_cycles:=1000"),
                     *("-p", "measurement_timeout:=1000.0", "-p", "model_timeout:=0.0"),
                     *("-p", f"record_directory:={folder}"),
+                    *of_joints(joints),
                 ],
                 **start,
             ),
@@ -127,7 +164,7 @@ class Bench:
     def _noting(times: list[int]) -> Any:
         append, now = times.append, time.monotonic_ns
 
-        def note(_: Float64) -> None:
+        def note(_: Any) -> None:
             append(now())
 
         return note
@@ -230,13 +267,14 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=1000.0, help="measurements a second")
     parser.add_argument("--phases", type=int, default=6, help="turns of each node")
     parser.add_argument("--quick", action="store_true", help="a few seconds, only to see it run")
+    parser.add_argument("--joints", type=int, default=0, help="of a JointState; 0: a Float64")
     parser.add_argument("--role", choices=("echo", "send"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role == "echo":
-        echo()
+        echo(options.joints)
         return 0
     if options.role == "send":
-        send(options.rate)
+        send(options.rate, options.joints)
         return 0
     from ros_domain import free_domain
 
@@ -248,7 +286,7 @@ def main() -> int:
     with free_domain() as domain, tempfile.TemporaryDirectory() as folder:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        bench = Bench(options.rate, Path(folder), dict(os.environ))
+        bench = Bench(options.rate, Path(folder), dict(os.environ), options.joints)
         try:
             bench.until(lambda: len(bench.arrived["bare"]) >= 0, 1.0, "start")
             connected = time.monotonic() + 3.0
