@@ -332,8 +332,10 @@ class Oscillation:
 
     def _look_for_chatter(self) -> None:
         """Fail if the process cannot have caused the last stays."""
-        is_long = self._relay.last_stay >= _OF_RESPONSE * self._response_time
-        self._answered.append(is_long)
+        stay = self._relay.last_stay
+        is_long = stay >= _OF_RESPONSE * self._response_time
+        if stay > 0.0:  # the clock goes
+            self._answered.append(is_long)
         self._long_stays += is_long
         known = self._levels.amplitude <= self._kick_amplitude and self._long_stays >= _SHOWN
         if known and len(self._answered) == _MANY_STAYS and sum(self._answered) <= 1:
