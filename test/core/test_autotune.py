@@ -81,7 +81,10 @@ def test_while_it_runs_there_is_a_model_and_no_gains():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("method", "rule"), [("waveform", "robust"), ("wang_biased", "imc")])
+@pytest.mark.parametrize(
+    ("method", "rule"),
+    [pytest.param("waveform", "robust", marks=pytest.mark.nightly), ("wang_biased", "imc")],
+)
 def test_alone_they_are_what_they_are_beside_others(method, rule):
     beside = _analysed(method, rule)
     alone = analyse_alone(_record(), method=method, rule=rule)

@@ -107,7 +107,7 @@ def test_equations_11_and_12(name, inputs, exact, tol):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+@pytest.mark.parametrize("share", [0.0, pytest.param(0.1, marks=pytest.mark.nightly), 0.4])
 @pytest.mark.parametrize("model", PROCESSES, ids=str)
 def test_the_generalised_equations_return_the_process(model, share):
     period, amplitude, epsilon = _cycle(model, share)
@@ -259,7 +259,7 @@ def _record(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("share", [0.0, 0.2])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.nightly), 0.2])
 @pytest.mark.parametrize("model", [*PROCESSES[:6], *PROCESSES[7:9]], ids=str)
 def test_records_with_gain_and_dead_time_known(model, share):
     found = identify_chang(_record(model, share), Known(gain=2.0, dead_time=model.dead_time))

@@ -40,7 +40,7 @@ def run(model, *, sign, period, **acting):
         pytest.param(SECOND_ORDER, 0.015, 0.0, marks=pytest.mark.nightly),
         pytest.param(SECOND_ORDER, 0.015, 0.03, marks=pytest.mark.nightly),
         pytest.param(SLOWER, 0.04, 0.0, marks=pytest.mark.nightly),
-        (SLOWER, 0.04, 0.5),
+        pytest.param(SLOWER, 0.04, 0.5, marks=pytest.mark.nightly),
         (INTEGRATOR, 0.015, 0.03),
     ],
 )
@@ -72,7 +72,7 @@ def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
 @pytest.mark.parametrize(
     "acting",
     [
-        {"drift": 0.003, "noise_std": 0.01},
+        pytest.param({"drift": 0.003, "noise_std": 0.01}, marks=pytest.mark.nightly),
         pytest.param(
             {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01}, marks=pytest.mark.nightly
         ),

@@ -109,7 +109,7 @@ def _records(
 
 @pytest.mark.long
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-@pytest.mark.parametrize("epsilon", [0.0, 0.2])
+@pytest.mark.parametrize("epsilon", [pytest.param(0.0, marks=pytest.mark.nightly), 0.2])
 @pytest.mark.parametrize(
     "process",
     [
