@@ -143,6 +143,8 @@ class Bench:
                     *("-p", "amplitude:=1.0", "-p", "baseline:=0.0", "-p", "hysteresis:=0.1"),
                     *("-p", f"settle_time:={SETTLE}", "-p", "process_gain_sign:=1"),
                     *("-p", "min_cycles:=1000", "-p", "max_cycles:=1000"),
+                    # The sine does not grow with the levels, as behind a clipped actuator.
+                    *("-p", "command_min:=-1.5", "-p", "command_max:=1.5"),
                     *("-p", "measurement_timeout:=1000.0", "-p", "model_timeout:=0.0"),
                     *("-p", f"record_directory:={folder}"),
                     *of_joints(joints),
