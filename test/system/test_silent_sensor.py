@@ -57,8 +57,8 @@ def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     # At rest nothing came, and the node repeated the last value every 20 ms.
     time, measurement = np.array(experiment.time), np.array(experiment.measurement)
     assert np.all(measurement[:20] == measurement[0])
-    # A busy machine repeats later.
-    assert 0.016 < np.median(np.diff(time[:20])) < 0.04
+    # A busy machine repeats some of them later, and none earlier.
+    assert np.quantile(np.diff(time[:20]), 0.25) == pytest.approx(0.02, rel=0.2)
     done = subprocess.run(
         [shutil.which("replay") or "replay", "--json", str(rig.bag(answer))],
         capture_output=True,
