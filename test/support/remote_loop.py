@@ -190,6 +190,16 @@ class Loop:
         client.destroy()
         return answer.result().status, answer.result().result
 
+    def until_setpoints(self, *wanted: float) -> None:
+        """Wait until these are the set-points so far; the last may come after its action ends."""
+        self.rig.until(
+            lambda: [self.setpoint_in(m) for m in self.setpoints] == list(wanted),
+            f"the set-points {wanted}",
+        )
+
+    def setpoint_in(self, message: Any) -> float:
+        return float(message.data)
+
     def values(self) -> list[float]:
         return self.rig.values("pid_controller", *(f"gains.heater.{name}" for name in "pid"))
 
@@ -205,3 +215,6 @@ class ReportingLoop(Loop):
         rig.start_python("pid_controller", REPORTING.replace("PERIOD", str(PERIOD)))
         self.start()
         rig.until(self.is_watched, "the controller_node")
+
+    def setpoint_in(self, message: Any) -> float:
+        return float(message.velocity[1])

@@ -32,7 +32,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert result.passed, result.reason
     (step,) = result.steps
     assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
-    assert [m.data for m in loop.setpoints] == [5.0, 5.5, 5.0]
+    loop.until_setpoints(5.0, 5.5, 5.0)
     assert loop.values() == [0.5, 1.6, 0.0]
 
     # A foreign set-point ends a verification and stays; the gains get no verdict.
@@ -42,7 +42,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert not result.passed
     assert "another node set the set-point to 4.8" in result.reason
     rig.run_for(2.0)
-    assert [m.data for m in loop.setpoints] == [*other, 5.5, 4.8]
+    loop.until_setpoints(*other, 5.5, 4.8)
     assert loop.values() == [0.5, 1.6, 0.0]
 
     # Gains for a process with a third of the true gain.
@@ -52,7 +52,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert not result.passed
     assert "/pid_controller has gains.heater.d 0, gains.heater.i 1.6" in result.reason
     assert loop.values() == [0.5, 1.6, 0.0]
-    assert [m.data for m in loop.setpoints[-2:]] == [5.3, 4.8]
+    loop.until_setpoints(*other, 5.5, 4.8, 5.3, 4.8)
 
 
 def test_the_gains_of_a_joint_are_proved_by_the_state_of_its_controller(rig: Rig) -> None:
@@ -69,6 +69,6 @@ def test_the_gains_of_a_joint_are_proved_by_the_state_of_its_controller(rig: Rig
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
     assert not result.passed
     assert loop.values() == [0.5, 1.6, 0.0]
+    loop.until_setpoints(5.5, 5.0, 5.5, 5.0)
     # The other joint of the message stays where it was.
     assert {(*m.name, m.velocity[0]) for m in loop.setpoints} == {("arm", "left", 0.25)}
-    assert [m.velocity[1] for m in loop.setpoints] == [5.5, 5.0, 5.5, 5.0]
