@@ -1,21 +1,25 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Gains for each law, on the batch of processes: `python3 benchmarks/laws.py [--all] [--quick]`.
+"""Gains for each law, on the batch: `python3 benchmarks/laws.py [--kept FILE] [--quick]`.
 
 PID gains are designed for a law at a sampling period, with Ms <= 1.4. Then the law runs, sample by
 sample, on the exact process, with sinusoids added to the measurement: at the frequency of the
-claimed Ms, below it and above it. Each of the 133 processes is run at three rates; by default with
-one law each, in turn, with --all with every law.
+claimed Ms, below it and above it. Each of the 133 processes is run at three rates with every law;
+laws with the same difference equation share the design and the run. With --kept each result is
+appended to a file, and what the file has already is not run again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import reference  # noqa: F401  before numpy
 from ah_processes import FAMILIES
@@ -25,7 +29,8 @@ from markdown import table
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.laws import LAWS, SampledLaw
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS, Law, SampledLaw
 from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
@@ -126,32 +131,51 @@ def tried(title: str, model: TransferFunction, law: str, rate: float) -> Case:
     assert runs is not None
     found = SampledLoop(runs, model).margins()
     measured = measured_ms(runs, model, found.ms_frequency)
-    return Case(rate, law, title, found.ms, measured, unnamed_ms(task))
+    unnamed = task.runs(unnamed_gains(model, period))
+    assert unnamed is not None
+    return Case(rate, law, title, found.ms, measured, SampledLoop(unnamed, model).ms())
 
 
-def unnamed_ms(task: DesignTask) -> float:
-    """Return Ms where the law of a task runs what it can of gains for no law in particular."""
-    controller, _ = robust(replace(task, options=replace(task.options, law="")))
-    runs = task.runs(controller)
-    assert runs is not None
-    return SampledLoop(runs, task.model).ms()
+@lru_cache(maxsize=1)
+def unnamed_gains(model: TransferFunction, period: float) -> Controller:
+    """Return gains for no law in particular.
+
+    :param model: the process.
+    :param period: of the samples [s].
+    """
+    options = DesignOptions(controller="pid", ms=MS, sample_period=period)
+    return robust(DesignTask(model=model, options=options))[0]
 
 
-def cases(every: bool, quick: bool) -> Iterator[Case]:
+def loop_of(law: Law) -> tuple[object, ...]:
+    """Return all that design and run depend on: laws that share it have the same loop."""
+    signs = (law.only_positive, law.needs_integral)
+    return (law.integral, law.slope, law.smoothing, law.weights, law.delay, *signs)
+
+
+def cases(quick: bool, kept: Path | None) -> Iterator[Case]:
     """Yield the results.
 
-    :param every: True: each law on each process and rate.
     :param quick: True: few, to see whether it runs.
+    :param kept: file with a result in each line, to which new ones are appended; None: no file.
     """
+    lines = kept.read_text().splitlines() if kept is not None and kept.exists() else []
+    known = {(c.title, c.rate, c.law): c for c in (Case(**json.loads(line)) for line in lines)}
     batch = [(f"{family.split(' = ')[0]}, {title}", model)
              for family, processes in FAMILIES.items() for title, model in processes]  # fmt: skip
-    for number, (title, model) in enumerate(batch[:: 50 if quick else 1]):
-        for place, rate in enumerate(RATES):
-            names = list(LAWS)
-            # 7 and the number of laws have no factor in common.
-            chosen = names if every else [names[(number + 7 * place) % len(names)]]
-            for law in chosen:
-                yield tried(title, model, law, rate)
+    for title, model in batch[:1] if quick else batch:
+        for rate in RATES[-1:] if quick else RATES:
+            same: dict[tuple[object, ...], Case] = {}
+            for name, law in LAWS.items():
+                found = known.get((title, rate, name))
+                if found is None:
+                    found = same.get(loop_of(law)) or tried(title, model, name, rate)
+                    found = replace(found, law=name)
+                    if kept is not None:
+                        with kept.open("a") as file:
+                            file.write(json.dumps(asdict(found)) + "\n")
+                same[loop_of(law)] = found
+                yield found
 
 
 def row(name: str, found: list[Case]) -> tuple[object, ...]:
@@ -174,13 +198,13 @@ def row(name: str, found: list[Case]) -> tuple[object, ...]:
 def main() -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--all", action="store_true", help="every law on every process and rate")
+    parser.add_argument("--kept", type=Path, help="file for the results, also those of before")
     parser.add_argument("--quick", action="store_true", help="few processes: does it run?")
     options = parser.parse_args()
     found = []
-    for case in cases(options.all, options.quick):
+    for case in cases(options.quick, options.kept):
         found.append(case)
-        if len(found) % 20 == 0:
+        if len(found) % 100 == 0:
             print(f"{len(found)} done", file=sys.stderr, flush=True)
     titles = ("law", "designs", "no gains", "did not settle", "largest Ms claimed",
               "median error [%]", "largest error [%]", "within 2 %",
