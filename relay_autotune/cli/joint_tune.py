@@ -611,7 +611,8 @@ class JointTune:
         # Towards the middle of its range.
         now[place] += math.copysign(_PROOF * (high - low), 0.5 * (low + high) - now[place])
         seconds = max(2, math.ceil(2.0 * settling_time)) if math.isfinite(settling_time) else 2
-        point = f"{{positions: [{', '.join(map('{:.4g}'.format, now))}], "
+        # YAML takes a number such as 5e-05, without a point, for text.
+        point = f"{{positions: [{', '.join(map('{:.5f}'.format, now))}], "
         point += f"time_from_start: {{sec: {seconds}}}}}"
         message = f"{{joint_names: [{', '.join(loop.joints)}], points: [{point}]}}"
         words = ["ros2", "topic", "pub", "--once", f"{loop.node}/joint_trajectory"]

@@ -5,12 +5,15 @@
 
 from __future__ import annotations
 
+import shlex
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from toolbox_pid import ToolboxPid
 
+from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.errors import LoopError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import law_named
@@ -253,6 +256,19 @@ def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:
     # By the names of the message, whatever their order.
     assert loop.state == DofState(0.2, pytest.approx(0.25), pytest.approx(3.0))
     assert loop.why_not_moved == "its references are trajectories"
+
+
+def test_the_trajectory_to_type_holds_numbers_also_where_a_joint_is_almost_at_zero() -> None:
+    arm = Arm()
+    tune = SimpleNamespace(
+        _loop=joint_loop(arm, arm, "arm", "arm_2"),
+        _within=(-1.0, 2.0),
+        _position_of=lambda _: 5e-5,
+    )
+    *words, text = shlex.split(JointTune._short_trajectory(tune, 0.3))
+    assert words[-1] == "trajectory_msgs/msg/JointTrajectory"
+    (point,) = yaml.safe_load(text)["points"]
+    assert point["positions"] == [5e-5, 0.15005]
 
 
 def test_a_joint_that_is_commanded_by_another_name_or_tells_no_output() -> None:

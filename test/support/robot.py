@@ -8,7 +8,7 @@ with them or with the package: strict switches, chains, references that NaN leav
 state that may miss a message. Cycles are 10 ms apart by their stamps; a busy machine makes up for
 late ones, so that the joints and the law are the same on any machine.
 
-    python3 robot.py [base|chain|arm|trajectory]
+    python3 robot.py [base|chain|arm|followed|trajectory]
 
 What happens is ordered on the topic /trouble: `refuse`, `die NAME`; who is active is told on
 /active.
@@ -25,6 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import rclpy
 from control_msgs.msg import (
     JointTrajectoryControllerState,
@@ -42,6 +43,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from toolbox_pid import ToolboxPid
+from trajectory_msgs.msg import JointTrajectory
 
 RATE = 100
 PERIOD = 1.0 / RATE
@@ -148,6 +150,7 @@ KINDS = {
     ),
 }
 KINDS["chain"] = replace(KINDS["base"], above="base_controller")
+KINDS["followed"] = replace(KINDS["arm"], above="path_controller")
 KINDS["trajectory"] = replace(
     KINDS["arm"],
     follows=True,
@@ -278,10 +281,60 @@ class PidController(ToolboxController):
         self.publish(self.states, state, stamp)
 
 
-class TrajectoryController(ToolboxController):
-    """joint_trajectory_controller that commands effort alone, and holds where it is."""
+class Path:
+    """The trajectory of some joints: straight lines between its points, and then its end.
+
+    :param node: of the controller.
+    :param joints: each at its position.
+    """
+
+    def __init__(self, node: Node, joints: dict[str, float]) -> None:
+        self.joints = tuple(joints)
+        self.begun, self.now = 0.0, list(joints.values())
+        self.times, self.points = [0.0], [self.now]
+        node.create_subscription(JointTrajectory, "~/joint_trajectory", self.hear, 10)
+
+    def hold(self, positions: list[float]) -> None:
+        self.begun, self.times, self.points, self.now = 0.0, [0.0], [positions], positions
+
+    def hear(self, message: JointTrajectory) -> None:
+        # A goal has to name all joints, in any order, with their positions.
+        if sorted(message.joint_names) != sorted(self.joints):
+            return
+        places = [message.joint_names.index(joint) for joint in self.joints]
+        ends = [point.time_from_start for point in message.points]
+        self.begun, self.times = 0.0, [0.0, *(end.sec + 1e-9 * end.nanosec for end in ends)]
+        self.points = [self.now, *([p.positions[k] for k in places] for p in message.points)]
+
+    def move(self, stamp: float) -> tuple[list[float], list[float]]:
+        """Return positions and velocities at a time; the first one is that of the start."""
+        self.begun = self.begun or stamp
+        since, before = stamp - self.begun, self.now
+        columns = zip(*self.points, strict=True)
+        self.now = [float(np.interp(since, self.times, column)) for column in columns]
+        return self.now, [(new - old) / PERIOD for new, old in zip(self.now, before, strict=True)]
+
+
+class PathController(Controller):
+    """joint_trajectory_controller that writes the references of another controller."""
 
     type_name = "joint_trajectory_controller/JointTrajectoryController"
+
+    def __init__(self, kind: Kind, needs: tuple[str, ...]) -> None:
+        super().__init__(kind.above, needs)
+        self.path = Path(self.node, kind.joints)
+
+    def activate(self, measured: dict[str, float]) -> None:
+        self.path.hold([measured[joint] for joint in self.path.joints])
+
+    def update(self, stamp: float, measured: dict[str, float], commands: dict[str, float]) -> None:
+        commands.update(zip(self.needs, self.path.move(stamp)[0], strict=True))
+
+
+class TrajectoryController(ToolboxController):
+    """joint_trajectory_controller that commands effort alone."""
+
+    type_name = PathController.type_name
 
     def __init__(self, kind: Kind) -> None:
         super().__init__(kind, {"antiwindup_strategy": "legacy", "ff_velocity_scale": 0.0})
@@ -291,12 +344,12 @@ class TrajectoryController(ToolboxController):
         declare("command_interfaces", ["effort"])
         declare("state_interfaces", ["position", "velocity"])
         declare("open_loop_control", False)
-        self.held = list(kind.joints.values())
+        self.path = Path(self.node, kind.joints)
         kind_of_state = JointTrajectoryControllerState
         self.states = self.node.create_publisher(kind_of_state, "~/controller_state", 10)
 
     def activate(self, measured: dict[str, float]) -> None:
-        self.held = [measured[joint] for joint in self.joints]
+        self.path.hold([measured[joint] for joint in self.joints])
         for law in self.laws:
             law.reset(save_integral=False)
 
@@ -306,11 +359,12 @@ class TrajectoryController(ToolboxController):
     def update(self, stamp: float, measured: dict[str, float], commands: dict[str, float]) -> None:
         now = [measured[joint] for joint in self.joints]
         rates = [measured[f"{joint}/velocity"] for joint in self.joints]
+        wanted, speeds = self.path.move(stamp)
         for k, name in enumerate(self.needs):
-            error = self.held[k] - now[k]
-            commands[name] = self.laws[k].step(error, PERIOD, 0.0 - rates[k])
+            error = wanted[k] - now[k]
+            commands[name] = self.laws[k].step(error, PERIOD, speeds[k] - rates[k])
         state = JointTrajectoryControllerState(joint_names=list(self.joints))
-        state.reference.positions, state.feedback.positions = self.held, now
+        state.reference.positions, state.feedback.positions = wanted, now
         state.feedback.velocities = rates
         state.output.effort = [commands[name] for name in self.needs]
         self.publish(self.states, state, stamp)
@@ -357,9 +411,10 @@ class Manager:
     def __init__(self, kind: Kind) -> None:
         self.measured = kind.measured
         joints = TrajectoryController(kind) if kind.follows else PidController(kind)
+        above = BaseController if kind.measured == "velocity" else PathController
         # Who writes references is before who reads them.
         self.controllers: list[Any] = [
-            *([BaseController(kind, joints.references)] if kind.above else []),
+            *([above(kind, joints.references)] if kind.above else []),
             joints,
             *(
                 ForwardController(name, tuple(f"{joint}/effort" for joint in joints))

@@ -19,6 +19,7 @@ TUNED = {
     "base": ("wheel_controller", "left_wheel", "--within", "0", "4"),
     "chain": ("wheel_controller", "left_wheel", "--within", "0", "4"),
     "arm": ("arm_controller", "arm_2"),
+    "followed": ("arm_controller", "arm_2"),
     "trajectory": ("arm_controller", "arm_2"),
 }
 

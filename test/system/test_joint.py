@@ -6,15 +6,20 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from builtin_interfaces.msg import Duration
 from loop_rig import RELIABLE, Rig
 from robot_rig import Robot
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 
 @pytest.fixture
@@ -86,6 +91,38 @@ def test_a_joint_under_a_trajectory_controller_gets_gains_and_its_controller_bac
     assert "not verified its references are trajectories: give it a short trajectory" in said
     assert "--once /arm_controller/joint_trajectory trajectory_msgs/msg/JointTrajectory" in said
     assert "Designed for control_toolbox_legacy every 0.01 s" in file.read_text()
+    # A twentieth of -1.3 to 0.7, towards the middle, and the other joint stays.
+    line = next(line for line in done.log.splitlines() if "ros2 topic pub" in line)
+    went = follows(rig, line)
+    assert went == pytest.approx({"arm_1": 0.0, "arm_2": 0.1}, abs=0.01)
+
+
+def follows(rig: Rig, line: str) -> dict[str, float]:
+    """Do what `ros2 topic pub` does with a trajectory; return how far each joint went with it.
+
+    :param line: what is typed.
+    """
+    *words, topic, kind, text = shlex.split(line)
+    assert words == ["ros2", "topic", "pub", "--once"]
+    assert kind == "trajectory_msgs/msg/JointTrajectory"
+    given = yaml.safe_load(text)
+    names, ((goal, after),) = given["joint_names"], [p.values() for p in given["points"]]
+    point = JointTrajectoryPoint(positions=goal, time_from_start=Duration(**after))
+    states = rig.listen("/joint_states", JointState, RELIABLE)
+
+    def now() -> np.ndarray:
+        """Return the mean positions of a while, in the order of the trajectory."""
+        states.clear()
+        rig.until(lambda: len(states) > 30, "the states")
+        told = [dict(zip(state.name, state.position, strict=True)) for state in states]
+        return np.mean([[each[name] for name in names] for each in told], axis=0)
+
+    before = now()
+    mouth = rig.node.create_publisher(JointTrajectory, topic, RELIABLE)
+    rig.until(mouth.get_subscription_count, "the controller")
+    mouth.publish(JointTrajectory(joint_names=names, points=[point]))
+    rig.until(lambda: np.abs(now() - goal).max() < 0.01, "the end of the trajectory")
+    return dict(zip(names, goal - before, strict=True))
 
 
 def test_a_chain_is_opened_as_a_whole_and_closed_again_when_the_tune_is_cancelled(
@@ -107,18 +144,32 @@ def test_a_chain_is_opened_as_a_whole_and_closed_again_when_the_tune_is_cancelle
 
 
 @pytest.mark.nightly
-def test_gains_of_a_chained_controller_are_set_without_a_step(rig: Rig) -> None:
-    robot = Robot(rig, "chain")
-    before = robot.gains()
+@pytest.mark.parametrize(
+    ("kind", "above", "forward", "had"),
+    [
+        ("chain", "base_controller", "forward_left", "p 0.3, i 0.6, d 0"),
+        ("followed", "path_controller", "forward_arm", "p 6, i 0, d 0"),
+    ],
+)
+def test_gains_of_a_chained_controller_are_set_without_a_step(
+    rig: Rig, kind: str, above: str, forward: str, had: str
+) -> None:
+    robot = Robot(rig, kind)
     done = robot.tune("--open")
     assert done.wait(240.0) == 0, done.log
     said = " ".join(done.log.split())
-    assert "references come from base_controller: move it by base_controller, and see" in said
+    assert f"references come from {above}: move it by {above}, and see" in said
     after = robot.gains()
-    assert after != before
-    assert "p {:.6g}, i {:.6g}, d {:.6g}; before: p 0.3, i 0.6, d 0".format(*after) in said
-    whole = "base_controller wheel_controller"
-    assert robot.history() == [whole, "forward_left", whole]
+    assert "p {:.6g}, i {:.6g}, d {:.6g}; before: {}".format(*after, had) in said
+    whole = " ".join(sorted((above, robot.controller)))
+    assert robot.history() == [whole, forward, whole]
+    if kind == "followed":
+        # The chain works again, with the new gains.
+        message = "{joint_names: [arm_2, arm_1], points: [{positions: [-0.1, 0.4], "
+        message += "time_from_start: {sec: 1}}]}"
+        line = f"ros2 topic pub --once /{above}/joint_trajectory "
+        went = follows(rig, f"{line} trajectory_msgs/msg/JointTrajectory '{message}'")
+        assert went == pytest.approx({"arm_1": -0.1, "arm_2": 0.2}, abs=0.02)
 
 
 PLAN = (
