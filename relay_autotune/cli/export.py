@@ -217,7 +217,10 @@ def _comments(gains: Gains, more: Sequence[str], remark: str) -> list[str]:
             "if the program runs at another.",
         ]
         if gains.law != OWN_LAW:
-            told.append("A proof with controller_node was of other gains: those for its own law.")
+            told.append(
+                f"controller_node proves them where its parameter law is {gains.law}; another "
+                f"proof of it was of other gains."
+            )
     return [f"{remark} {line}" for line in (*told, *more)]
 
 

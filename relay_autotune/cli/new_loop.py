@@ -20,6 +20,7 @@ from relay_autotune.cli.export import number
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import ParameterError, SelectionError
+from relay_autotune.loop.laws import LAWS
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
@@ -66,6 +67,15 @@ _OF_NEW_LOOP: dict[str, dict[str, Any]] = {
     },
     "within": {**_LIMITS, "help": "the tune ends where the measurement leaves these [y]"},
     "command_within": {**_LIMITS, "help": "no command beyond these is sent [u]"},
+    "law": {
+        "choices": tuple(LAWS), "metavar": "LAW",
+        "help": "design the gains for the law of another program, such as simple_pid, and prove "
+        "them with that law",
+    },
+    "sample_period": {
+        "type": finite, "metavar": "S",
+        "help": "time between two runs of that program [s]; default: that of the measurement",
+    },
     "verify": {
         "action": argparse.BooleanOptionalAction,
         "help": "prove the gains with a step of the set-point, by a controller_node of its own; "
@@ -195,7 +205,9 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     topics = {"measurement": options.measurement, "command": options.command}
     nodes = {"relay_node": ros_arguments(space, topics, values)}
     if not options.record_only:
-        nodes["identifier_node"] = ros_arguments(space)
+        asked_for = {name: getattr(options, name) for name in ("law", "sample_period")}
+        given = {name: value for name, value in asked_for.items() if value is not None}
+        nodes["identifier_node"] = ros_arguments(space, values=given)
     return OwnNodes(nodes)
 
 

@@ -32,7 +32,9 @@ from relay_autotune.control.verification import (
 )
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
+from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
+from relay_autotune.nodes.controller_parameters import parameters_of_law, rate_from
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
@@ -74,6 +76,7 @@ class _Proof:
     :param within: range of the measurement [y].
     :param commands: range of the command [u].
     :param noise_std: of the measurement [y]; NaN: not known.
+    :param rate: the law that the gains are for; None: our own.
     """
 
     step: float
@@ -85,12 +88,16 @@ class _Proof:
     within: Limits
     commands: Limits
     noise_std: float
+    rate: LawRate | None
 
     def question(self, options: argparse.Namespace, doubt: str) -> str:
         """Say what will move, how far and how long."""
         rest, (least, most) = self.rest, self.expected
+        runs = ""
+        if self.rate is not None:
+            runs = f", which runs {self.rate.law.name} every {self.rate.period:g} s,"
         told = (
-            f"Prove the gains now? A controller_node of this command takes the loop at "
+            f"Prove the gains now? A controller_node of this command{runs} takes the loop at "
             f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
             f"{options.measurement} by {self.step:+g} y and back, and ends at "
             f"{rest.baseline:.6g} u after about {duration(self.takes)}. {options.command} is "
@@ -166,7 +173,8 @@ def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof
     step = options.step or proving_step(record, model, within, commands, noise)
     if not step:
         raise TuningError("the limits leave no room for a step: widen --within")
-    wanted = plan(gains, model, Step(setpoint=step), record.mean_interval)
+    rate = rate_from(parameters_of_law(gains.law, gains.law_period))
+    wanted = plan(gains, model, Step(setpoint=step), record.mean_interval, rate=rate)
     peak = wanted.peak / abs(step)
     low, high = allowed_steps(record, model, within, commands, peak, noise)
     if not options.step:
@@ -181,7 +189,8 @@ def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof
         settles = wanted.duration
     least, most = (commands.clip(rest.baseline + end) for end in wanted.command)
     takes = wanted.duration + 2.0 * settles
-    return _Proof(step, (low, high), (least, most), takes, settles, rest, within, commands, noise)
+    ends = (low, high), (least, most)
+    return _Proof(step, *ends, takes, settles, rest, within, commands, noise, rate)
 
 
 def _made(
@@ -215,6 +224,8 @@ def _made(
             "accept_doubtful": str(doubtful).lower(),
             "record_directory": journal,
         }
+        if proof.rate is not None:
+            values |= parameters_of_law(proof.rate.law.name, proof.rate.period)
         topics = {"measurement": options.measurement}
         nodes.start(_CONTROLLER, ros_arguments(own_namespace(options), topics, values))
         try:
@@ -229,6 +240,12 @@ def _made(
         finally:
             shown.clear()
         print("\n" + "\n".join(found_lines(found, width(), proof.noise_std)), flush=True)
+        if proof.rate is not None:
+            told = (
+                f"controller_node ran {proof.rate.law.name} every {proof.rate.period:g} s; what "
+                f"your program does at a limit of the command was not tried"
+            )
+            print("\n".join(labelled("law", told, width())), flush=True)
         return found
 
 

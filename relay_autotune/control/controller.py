@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.closed_loop import ClosedLoop
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LawRate, RunningLaw
 from relay_autotune.loop.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
 from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
@@ -41,6 +43,8 @@ LONGEST_TIME = 1e9
 _JITTER = 0.2
 # An interval longer than this many nominal ones is a gap; the integral does not run through it.
 _LONGEST_INTERVAL = 5.0
+# A sample that comes this part of a law's period before its next run is taken for that run.
+_EARLY = 0.25
 
 
 @dataclass(frozen=True)
@@ -49,16 +53,18 @@ class GainBounds:
 
     :param kc_max: largest magnitude of the proportional gain [u/y].
     :param ti_min: shortest integral time [s]; no integral action (0) is always allowed.
+    :param rate: the law that runs them; None: our own.
     """
 
     kc_max: float = LARGEST_GAIN
     ti_min: float = 0.0
+    rate: LawRate | None = None
 
     def require(self, gains: Controller) -> None:
         """Refuse gains that are outside.
 
         :param gains: the controller.
-        :raises TuningError: if a gain is outside its bounds.
+        :raises TuningError: if a gain is outside its bounds, or the law cannot run them.
         """
         largest = min(self.kc_max, LARGEST_GAIN)
         longest = max(gains.ti, gains.td, gains.tf)
@@ -71,6 +77,8 @@ class GainBounds:
         elif not 0.0 <= gains.b <= 1.0:
             problem = f"b is {gains.b:g}, expected 0 to 1"
         else:
+            if self.rate is not None:
+                self.rate.of(gains)
             return
         raise TuningError(f"gains out of bounds: {problem}")
 
@@ -175,6 +183,17 @@ class PidController:
         gains = self._gains
         if gains is None:
             return self._command
+        command = self._answer(gains, interval, setpoint, measurement)
+        if is_usable(command):
+            self._command = command
+        else:
+            # The law's memory is no longer valid, so start again from this command.
+            self._law, self._align = None, True
+        return self._command
+
+    def _answer(
+        self, gains: Controller, interval: float, setpoint: float, measurement: float
+    ) -> float:
         law = self._heard(gains, interval, measurement)
         if self._align or not self._automatic:
             # Set the integral so that the command continues from its present value.
@@ -183,13 +202,7 @@ class PidController:
             return self._command
         if not math.isnan(self._nominal):
             interval = min(interval, _LONGEST_INTERVAL * max(self._nominal, self._usual))
-        command = law.command(gains, setpoint, interval, self._limits)
-        if is_usable(command):
-            self._command = command
-        else:
-            # The law's memory is no longer valid, so start again from this command.
-            self._law, self._align = None, True
-        return self._command
+        return law.command(gains, setpoint, interval, self._limits)
 
     def _heard(self, gains: Controller, interval: float, measurement: float) -> PidLaw:
         """Pass a measurement to the filter, over an interval that may vary."""
@@ -209,6 +222,49 @@ class PidController:
         return law
 
 
+class LawController(PidController):
+    """Answer with the law of another program, at the samples that are next to its runs.
+
+    Between its runs the command is held.
+
+    :param rate: the law, and how often it runs.
+    :param others: as of `PidController`.
+    """
+
+    def __init__(self, rate: LawRate, *args: Any, **others: Any) -> None:
+        super().__init__(*args, **others)
+        self._rate = rate
+        self._running: RunningLaw
+        self._wait = 0.0
+
+    def _answer(
+        self, gains: Controller, interval: float, setpoint: float, measurement: float
+    ) -> float:
+        period = self._rate.period
+        if self._align or not self._automatic:
+            self._running = self._rate.of(gains).running()
+            self._running.take_over(setpoint, measurement, self._command)
+            self._align, self._wait = False, period
+            return self._command
+        self._wait -= interval
+        if self._wait > _EARLY * period:
+            return self._command
+        # A sensor that is slower than the law leaves runs out; they are not made up for.
+        self._wait = max(self._wait, -0.5 * period) + period
+        return self._running.step(setpoint, measurement, self._limits)
+
+
+def running(rate: LawRate | None, *args: Any, **others: Any) -> PidController:
+    """Return the controller that runs a law.
+
+    :param rate: the law, and how often it runs; None: our own, at each sample.
+    :param others: as of `PidController`.
+    """
+    if rate is None:
+        return PidController(*args, **others)
+    return LawController(rate, *args, **others)
+
+
 def run_loop(
     gains: Controller,
     model: TransferFunction,
@@ -217,6 +273,7 @@ def run_loop(
     setpoint: float = 0.0,
     load: float = 0.0,
     limits: Limits = UNLIMITED,
+    rate: LawRate | None = None,
 ) -> ClosedLoop:
     """Simulate the controller on the exact process, from rest, after steps of set-point and load.
 
@@ -226,9 +283,10 @@ def run_loop(
     :param setpoint: step of the set-point [y].
     :param load: step added to the command [u].
     :param limits: range of the command, as deviations [u].
+    :param rate: the law, and how often it runs; None: our own, at each sample.
     """
     plant = Plant(model)
-    controller = PidController(gains, 0.0, limits=limits)
+    controller = running(rate, gains, 0.0, limits=limits)
     interval = float(np.median(np.diff(time))) if time.size > 1 else 1.0
     controller.step(-interval, 0.0, 0.0)
     measurement, command = np.empty(time.size), np.empty(time.size)

@@ -16,7 +16,9 @@ from relay_autotune.control.controller import run_loop, scaled
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import UNLIMITED, Limits
+from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
@@ -52,6 +54,9 @@ _CLEAR_OF_NOISE, _OF_WIDE_ROOM = 40.0, 1.0 / 3.0
 LEAST_OF_NOISE = 10.0
 # Part of the way to a limit that a step may go, for its overshoot.
 _OF_ROOM = 0.8
+
+# A sensor whose samples are this many periods of a law apart leaves runs of it out.
+_SLOWER_SENSOR = 1.2
 
 _GAIN_SEARCH = (0.3, 3.0)
 _PREDICTED_SAMPLES = 4000
@@ -231,7 +236,12 @@ def _rounded_down(value: float) -> float:
 
 
 def plan(
-    gains: Controller, model: TransferFunction, step: Step, period: float, noise_std: float = 0.0
+    gains: Controller,
+    model: TransferFunction,
+    step: Step,
+    period: float,
+    noise_std: float = 0.0,
+    rate: LawRate | None = None,
 ) -> Plan:
     """Return how long a step must be observed, and when to stop it.
 
@@ -240,16 +250,26 @@ def plan(
     :param step: the step.
     :param period: sample period of the loop [s].
     :param noise_std: standard deviation of the measurement noise [y].
-    :raises TuningError: if the loop is unstable on the model, or does not settle.
+    :param rate: the law that runs the gains; None: our own.
+    :raises TuningError: if the loop is unstable on the model, does not settle, or has fewer
+        samples than the law has runs.
     """
-    if not is_stable(gains, model):
+    if rate is not None and period > _SLOWER_SENSOR * rate.period:
+        raise TuningError(
+            f"the samples come every {period:.3g} s, and {rate.law.name} runs every "
+            f"{rate.period:.3g} s: these gains can only be proven in their own program; design "
+            f"them for the sensor, with a sampling period of {period:.3g} s"
+        )
+    if not runs_stably(gains, model, rate):
         raise TuningError("these gains make an unstable loop with the model: nothing to verify")
     horizon = max(8.0 * (gains.ti + model.dead_time), LEAST_SAMPLES * period)
     for _ in range(_DOUBLINGS):
         # Predict a slow loop with fewer samples, to save time.
         interval = max(period, horizon / _PREDICTED_SAMPLES)
+        if rate is not None:
+            interval = max(period, min(interval, rate.period))
         time = np.arange(int(horizon / interval) + 2, dtype=np.float64) * interval
-        run = run_loop(gains, model, time, setpoint=step.setpoint, load=step.load)
+        run = run_loop(gains, model, time, setpoint=step.setpoint, load=step.load, rate=rate)
         response = describe(time, run.measurement, step)
         if response.settling_time < 0.6 * horizon:
             duration = max(WATCHED * response.settling_time, LEAST_SAMPLES * period)
@@ -303,6 +323,7 @@ def compare(
     *,
     limits: Limits = UNLIMITED,
     noise_std: float = 0.0,
+    rate: LawRate | None = None,
 ) -> Comparison:
     """Compare a measured step with the prediction.
 
@@ -313,6 +334,7 @@ def compare(
     :param deviation: measurement minus its value before the step [y], shape (n,).
     :param limits: range of the command, relative to its value before the step [u].
     :param noise_std: standard deviation of the measurement noise [y].
+    :param rate: the law that runs the gains; None: our own.
     """
 
     def predict(factor: float) -> FloatArray:
@@ -323,6 +345,7 @@ def compare(
             setpoint=step.setpoint,
             load=step.load,
             limits=limits,
+            rate=rate,
         )
         return run.measurement
 
@@ -338,7 +361,7 @@ def compare(
     rms = math.sqrt(float(np.mean((deviation - predicted) ** 2)))
     measured = describe(time, deviation, step, noise_std)
     expected = describe(time, predicted, step)
-    ms, ms_predicted = _ms(gains, scaled(model, ratio)), _ms(gains, model)
+    ms, ms_predicted = _ms(gains, scaled(model, ratio), rate), _ms(gains, model, rate)
     compared = _comparisons(measured, expected, ratio, ms, ms_predicted, time)
     # Written so that NaN does not pass.
     told = problems = [c.problem for c in compared if not c.taken <= 1.0]
@@ -365,9 +388,24 @@ def compare(
     )
 
 
-def _ms(gains: Controller, model: TransferFunction) -> float:
-    if not is_stable(gains, model):
+def runs_stably(gains: Controller, model: TransferFunction, rate: LawRate | None) -> bool:
+    """Return whether the closed loop is stable.
+
+    :param gains: the controller.
+    :param model: the process.
+    :param rate: the law that runs the gains; None: our own.
+    :raises TuningError: if the law cannot run them.
+    """
+    if rate is None:
+        return is_stable(gains, model)
+    return SampledLoop(rate.of(gains), model).unstable == 0
+
+
+def _ms(gains: Controller, model: TransferFunction, rate: LawRate | None) -> float:
+    if not runs_stably(gains, model, rate):
         return math.nan
+    if rate is not None:
+        return SampledLoop(rate.of(gains), model).ms()
     loop = gains.loop(model)
     return sensitivity_peaks(loop, frequencies(loop))[0]
 

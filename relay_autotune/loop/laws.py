@@ -25,7 +25,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import TuningError, look_up
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.sampled import filter_matrices, require_period
+from relay_autotune.loop.sampled import UNLIMITED, Limits, filter_matrices, require_period
 
 # Largest excess of a weight that counts as the same.
 _SAME_WEIGHT = 0.005
@@ -362,12 +362,14 @@ class SampledLaw:
         return np.asarray(through * z ** float(-self.law.delay))
 
     def running(self) -> RunningLaw:
-        """Return the law as it runs, from rest and without limits."""
+        """Return the law as it runs, from rest."""
         return RunningLaw(self)
 
 
 class RunningLaw:
-    """A law that is called once for each sample, from rest and without limits.
+    """A law that is called once for each sample, from rest.
+
+    At a limit its integral stops, whatever its program does there.
 
     :param law: the law with its gains.
     """
@@ -380,22 +382,69 @@ class RunningLaw:
         self._integral = _Running(law.integral)
         self._derivative = _Running(law.derivative)
         self._waiting = [0.0] * law.law.delay
+        self._setpoint = self._measurement = self._total = self._bias = 0.0
 
-    def step(self, setpoint: float, measurement: float) -> float:
+    def take_over(self, setpoint: float, measurement: float, command: float) -> None:
+        """Go on from a command without a bump, as if all had been constant until now.
+
+        The integral takes up the difference. To be called before the first sample.
+
+        :param setpoint: y.
+        :param measurement: y.
+        :param command: u.
+        """
+        self._setpoint, self._measurement = setpoint, measurement
+        self._bias = command - self._gains.kc * self._gains.b * setpoint
+        self._waiting = [command] * len(self._waiting)
+
+    def step(self, setpoint: float, measurement: float, limits: Limits = UNLIMITED) -> float:
         """Return the command for this sample [u].
 
         :param setpoint: y.
         :param measurement: y.
+        :param limits: range of the command.
         """
-        value = self._value.step(measurement)
-        moved = measurement - setpoint if self._on_error else measurement
-        command = (
-            self._gains.kc * (self._gains.b * setpoint - value)
-            + self._integral.step(setpoint - value)
+        moved = measurement - self._measurement
+        value = self._value.step(moved)
+        if self._on_error:
+            moved -= setpoint - self._setpoint
+        before = self._total
+        self._total = self._integral.step(setpoint - self._measurement - value)
+        wanted = (
+            self._bias
+            + self._gains.kc * (self._gains.b * setpoint - value)
+            + self._total
             - self._derivative.step(moved)
         )
-        self._waiting.append(command)
+        given = limits.clip(wanted)
+        if (wanted - given) * (self._total - before) > 0.0:
+            self._bias -= self._total - before
+        self._waiting.append(given)
         return self._waiting.pop(0)
+
+
+@dataclass(frozen=True)
+class LawRate:
+    """A law, and how often a program runs it.
+
+    :param law: the law.
+    :param period: of its runs [s].
+    :raises TuningError: if the period is not positive and finite.
+    """
+
+    law: Law
+    period: float
+
+    def __post_init__(self) -> None:
+        require_period(self.period)
+
+    def of(self, gains: Controller) -> SampledLaw:
+        """Return the law with gains, those parts left out that it lacks.
+
+        :param gains: the gains.
+        :raises TuningError: if it cannot run them.
+        """
+        return self.law.at(self.law.best(gains, self.period), self.period)
 
 
 def _tracking(law: SampledLaw) -> float | None:

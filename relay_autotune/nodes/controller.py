@@ -17,11 +17,10 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
-from relay_autotune.control.controller import GainBounds, PidController, is_usable
+from relay_autotune.control.controller import GainBounds, is_usable, running
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.verification import Step
+from relay_autotune.control.verification import Step, runs_stably
 from relay_autotune.errors import FieldError, ParameterError, RelayAutotuneError, TuningError
-from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import (
@@ -34,6 +33,7 @@ from relay_autotune.nodes.controller_parameters import (
     gains_from,
     limits_from,
     range_from,
+    rate_from,
 )
 from relay_autotune.nodes.following import FOLLOW_EVERY, Following
 from relay_autotune.nodes.gains_journal import GainsJournal
@@ -71,10 +71,10 @@ class ControllerNode(ServedNode):
         declare(self, FIXED, read_only=True)
         values = values_of(self, (*GAINS, *OTHERS, *FIXED))
         require_own_time(values["sample_period"], values["repeat_period"])
-        gains = gains_from(values)
+        gains, self._rate = gains_from(values), rate_from(values)
         if gains is not None:
-            bounds_from(values).require(gains)
-        self._results = ResultCheck(self, is_stable)
+            bounds_from(values, self._rate).require(gains)
+        self._results = ResultCheck(self, lambda c, model: runs_stably(c, model, self._rate))
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
         # Why those that came since were refused; empty: none were.
@@ -85,7 +85,8 @@ class ControllerNode(ServedNode):
         self._predictors = Predictors(self._results.models)
         self._limits = limits_from(values)
         self._range = range_from(values)
-        self._pid = PidController(
+        self._pid = running(
+            self._rate,
             gains,
             values["initial_command"],
             limits=self._limits,
@@ -115,7 +116,7 @@ class ControllerNode(ServedNode):
             ended=self._after_verification,
         )
         self._remote: RemoteLoop | None = None
-        self._place: OwnGains | RemoteGains = OwnGains(self._use)
+        self._place: OwnGains | RemoteGains = OwnGains(self._use, self._rate)
         self._reported, setpoints = reported_by(values)
         if values["apply_to"]:
             mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
@@ -161,11 +162,14 @@ class ControllerNode(ServedNode):
         self.create_service(SetBool, "~/automatic", self._on_automatic)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
+        rate = self._rate
+        under = "" if rate is None else f"{rate.law.name} {rate.period:g} s"
         journal = GainsJournal(
             Path(values["record_directory"]).expanduser(),
             self.get_fully_qualified_name(),
             self.context.get_domain_id(),
-            f"{measurement.topic_name} {values['apply_to']}".strip(),
+            # The same numbers are other gains under another law.
+            " ".join(filter(None, (measurement.topic_name, values["apply_to"], under))),
         )
         given = set_of(gains) if gains is not None and self._remote is None else None
         self._keeper = GainsKeeper(self, self._place, journal, given)
@@ -316,11 +320,7 @@ class ControllerNode(ServedNode):
             return
         name = message.experiment_id
         try:
-            if gains.law not in self._place.laws:
-                raise TuningError(
-                    f"they are for the law {gains.law}, which {self._place.name} does not run: "
-                    f"write them to a file with apply_gains --file, or tune without that law"
-                )
+            self._place.require_law(gains)
             self._bounds.require(gains)
             self._keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
@@ -346,7 +346,7 @@ class ControllerNode(ServedNode):
 
     @property
     def _bounds(self) -> GainBounds:
-        return bounds_from(values_of(self, OTHERS))
+        return bounds_from(values_of(self, OTHERS), self._rate)
 
     def _on_model(self, message: Any) -> None:
         if message.final and self._results.model(message) is not None:
@@ -460,7 +460,7 @@ class ControllerNode(ServedNode):
                 f"the model that would predict the step is {doubt}; set the parameter "
                 "accept_doubtful to true to step all the same"
             )
-        return Verifiable(self._place.controller_of(kept), model, self._limits)
+        return Verifiable(self._place.controller_of(kept), model, self._limits, self._rate)
 
     async def _begin_verification(self) -> None:
         await self._keeper.begin_verification()
@@ -554,7 +554,7 @@ class ControllerNode(ServedNode):
             values = merged(self, (*GAINS, *OTHERS), changes)
             limits_from(values)
             range_from(values)
-            gains, bounds = gains_from(values), bounds_from(values)
+            gains, bounds = gains_from(values), bounds_from(values, self._rate)
             if gains is not None:
                 bounds.require(gains)
             if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:

@@ -17,11 +17,14 @@ from relay_autotune.control.controller import (
 )
 from relay_autotune.errors import ParameterError
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.quantities import Quantity
 
+# Names of the law that the node runs by itself.
+OWN_LAWS = ("", OWN_LAW)
 # Answer of ~/apply where no gains have come since the last were applied or discarded.
 NONE_WAIT = "no gains wait to be applied"
 GAINS = (
@@ -117,6 +120,21 @@ FIXED = (
         "Set-point until one comes; NaN: the first measurement.",
     ),
     Quantity("initial_command", 0.0, "u", "Command from which it starts."),
+    Quantity(
+        "law",
+        "",
+        "",
+        "Law of another program that this node runs in place of its own, so that gains for it "
+        "can be applied and proven; empty: its own.",
+        choices=("", *LAWS),
+    ),
+    Quantity(
+        "law_period",
+        0.0,
+        "s",
+        "Time between two runs of that law; 0: not given.",
+        0.0,
+    ),
     Quantity("manual", False, "", "True: it starts in manual, holding initial_command."),
     Quantity(
         "sample_period",
@@ -211,9 +229,41 @@ def range_from(values: Mapping[str, Any]) -> Limits:
     return Limits(low, high)
 
 
-def bounds_from(values: Mapping[str, Any]) -> GainBounds:
+def bounds_from(values: Mapping[str, Any], rate: LawRate | None) -> GainBounds:
     """Return the bounds for new gains.
 
     :param values: the parameters by name.
+    :param rate: of `rate_from`.
     """
-    return GainBounds(values["kc_max"], values["ti_min"])
+    return GainBounds(values["kc_max"], values["ti_min"], rate)
+
+
+def rate_from(values: Mapping[str, Any]) -> LawRate | None:
+    """Return the law that the node runs, None if it is its own.
+
+    :param values: the parameters by name, at least those of `parameters_of_law`.
+    :raises ParameterError: if its period is not given, or another node has the gains.
+    """
+    law = values.get("law", "")
+    if law in OWN_LAWS:
+        return None
+    period = values["law_period"]
+    if values.get("apply_to"):
+        raise ParameterError(
+            f"law is {law}, which this node would run itself, and apply_to is "
+            f"{values['apply_to']}, which runs its own: give only one of them"
+        )
+    if period == 0.0:
+        raise ParameterError(
+            f"law is {law} and law_period is 0 s: give the time between two runs of its program"
+        )
+    return LawRate(LAWS[law], period)
+
+
+def parameters_of_law(law: str, period: float) -> dict[str, Any]:
+    """Return the parameters with which the node runs a law; none for its own.
+
+    :param law: its name.
+    :param period: of its runs [s].
+    """
+    return {} if law in OWN_LAWS else {"law": law, "law_period": period}

@@ -20,6 +20,7 @@ from relay_autotune.control.gains_history import (
     Work,
 )
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 
@@ -33,8 +34,12 @@ class Place(Protocol):
     name: str
     outlives: bool
     """True if the gains stay in force when this process ends."""
-    laws: tuple[str, ...]
-    """Laws that it may run, by the names of :data:`~relay_autotune.loop.laws.LAWS`; "": none."""
+
+    def require_law(self, gains: Gains) -> None:
+        """Refuse gains that are for a law which does not run there.
+
+        :raises TuningError: with what to do.
+        """
 
     async def read(self) -> GainSet | None:
         """Return the gains in force, None if the command is held."""

@@ -14,8 +14,8 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.errors import ParameterError, RelayAutotuneError
-from relay_autotune.loop.gains import Controller
+from relay_autotune.errors import ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes.lifetime import STEADY
 
@@ -84,8 +84,6 @@ class RemoteGains:
     """
 
     outlives = True
-    # Laws of nodes whose parameters are the gains themselves.
-    laws: tuple[str, ...] = ("", *(name for name, law in LAWS.items() if law.sets_gains))
 
     def __init__(
         self, node: Node, target: str, mapping: Mapping[str, str], feedforward: float = 0.0
@@ -104,6 +102,17 @@ class RemoteGains:
                 (SetParametersAtomically, "set_parameters_atomically"),
             )
         )
+
+    def require_law(self, gains: Gains) -> None:
+        """Refuse gains for a program whose parameters are not the gains themselves.
+
+        :raises TuningError: with what to do.
+        """
+        if gains.law and not LAWS[gains.law].sets_gains:
+            raise TuningError(
+                f"they are for the law {gains.law}, which {self.name} does not run: write them "
+                f"to a file with apply_gains --file, or tune without that law"
+            )
 
     def set_of(self, controller: Controller) -> GainSet:
         """Return the parameters of a controller.

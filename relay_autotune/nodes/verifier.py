@@ -23,6 +23,7 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import conclude
@@ -67,11 +68,13 @@ class Verifiable:
     :param gains: the controller in force.
     :param model: the process as identified.
     :param limits: range of the command.
+    :param rate: the law that runs them; None: our own.
     """
 
     gains: Controller
     model: TransferFunction
     limits: Limits
+    rate: LawRate | None = None
 
 
 class Predictors:
@@ -252,7 +255,8 @@ class Verifier:
         self._tried, self._steps, self._rest, self._period = tried, steps, rest, period
 
         def plans() -> list[Plan]:
-            return [plan(tried.gains, tried.model, s, period, rest.noise_std) for s in steps]
+            loop = tried.gains, tried.model
+            return [plan(*loop, s, period, rest.noise_std, tried.rate) for s in steps]
 
         self._node.compute(plans, partial(self._planned, goal))
 
@@ -492,6 +496,7 @@ def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Re
         y - rest.measurement,
         limits=Limits(limits.low - rest.command, limits.high - rest.command),
         noise_std=rest.noise_std,
+        rate=tried.rate,
     )
     message = Verification(
         kind=Verification.SETPOINT if step.setpoint else Verification.LOAD,

@@ -188,7 +188,7 @@ def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
     lines = text.splitlines()
     assert all(line.startswith(law.remark) for line in lines[:6])
     assert f"Designed for {name} every 0.5 s." in text
-    assert ("controller_node was of other gains" in text) == (name != "controller_node")
+    assert ("another proof of it was of other gains" in text) == (name != "controller_node")
     found = settings_of("\n".join(line for line in lines if not line.startswith(law.remark)))
     assert list(found) == [each.name for each in law.settings]
     gains = tune_model(

@@ -91,6 +91,13 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
     assert set(nodes_for(Looker(), given)._nodes) == {"relay_node", "identifier_node"}
 
 
+def test_the_law_of_another_program_is_designed_for() -> None:
+    given = options("--within", "30", "50", "--at", "2", "--command-within", "0", "5")
+    given.law, given.sample_period = "simple_pid", 0.1
+    words = nodes_for(Looker(), given)._nodes["identifier_node"]
+    assert {"law:=simple_pid", "sample_period:=0.1"} < set(words)
+
+
 def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -> None:
     typed += ["two", "2", "30", "30 50", "0, 5"]
     found = arguments(Looker(), options())

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from fopdt_plant import FopdtPlant
 
+from relay_autotune.control.controller import LawController
+from relay_autotune.control.verification import Step, compare, plan
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.closed_loop import simulate_closed_loop
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, law_named
-from relay_autotune.loop.sampled import SampledPid
+from relay_autotune.loop.laws import LAWS, LawRate, law_named
+from relay_autotune.loop.sampled import Limits, SampledPid
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -308,3 +310,47 @@ def test_gains_that_a_law_cannot_run_are_refused():
     wild = law_named("simple_pid").at(Controller(30.0, 1.0), PERIOD)
     with pytest.raises(TuningError, match="simple_pid runs it every"):
         analyse_sampled(wild, PROCESS)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_controller_that_runs_a_law_does_what_its_source_does_about_a_rest(name):
+    rate = LawRate(law_named(name), PERIOD)
+    gains = rate.of(WANTED)
+    source, controller = Source(name, gains.gains), LawController(rate, WANTED, 2.0)
+    assert controller.step(7.0, 40.0, 40.0) == 2.0
+    rng = np.random.default_rng(4)
+    for k, (r, y) in enumerate(rng.standard_normal((40, 2)), start=1):
+        late = k + 0.2 * rng.uniform(-1.0, 1.0)
+        found = controller.step(7.0 + late * PERIOD, 40.0 + r, 40.0 + y)
+        assert found == pytest.approx(2.0 + source.step(r, y), rel=1e-9, abs=1e-9)
+        # A sample between two runs is not answered.
+        assert controller.step(7.0 + (late + 0.4) * PERIOD, 40.0, 30.0) == found
+
+
+@pytest.mark.parametrize("name", ["pid_controller", "klipper_heater", "iec_61131_3_pid"])
+def test_a_step_of_a_law_is_predicted_as_its_source_makes_it(name):
+    rate = LawRate(law_named(name), PERIOD)
+    gains, step = Controller(kc=0.9, ti=2.0, td=0.2), Step(setpoint=0.5)
+    wanted = plan(gains, PROCESS, step, PERIOD, rate=rate)
+    plant, source = FopdtPlant(0.9, 2.0, 0.8), Source(name, rate.of(gains).gains)
+    time, command = np.arange(int(wanted.duration / PERIOD)) * PERIOD, 0.0
+    seen = np.empty(time.size)
+    for k, t in enumerate(time):
+        seen[k] = plant.advance(t, command)
+        command = source.step(step.setpoint, seen[k])
+    found = compare(gains, PROCESS, step, time, seen, rate=rate)
+    assert found.passed, found.reason
+    assert found.predicted == pytest.approx(seen, abs=1e-6)
+    assert found.ms_predicted == SampledLoop(rate.of(gains), PROCESS).ms()
+    with pytest.raises(TuningError, match=f"{name} runs every 0.25 s"):
+        plan(gains, PROCESS, step, 2.0 * PERIOD, rate=rate)
+
+
+def test_at_a_limit_the_integral_of_a_law_stops():
+    rate = LawRate(law_named("control_toolbox_none"), PERIOD)
+    controller = LawController(rate, Controller(0.5, 2.0), 0.9, limits=Limits(0.0, 1.0))
+    commands = [controller.step(k * PERIOD, 41.0, 40.0) for k in range(200)]
+    assert commands[0] == 0.9
+    assert set(commands[5:]) == {1.0}
+    # Without the windup of 50 s the command leaves the limit as soon as the error turns.
+    assert controller.step(200 * PERIOD, 40.0, 40.0) < 0.6

@@ -9,6 +9,7 @@ import math
 import shutil
 import signal
 import subprocess
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -225,6 +226,41 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     assert parameters_of(rig) == [0.3, 0.8]
     # Only one earlier set exists, so there is one revert at most.
     assert len(result.steps) <= 1
+
+
+def test_gains_for_another_law_are_proven_by_a_node_that_runs_it(rig: Rig) -> None:
+    rig.plant(**PLANT)
+    commands = rig.listen("command", Float64, RELIABLE)
+    law = {"law": "pid_controller", "law_period": 0.1}
+    controller = rig.start(
+        "controller_node", "-r", "controller_command:=command",
+        **CONTROLLER, **law, verify_step=0.3, auto_apply=True,
+    )  # fmt: skip
+    experiments = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
+    models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+    gains = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+    experiments.publish(experiment_of(PROCESS, "of a law"))
+    model = TransferFunction(final=True, numerator=[2.0], denominator=[0.8, 1.0], dead_time=0.4)
+    model.experiment_id, model.verdict = "of a law", TransferFunction.VERDICT_TRUSTED
+    models.publish(model)
+    sent = PidGains(final=True, kc=0.4, ti=0.8, td=0.12, b=1.0, experiment_id="of a law")
+    sent.verdict = PidGains.VERDICT_TRUSTED
+    sent.law, sent.law_period = "pid_controller", 0.2
+    gains.publish(sent)
+    rig.until(lambda: "and this node runs it every 0.1 s" in controller.log, "the refusal")
+    sent.law_period = 0.1
+    gains.publish(sent)
+    rig.until(lambda: rig.values("controller_node", "kc", "td") == [0.4, 0.12], "the gains")
+    rig.until(lambda: len(commands) > 400, "a closed loop")
+    status, result = verify(rig)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
+    assert result.passed, result.reason
+    # The law takes the derivative of the error, so that a step of the set-point jumps through it,
+    # and it runs at every fifth sample.
+    values = [message.data for message in commands]
+    assert max(values) > 1.0 + 0.9 * (0.4 + 0.4 * 0.12 / 0.1) * 0.3
+    changes = sum(a != b for a, b in pairwise(values))
+    assert changes == pytest.approx(len(values) / 5.0, rel=0.15)
 
 
 def test_doubtful_gains_are_never_applied_by_themselves(rig: Rig) -> None:
