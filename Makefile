@@ -13,6 +13,8 @@ ENTER = . ./env.sh
 SOURCES = setup.py docs/conf.py launch relay_autotune test tools $(wildcard bags benchmarks)
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
+# without the cached bytecode each of some hundred nodes and commands would compile its modules again
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: setup demo test test-nightly test-web test-core test-oldest test-system test-rest lint docs release clean
 

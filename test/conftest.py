@@ -11,6 +11,10 @@ import signal
 import pytest
 from hypothesis import settings
 
+# Before numpy, as in nodes and commands: small matrices gain nothing by a second thread, which
+# would only take the processor from the tests beside.
+import relay_autotune.threads  # noqa: F401
+
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
