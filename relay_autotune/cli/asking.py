@@ -27,23 +27,21 @@ _TWO = re.compile(_NUMBER + _BETWEEN + _NUMBER, re.IGNORECASE)
 _DASHES = str.maketrans(dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}", "-"))
 
 
-def asked_for_file(what: str, others: Collection[str], how: str) -> str:
-    """Ask for a file to write; return its name, empty for none.
+def asked_for_file(what: str, names: Collection[str]) -> str:
+    """Ask for a file to write; return its name, or one of some programs, empty for none.
 
     :param what: what would be written.
-    :param others: what can be written by another command only.
-    :param how: that command, with NAME in place of one of these.
+    :param names: programs that may be named in its place.
     """
     while True:
-        answer = _input(f"{what}, to which file? [none]: ")
+        answer = _input(f"{what}: file name, or another program [none]: ")
         if answer.lower() in ("n", "no", "none"):
             return ""
-        if answer.lower() in ("y", "yes"):
-            told = "expected the name of a file, such as gains.yaml, or Enter for none"
-        elif answer.lower() in others:
-            told = f"{answer} is no file; after this command type {how.replace('NAME', answer)}"
-        else:
+        if answer.lower() in names:
+            return answer.lower()
+        if answer.lower() not in ("y", "yes"):
             return str(Path(answer).expanduser()) if answer else ""
+        told = "expected the name of a file, such as gains.yaml, or Enter for none"
         print(told, file=sys.stderr)
 
 

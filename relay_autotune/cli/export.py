@@ -19,7 +19,7 @@ from pathlib import Path
 
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.laws import LAWS, OWN_LAW, Law
+from relay_autotune.loop.laws import LAWS, OWN_LAW, Law, SampledLaw
 from relay_autotune.quantities import told_fields
 
 _DIGITS = 10
@@ -38,6 +38,7 @@ class Target:
     :param dof: name of the degree of freedom, a key of the parameter `gains`.
     :param command_min: lower clamp of the command [u]; -inf: none.
     :param command_max: upper clamp of the command [u]; inf: none.
+    :param present: the command at which the process rests [u]; NaN: not known.
     :raises SelectionError: if a name cannot be that of a node or parameter, or a clamp is NaN or
         above the other.
     """
@@ -46,6 +47,7 @@ class Target:
     dof: str = "joint"
     command_min: float = -math.inf
     command_max: float = math.inf
+    present: float = math.nan
 
     def __post_init__(self) -> None:
         if not _NODE.match(self.node):
@@ -139,8 +141,22 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
         told += (f"{sign}, with kc {gains.kc:.6g}.",)
     lines = _comments(gains, told, law.remark)
+    lines += _start(law.at(gains, gains.law_period), target.present)
     lines += [law.line.format(name=name, value=value) for name, value in _values(gains, law)]
     return "\n".join(lines) + "\n"
+
+
+def _start(law: SampledLaw, present: float) -> list[str]:
+    """Return how a program starts without a bump, where it can."""
+    start = law.law.start
+    if start is None:
+        return []
+    known = "" if math.isnan(present) else f" At the tune it was {present:.6g} u."
+    lines = [f"{law.law.remark} Start without a bump: {start.words}{known}"]
+    if start.name and known:
+        value = number(start.value(law, present))
+        lines.append(law.law.line.format(name=start.name, value=value))
+    return lines
 
 
 def _values(gains: Gains, law: Law) -> list[tuple[str, str]]:

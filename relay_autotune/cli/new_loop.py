@@ -218,11 +218,11 @@ def ros_arguments(
 ) -> list[str]:
     """Return the arguments for ROS of a node.
 
-    :param namespace: of the node.
+    :param namespace: of the node; empty: the root.
     :param topics: the names of its topics.
     :param values: of its parameters.
     """
-    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"]
+    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else []
     for name, topic in (topics or {}).items():
         arguments += ["-r", f"{name}:={topic}"]
     for name, value in (values or {}).items():

@@ -25,23 +25,31 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from relay_autotune.cli.after_tune import (
+    PATIENCE,
+    PROGRAM,
+    HandedOver,
+    hand_over,
+    left,
+    left_its_limits,
+    prefix,
+    repeated,
+)
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
     USAGE,
-    as_typed,
     deserved,
     finite,
     guarded,
     say,
 )
-from relay_autotune.cli.asking import agrees, asked_for_file
-from relay_autotune.cli.export import EXPORTS, Target, exported, exports_of, write
+from relay_autotune.cli.asking import agrees
+from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.joint_tune import JointTune, add_joint, is_of_joint
-from relay_autotune.cli.layout import Help, labelled, width
+from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     START_WITHIN,
     add_new_loop,
@@ -64,23 +72,16 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError
-from relay_autotune.exchange.messages import gains_from_message
-from relay_autotune.experiment.experiment import OUTSIDE_LIMITS
-from relay_autotune.experiment.settling import NO_REST_AT
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.cli.own_nodes import OwnNodes
     from relay_autotune.nodes.tune_client import TuneClient
-
-PROGRAM = "tune_loop"
 # Time between two updates of a terminal [s].
 _TICK = 0.25
 # Parts of the checklist's lines on rest while few samples have come, and on the model while
 # identifier_node is not discovered.
 NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
-# How long to wait for what the report needs from the nodes [s].
-_PATIENCE = 5.0
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -343,110 +344,31 @@ def _conclude(
         say(PROGRAM, refused)
     if not result.experiment.experiment_id:
         return _nothing_started(client, options)
+    outside = left_its_limits(client, options)
     if not options.json:
         paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
         new = nodes is not None and joint is None
-        left = _left(result, options.at) if new else ""
-        print("\n".join(result_lines(result, cancelled, paint, width(), left)), flush=True)
+        told = left(result, options.at, outside) if new else ""
+        print("\n".join(result_lines(result, cancelled, paint, width(), told)), flush=True)
     flags, report = _afterwards(client, options)
     # Gains of nodes that end with this command cannot be asked for later.
     controllers = client.controllers() if nodes is None else []
-    proven = None
+    done = HandedOver()
     if options.json:
         print(json.dumps(document(result, client.name, cancelled, report)))
     else:
         if nodes is not None and result.gains.experiment_id:
-            proven = _hand_over(client, options, nodes, joint)
-        steps = next_commands(result, controllers, _prefix(), flags, report)
-        steps += _repeated(result, options, proven)
+            done = hand_over(client, options, _parser(), nodes, joint)
+        steps = done.steps + next_commands(result, controllers, prefix(), flags, report)
+        steps += repeated(result, options, _parser(), done.proven, outside)
         if steps:
             print("\nNext:")
         for what, command in steps:
             print(f"  {what:<26} {command}")
     complete = result.gains.experiment_id or options.record_only
     written = report or not options.report
-    found = client.succeeded and complete and written and proven is not False
+    found = client.succeeded and complete and written and done.proven is not False
     return deserved(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
-
-
-def _left(result: Any, command: float) -> str:
-    """Return at which command a loop of two topics is left, and whether that is the right one."""
-    if result.reason.startswith(NO_REST_AT):
-        return (
-            f"the command stands at {command:.6g} u, which is not the one at which the process "
-            f"rested: set the right one now"
-        )
-    left = f"the plant is left at the safe command {command:.6g} u"
-    if OUTSIDE_LIMITS in result.reason:
-        left += ": look whether the process rests there, else set the right one now"
-    return left
-
-
-def _hand_over(
-    client: TuneClient, options: argparse.Namespace, nodes: OwnNodes, joint: JointTune | None
-) -> bool | None:
-    """Offer to apply or to prove the gains, and to write them for another controller.
-
-    :return: whether they passed, or are in force with a joint; None: that was not wanted.
-    """
-    result, proven, unless = client.result, None, ""
-    doubt = result.verdict_reason if result.verdict != Verdict.TRUSTED else ""
-    if joint is None:
-        # Imported here, because it loads slowly and must not delay a tune.
-        from relay_autotune.cli.proof import prove
-
-        outcome = prove(client, nodes, options)
-        proven = outcome.passed
-        doubt, unless = outcome.against or doubt, " all the same" * bool(outcome.against)
-    how, file = exports_of(result.gains.law)[0], options.export
-    if not (file or joint or options.yes) and sys.stdin.isatty():
-        replay = f"{_prefix()}replay {shlex.quote(result.bag)}"
-        other = f"{replay} --export NAME --sample-period S > FILE"
-        names = ", ".join(name for name in EXPORTS if name != how)
-        told = f"{other}, with NAME {names}, and S the time between two runs of the controller [s]"
-        # What replay writes does not say that these gains have failed.
-        lines = [] if unless else labelled("other programs", told, width())
-        print("\n".join(["", *lines]))
-        what = f"Write the gains for {how} of ros2_controllers{unless}"
-        file = asked_for_file(what, EXPORTS, other)
-    if file:
-        target = joint.target if joint else Target()
-        write(exported(gains_from_message(result.gains), how, target, doubt=doubt), file)
-        print(f"  {'gains for':<16} {how}: {Path(file).resolve()}")
-    if joint is not None and joint.applies:
-        print()
-        return joint.apply(nodes, doubt) == DONE
-    return proven
-
-
-def _repeated(
-    result: Any, options: argparse.Namespace, proven: bool | None
-) -> list[tuple[str, str]]:
-    """Return the commands that repeat the tune, with its answers as flags, or prove its gains."""
-    words = options.typed
-    new = not options.joint and is_new_loop(options)
-    if new:
-        words = shlex.split(as_typed(PROGRAM, _parser(), options, verify=None))[1:]
-    again = _prefix() + shlex.join([PROGRAM, *words])
-    if result.gains.experiment_id:
-        # Nodes that end with this command cannot prove them later.
-        return [("prove the gains", f"{again} --verify")] if new and proven is None else []
-    if result.outcome == result.COMPLETED:
-        return []
-    if new and result.reason.startswith(NO_REST_AT):
-        # The same command again would drive the process away again.
-        return [("once it rests", "start again with --at and the command at which it rests")]
-    if new and OUTSIDE_LIMITS in result.reason:
-        told = (
-            "start again with the --at at which it rests, a smaller --amplitude, or wider --within"
-        )
-        return [("once it rests", told)]
-    steps = [("run it again", again)]
-    if result.reason.startswith("no measurement on "):
-        topic = result.reason.split()[3]
-        told = f"look at the sensor (ros2 topic hz {topic}) and the load of the machine (uptime)"
-        steps.append(("if it happens again", told))
-    return steps
 
 
 def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
@@ -459,14 +381,10 @@ def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
         print("\n".join(check_lines(checks, width())))
     if client.succeeded and not options.json:
         again = [word for word in options.typed if word != "--dry-run"]
-        print(f"\nNext:\n  {'start it':<26} {_prefix()}{shlex.join((PROGRAM, *again))}")
+        print(f"\nNext:\n  {'start it':<26} {prefix()}{shlex.join((PROGRAM, *again))}")
     if not client.succeeded:
         say(PROGRAM, f"{client.name} refuses: {reason}")
     return DONE if client.succeeded else NOTHING_FOUND
-
-
-def _prefix() -> str:
-    return "" if shutil.which("replay") else "ros2 run relay_autotune "
 
 
 def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, str]:
@@ -476,7 +394,7 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
         # Imported here, because it loads slowly and must not delay a tune.
         from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
 
-        values = None if options.record_only else client.identifier_values(_PATIENCE)
+        values = None if options.record_only else client.identifier_values(PATIENCE)
     flags = flags_of(values) if values is not None else ""
     if not options.report:
         return flags, ""
@@ -485,7 +403,7 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
             say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
         with Working("writing the report"):
             told = report_of_tune(
-                client.record(_PATIENCE),
+                client.record(PATIENCE),
                 values or defaults(),
                 result,
                 result.bag or client.name,

@@ -34,8 +34,6 @@ _OUTCOMES = {
 }
 
 
-OUTSIDE_LIMITS = "is outside its limits"
-"""What the reason contains if the measurement left its limits."""
 _BASELINE = SafePolicy()
 
 
@@ -402,7 +400,7 @@ class RelayExperiment:
         if not p.measurement_min <= y <= p.measurement_max:
             procedure.end(
                 State.ABORTED,
-                f"the measurement {y:g} at {t:g} s {OUTSIDE_LIMITS}, {p.measurement_min:g} "
+                f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
                 f"to {p.measurement_max:g}",
             )
         elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:

@@ -219,6 +219,20 @@ class Setting:
 
 
 @dataclass(frozen=True)
+class Start:
+    """How a program begins from the present command.
+
+    :param words: what to do, a sentence.
+    :param name: the input that takes the value; empty: it has none.
+    :param value: of that input, from the law with its gains and the command [u].
+    """
+
+    words: str
+    name: str = ""
+    value: Callable[[SampledLaw, float], float] = lambda _law, command: command
+
+
+@dataclass(frozen=True)
 class Law:
     """A control law that some program runs.
 
@@ -239,6 +253,7 @@ class Law:
     :param line: how a setting is written, with ``{name}`` and ``{value}``.
     :param remark: beginning of a line that is a comment.
     :param sign: what to know where its gains have not the sign of kc; ``{sign}`` is theirs.
+    :param start: how it begins from the present command; None: its program has no way.
     """
 
     name: str
@@ -258,6 +273,7 @@ class Law:
     line: str = "{name}: {value}"
     remark: str = "#"
     sign: str = ""
+    start: Start | None = None
 
     @property
     def sets_gains(self) -> bool:
@@ -568,6 +584,7 @@ _ROWS = (
         line="const auto {name} = {value};",
         remark="//",
         sign="Its gains are never negative: ControllerDirection says the sign",
+        start=Start("set Output to the present command before SetMode(AUTOMATIC)."),
     ),
     Law(
         "simple_pid",
@@ -584,6 +601,7 @@ _ROWS = (
         ),
         weights=(0.0, 1.0),
         line="{name} = {value}",
+        start=Start("starting_output is the present command.", "starting_output"),
     ),
     Law(
         "esphome_pid",
@@ -603,6 +621,7 @@ _ROWS = (
             Setting("output_averaging_samples", "1"),
         ),
         command="level of the output, -1 (cool) to 1 (heat)",
+        start=Start("starting_integral_term is the present command.", "starting_integral_term"),
     ),
     Law(
         "klipper_heater",
@@ -706,6 +725,12 @@ _ROWS = (
         line="{name} := {value};",
         remark="//",
         sign="This block forms ERROR = PV - SP, so KP is {sign} here",
+        start=Start(
+            "call it once with AUTO false and X0 the present command over KP, since its output "
+            "is KP X0 then.",
+            "X0",
+            lambda law, command: -command / law.gains.kc,
+        ),
     ),
     Law(
         "oscat_ft_pid",
@@ -723,6 +748,10 @@ _ROWS = (
         form="ideal",
         line="{name} := {value};",
         remark="//",
+        start=Start(
+            "this block begins at 0, so add the present command to its output Y, and take it "
+            "off the limits."
+        ),
     ),
 )
 

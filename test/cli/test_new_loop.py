@@ -7,22 +7,30 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from made_experiments import record_of
 
-from relay_autotune.cli import proof, tune_loop
+from relay_autotune.cli import proof, tune_loop, tune_report
+from relay_autotune.cli.after_tune import hand_over, left, left_its_limits, prefix, repeated
 from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.nodes.controller_parameters import PARAMETERS
+from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune.verdict import Verdict
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains
 
@@ -142,13 +150,11 @@ def test_a_number_is_taken_with_its_unit(text: str, value: float | None) -> None
 def test_neither_yes_nor_a_law_becomes_the_name_of_a_file(
     typed: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    typed += ["y", "iec_61131_3_pid", "~/gains.yaml", "no"]
-    how = "replay bag --export NAME --sample-period S > FILE"
-    assert asked_for_file("Write", EXPORTS, how) == str(Path("~/gains.yaml").expanduser())
-    yes, law = capsys.readouterr().err.splitlines()
-    assert "such as gains.yaml" in yes
-    assert law.endswith("type replay bag --export iec_61131_3_pid --sample-period S > FILE")
-    assert asked_for_file("Write", EXPORTS, how) == ""
+    typed += ["y", "~/gains.yaml", "IEC_61131_3_pid", "no"]
+    assert asked_for_file("Write", EXPORTS) == str(Path("~/gains.yaml").expanduser())
+    assert "such as gains.yaml" in capsys.readouterr().err
+    assert asked_for_file("Write", EXPORTS) == "iec_61131_3_pid"
+    assert asked_for_file("Write", EXPORTS) == ""
     with pytest.raises(SystemExit):
         tune_loop.main(["--export", "iec_61131_3_pid"])
 
@@ -211,82 +217,146 @@ def ended(reason: str, **values: Any) -> Any:
 
 def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     words = ["--measurement", "/tank/level", "--command", "/tank/valve"]
-    given = tune_loop._parser().parse_args(words)
+    parser = tune_loop._parser()
+    given = parser.parse_args(words)
     given.typed = words
     given.at, given.within, given.command_within = 2.0, [30.0, 50.0], [0.0, 5.0]
     again = (
-        f"{tune_loop._prefix()}tune_loop --measurement /tank/level --command /tank/valve "
+        f"{prefix()}tune_loop --measurement /tank/level --command /tank/valve "
         f"--at 2 --within 30 50 --command-within 0 5"
     )
     silent = ended("no measurement on /tank/level for 1.01 s")
-    (what, command), (then, told) = tune_loop._repeated(silent, given, None)
+    (what, command), (then, told) = repeated(silent, given, parser, None, False)
     assert (what, command, then) == ("run it again", again, "if it happens again")
     assert "ros2 topic hz /tank/level" in told and "the load of the machine" in told
-    assert tune_loop._repeated(ended("cancelled"), given, None) == [("run it again", again)]
+    assert repeated(ended("cancelled"), given, parser, None, False) == [("run it again", again)]
     found = ended("", gains=PidGains(experiment_id="x"))
-    assert tune_loop._repeated(found, given, None) == [("prove the gains", f"{again} --verify")]
-    assert tune_loop._repeated(found, given, True) == []
+    assert repeated(found, given, parser, None, False) == [
+        ("prove the gains", f"{again} --verify")
+    ]
+    assert repeated(found, given, parser, True, False) == []
 
 
-def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
+@pytest.fixture
+def shown(
     typed: list[str],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
-) -> None:
-    message = PidGains()
-    task = DesignTask(model=TransferFunction.fopdt(1.65, 1.0, 0.5), options=DesignOptions())
+) -> Callable[..., str]:
+    """Return what is shown after a tune whose proof had an outcome and these answers came."""
+    process = TransferFunction.fopdt(1.65, 1.0, 0.5)
+    message, record = PidGains(), record_of(process, "x")
+    task = DesignTask(model=process, options=DesignOptions())
     fill_gains(message, design(task, "imc"), experiment_id="x")
-    client = SimpleNamespace(
-        result=Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
-    )
-    given = tune_loop._parser().parse_args([])
+    result = Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
+    result.experiment.settings.setpoint = 50.0
+    kinds = {"command_type": FLOAT64, "measurement_type": "std_msgs/msg/Float32"}
+    client: Any = SimpleNamespace(
+        name="relay_node", result=result, record=lambda patience: record,
+        identifier_values=lambda patience: None, values=lambda node, names: kinds,
+    )  # fmt: skip
+    parser = tune_loop._parser()
+    given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
+    given.at, given.within, given.command_within = 35.0, [0.0, 90.0], [0.0, 100.0]
     nodes: Any = SimpleNamespace(require_alive=lambda: None)
-    given.at = 35.0
     monkeypatch.chdir(tmp_path)
 
-    def shown(passed: bool | None, against: str, file: str) -> str:
-        typed.append(file)
-        monkeypatch.setattr(proof, "_offered", lambda *_: proof.Outcome(passed, against))
-        assert tune_loop._hand_over(client, given, nodes, None) is passed
-        return " ".join(capsys.readouterr().out.split())
+    def analysed(_: Any, values: dict[str, Any]) -> Any:
+        asked = DesignOptions(law=values["law"], sample_period=values["sample_period"])
+        gains = design(DesignTask(model=process, options=asked), "imc")
+        judgement = SimpleNamespace(reason="")
+        return SimpleNamespace(best_gains=gains, verdict=Verdict.TRUSTED, judgement=judgement)
 
+    # The whole analysis takes seconds.
+    monkeypatch.setattr(tune_report, "analysed_as_there", analysed)
+
+    def show(passed: bool | None, against: str, *answers: str) -> str:
+        typed.extend(answers)
+        monkeypatch.setattr(proof, "_offered", lambda *_: proof.Outcome(passed, against))
+        done = hand_over(client, given, parser, nodes, None)
+        assert done.proven is passed
+        assert not typed
+        told = " ".join(capsys.readouterr().out.split())
+        return " ".join([told, "NEXT", *(word for step in done.steps for word in step)])
+
+    return show
+
+
+def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
+    shown: Callable[..., str], tmp_path: Path
+) -> None:
     failed = shown(False, "the step that was to prove them failed: it runs away", "failed.yaml")
     assert "the command stands at 35 u" in failed and "start your own" not in failed
     assert f"pid_controller: {tmp_path / 'failed.yaml'}" in failed
+    assert failed.endswith("NEXT")
     first = (tmp_path / "failed.yaml").read_text().splitlines()[0]
     assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
     assert "they are not proven" in shown(None, "few cycles", "")
     assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
-    assert "DOUBTFUL" not in (tmp_path / "passed.yaml").read_text()
+    text = (tmp_path / "passed.yaml").read_text()
+    assert "DOUBTFUL" not in text and "u_clamp_max: 100.0" in text
+
+
+def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bump(
+    shown: Callable[..., str], tmp_path: Path
+) -> None:
+    told = shown(True, "", "iec_61131_3_pid", "", "pid.st")
+    text = (tmp_path / "pid.st").read_text()
+    # The block's output is KP X0 before it runs.
+    values = dict(re.findall(r"^(\w+) := ([-\d.]+);$", text, re.MULTILINE))
+    assert float(values["KP"]) * float(values["X0"]) == pytest.approx(35.0)
+    (period,) = re.findall(r"Designed for iec_61131_3_pid every ([\d.]+) s", text)
+    assert f"--law iec_61131_3_pid --sample-period {period} --verify" in told
+    other = shown(False, "it runs away", "px4_rate", "0.1", "px4.txt")
+    assert "# DOUBTFUL: it runs away" in (tmp_path / "px4.txt").read_text()
+    assert other.endswith("NEXT")
+
+
+def test_somebody_without_a_controller_is_told_how_to_start_one(
+    shown: Callable[..., str],
+) -> None:
+    command = shown(None, "", "").partition("NEXT control with these gains ")[2].split()
+    assert command[command.index("--ros-args") - 1] == "controller_node"
+    given = dict(word.split(":=", 1) for word in command if ":=" in word)
+    assert given["controller_command"] == "/tank/valve"
+    assert float(given["kc"]) > 0.0 and float(given["initial_command"]) == 35.0
+    assert (given["measurement_type"], given["measurement_max"]) == (
+        "std_msgs/msg/Float32",
+        "90.0",
+    )
+    assert set(given) - {"measurement", "controller_command"} <= {e.name for e in PARAMETERS}
 
 
 @pytest.mark.parametrize(
-    ("reason", "left", "next_step"),
+    ("reason", "outside", "left_at", "next_step"),
     [
         (
             "the measurement rested at 6 y and is at 6.2 y",
-            "which is not the one at",
+            False,
+            "not the one at",
             "once it rests",
         ),
-        (
-            "the measurement 9.1 at 3 s is outside its limits, 3 to 9",
-            "look whether",
-            "once it rests",
-        ),
-        ("cancelled", "the plant is left at the safe command 1040 u", "run it again"),
+        ("the measurement 9.1 at 3 s is too high", True, "look whether", "once it rests"),
+        ("cancelled", False, "the plant is left at the safe command 1040 u", "run it again"),
     ],
 )
 def test_after_the_process_was_driven_away_the_same_command_is_not_offered_again(
-    reason, left, next_step
+    reason, outside, left_at, next_step
 ):
     words = ["--measurement", "/y", "--command", "/u", "--at", "1040", "--within", "3", "9"]
-    given = tune_loop._parser().parse_args(words)
+    parser = tune_loop._parser()
+    given = parser.parse_args(words)
     given.typed = words
     result = SimpleNamespace(
-        reason=reason, outcome=1, COMPLETED=2, gains=SimpleNamespace(experiment_id="")
+        reason=reason, outcome=2, ABORTED=2, COMPLETED=1, gains=SimpleNamespace(experiment_id="")
     )
-    assert left in tune_loop._left(result, 1040.0)
-    ((name, told),) = tune_loop._repeated(result, given, None)
+    last = np.array([5.0, 9.1 if outside else 6.2])
+    client: Any = SimpleNamespace(
+        result=result, record=lambda patience: SimpleNamespace(measurement=last)
+    )
+    assert left_its_limits(client, given) is outside
+    assert left_at in left(result, 1040.0, outside)
+    ((name, told),) = repeated(result, given, parser, None, outside)
     assert name == next_step
     assert ("1040" in told) == (next_step == "run it again")
