@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import Selection, read_experiments
@@ -171,6 +171,8 @@ def _exported(
             "--accept-doubtful to export them anyway"
         )
     assert only.best_gains is not None
+    if only.record.settings is not None:
+        target = replace(target, present=only.record.settings.baseline)
     return exported(only.best_gains, how, target, doubt=only.judgement.reason).rstrip("\n")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -209,6 +210,24 @@ def test_a_block_with_the_other_error_says_the_sign_of_its_gain(gain, kp, capsys
     text = capsys.readouterr().out
     assert f"// This block forms ERROR = PV - SP, so KP is {kp} here, with kc " in text
     assert (float(settings_of(text)["KP"]) > 0.0) == (kp == "positive")
+
+
+@pytest.mark.parametrize(
+    ("law", "name"),
+    [
+        ("simple_pid", "starting_output"),
+        ("esphome_pid", "starting_integral_term"),
+        ("iec_61131_3_pid", "X0"),
+    ],
+)
+def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name):
+    of_law = replace(gains(-2.0, 5.0), law=law, law_period=0.5)
+    unknown = exported(of_law, law, Target())
+    assert "Start without a bump" in unknown and name not in settings_of(unknown)
+    found = settings_of(exported(of_law, law, Target(present=35.0)))
+    # Before it runs, the block of IEC 61131-3 gives KP X0; the others' first output is theirs.
+    factor = float(found["KP"]) if name == "X0" else 1.0
+    assert factor * float(found[name]) == pytest.approx(35.0)
 
 
 def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path, capsys):
