@@ -123,23 +123,22 @@ def apply_at(
     name: str,
     *,
     doubtful: bool,
-    yes: bool = False,
-    stays: bool = True,
-    patience: float = _FOUND_WITHIN,
+    yes: bool,
+    patience: float,
 ) -> int:
-    """Offer the newest gains to a controller_node; return the exit status.
+    """Offer the newest gains to a controller_node that ends with this command.
 
     :param name: its full name.
     :param doubtful: True: also gains whose verdict is not trusted.
     :param yes: True: do not ask.
-    :param stays: True: it goes on running, so that it can be asked for the gains before.
     :param patience: how long to look for it [s].
+    :return: the exit status.
     """
     from relay_autotune.nodes.gains_client import GainsClient
 
     namespace, _, node = name.rpartition("/")
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
-    options.yes, options.stays = yes, stays
+    options.yes, options.stays = yes, False
     with GainsClient(namespace, node) as client:
         with Working(f"looking for {name}"):
             client.find(patience)
@@ -182,9 +181,15 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model)))
     step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
+    tried = present if options.verify_only else gains
+    if step and tried is not None:
+        with Working("computing which steps the limits allow"):
+            allowed = client.allowed_steps(tried)
+        step = options.step or allowed.nearest(step)
+        allowed.require(step)
     question = _question(options, step)
-    if step and not options.yes:
-        agreed = bool(step := agreed_step(question, step))
+    if step and tried is not None and not options.yes:
+        agreed = bool(step := agreed_step(question, step, allowed))
     else:
         agreed = agrees(question, yes=options.yes)
     if not agreed:

@@ -10,10 +10,13 @@ import re
 import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.layout import broken, width
 from relay_autotune.errors import LoopError
+
+if TYPE_CHECKING:
+    from relay_autotune.control.verification import StepRange
 
 # A number as people type it: with a unit, which counts for nothing. A thousand is no unit.
 _UNIT = r"\s*(?!to\b|and\b|k\b|e\b)[^\W\d_][\w/^*]*|\s*[%°][a-z]*"
@@ -58,15 +61,12 @@ def agrees(question: str, *, yes: bool) -> bool:
     return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
 
 
-def agreed_step(
-    question: str, step: float, low: float = -math.inf, high: float = math.inf
-) -> float:
+def agreed_step(question: str, step: float, allowed: StepRange) -> float:
     """Ask whether to make a step; return its height, 0 for none.
 
     :param question: with its question mark.
     :param step: the height that yes takes [y].
-    :param low: lowest height that may be typed in its place [y].
-    :param high: highest one [y].
+    :param allowed: the heights that may be typed in its place.
     :raises LoopError: if nobody can be asked.
     """
     _require_somebody("--yes")
@@ -76,12 +76,10 @@ def agreed_step(
         if answer in ("", "n", "no", "y", "yes"):
             return step if answer.startswith("y") else 0.0
         other = number_of(answer)
-        if other and low <= other <= high:
+        if other is not None and allowed.allows(other):
             return other
-        told = "other than 0"
-        if math.isfinite(high - low):
-            told = f"from {low:g} to {high:g} y: the limits allow no more, with the overshoot"
-        print(f"expected y, n, or the height of the step, {told}", file=sys.stderr)
+        told = f"expected y, n, or the height of the step, {allowed.words}"
+        print("\n".join(broken(told, width())), file=sys.stderr)
 
 
 def asked(what: str, flag: str, known: str, example: str, read: Callable[[str], Any]) -> Any:

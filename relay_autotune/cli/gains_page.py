@@ -14,7 +14,7 @@ from typing import Any
 
 from relay_autotune.cli.apply_gains import verdict_lines
 from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
-from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.exchange.messages import fill_gains, gains_from_message
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tune_client import TuneClient
@@ -137,9 +137,14 @@ class GainsPage:
             if wish.what == APPLY:
                 live.tell(phase="applying", tone="", status="putting the gains in force", proof=())
                 message, settles = self._message(wish)
+                if wish.step:
+                    tried = gains_from_message(message)
+                    controller.allowed_steps(tried).require(wish.step)
                 told = controller.put_in_force(message)
                 live.tell(status=told)
                 self.look()
+            elif (present := controller.in_force()) is not None:
+                controller.allowed_steps(present).require(wish.step)
             if wish.step:
                 self._verify(wish, controller, settles)
             else:

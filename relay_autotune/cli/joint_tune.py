@@ -554,7 +554,6 @@ class JointTune:
             own_node(self._options, "controller_node"),
             doubtful=bool(doubt),
             yes=self._options.yes,
-            stays=False,
             patience=START_WITHIN,
         )
 

@@ -25,6 +25,7 @@ from relay_autotune.cli.progress import StatusLine, Working
 from relay_autotune.control.verification import (
     LEAST_OF_NOISE,
     Step,
+    StepRange,
     allowed_steps,
     noise_of,
     plan,
@@ -68,7 +69,7 @@ class _Proof:
     """What is to be done.
 
     :param step: of the set-point [y].
-    :param allowed: lowest and highest step that the limits allow [y].
+    :param allowed: the steps that the limits allow.
     :param expected: predicted range of the command [u].
     :param takes: about how long all of it takes [s].
     :param settles: how long the loop takes to settle with the gains [s].
@@ -80,7 +81,7 @@ class _Proof:
     """
 
     step: float
-    allowed: tuple[float, float]
+    allowed: StepRange
     expected: tuple[float, float]
     takes: float
     settles: float
@@ -146,7 +147,7 @@ def _offered(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -
         proof = _planned(client.record(_RECORD_WITHIN), result, options)
     step = proof.step
     if asks:
-        step = agreed_step(proof.question(options, doubt), proof.step, *proof.allowed)
+        step = agreed_step(proof.question(options, doubt), proof.step, proof.allowed)
         if not step:
             print()
             return unproven
@@ -176,21 +177,16 @@ def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof
     rate = rate_from(parameters_of_law(gains.law, gains.law_period))
     wanted = plan(gains, model, Step(setpoint=step), record.mean_interval, rate=rate)
     peak = wanted.peak / abs(step)
-    low, high = allowed_steps(record, model, within, commands, peak, noise)
-    if not options.step:
-        step = min(max(step, low), high)
-    if not step or not low <= step <= high:
-        raise TuningError(
-            f"a step of {step:g} y from {rest.setpoint:.6g} y, with the overshoot that the model "
-            f"predicts, leads beyond the limits: give a --step from {low:g} to {high:g}"
-        )
+    allowed = allowed_steps(record, model, within, commands, peak, noise)
+    step = options.step or allowed.nearest(step)
+    allowed.require(step)
     settles = gains.settling_time
     if not math.isfinite(settles):
         settles = wanted.duration
     least, most = (commands.clip(rest.baseline + end) for end in wanted.command)
     takes = wanted.duration + 2.0 * settles
-    ends = (low, high), (least, most)
-    return _Proof(step, *ends, takes, settles, rest, within, commands, noise, rate)
+    ends = (least, most)
+    return _Proof(step, allowed, ends, takes, settles, rest, within, commands, noise, rate)
 
 
 def _made(

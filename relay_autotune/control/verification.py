@@ -76,6 +76,51 @@ class Step:
 
 
 @dataclass(frozen=True)
+class StepRange:
+    """The steps of a set-point that the limits allow.
+
+    :param low: lowest step [y].
+    :param high: highest one [y].
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def words(self) -> str:
+        """Which steps are allowed, and why."""
+        if not math.isfinite(self.high - self.low):
+            return "other than 0"
+        return (
+            f"from {self.low:g} to {self.high:g} y: the limits allow no more, with the overshoot "
+            f"that the model predicts"
+        )
+
+    def allows(self, step: float) -> bool:
+        """Return whether a step is within the range, and not 0.
+
+        :param step: y.
+        """
+        return step != 0.0 and self.low <= step <= self.high
+
+    def nearest(self, step: float) -> float:
+        """Return the step in the range that is nearest to one [y].
+
+        :param step: y.
+        """
+        return min(max(step, self.low), self.high)
+
+    def require(self, step: float) -> None:
+        """Refuse a step.
+
+        :param step: y.
+        :raises TuningError: if it is outside.
+        """
+        if not self.allows(step):
+            raise TuningError(f"the step of the set-point is {step:g} y, expected {self.words}")
+
+
+@dataclass(frozen=True)
 class Response:
     """Features of a response to a step.
 
@@ -187,8 +232,8 @@ def allowed_steps(
     command: Limits,
     peak: float,
     noise_std: float,
-) -> tuple[float, float]:
-    """Return the lowest and highest step of the set-point that limits allow [y], in two digits.
+) -> StepRange:
+    """Return the steps of the set-point that limits allow, in two digits.
 
     The predicted peak, with an allowance for the noise, stays within the limits of the
     measurement, and the command can hold the new set-point.
@@ -204,7 +249,7 @@ def allowed_steps(
     setpoint = record.settings.setpoint
     spared = NOISE_ALLOWANCE * (0.0 if math.isnan(noise_std) else noise_std)
     down, up = _ways(record, model, measurement, command)
-    return (
+    return StepRange(
         0.0 - _rounded_down(min(down, (setpoint - measurement.low - spared) / peak)),
         _rounded_down(min(up, (measurement.high - setpoint - spared) / peak)),
     )

@@ -16,7 +16,14 @@ from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
-from relay_autotune.control.verification import noise_of, proving_step
+from relay_autotune.control.verification import (
+    Step,
+    StepRange,
+    allowed_steps,
+    noise_of,
+    plan,
+    proving_step,
+)
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -26,10 +33,11 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.controller_parameters import FIXED, GAINS, NONE_WAIT
+from relay_autotune.nodes.controller_parameters import FIXED, GAINS, NONE_WAIT, rate_from
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.nodes.remote_gains import controller_of, mapping_of
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import Record
 from relay_autotune.text import TOLD_EVERY, duration
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
@@ -231,18 +239,41 @@ class GainsClient(LoopClient):
 
         None: neither is known.
         """
-        names = (*LIMITS, "verify_step")
-        low, high, least, most, given = self.values(self.name, names).values()
-        if given:
+        if given := self.values(self.name, ["verify_step"])["verify_step"]:
             return float(given)
+        record = self._record()
+        if record is None:
+            return None
+        return proving_step(record, self.model(), *self._limits(), self.noise()) or None
+
+    def allowed_steps(self, gains: Controller) -> StepRange:
+        """Return the steps of the set-point that the limits of the node allow.
+
+        Without the record of a tune it is not known where the loop rests: the node alone refuses.
+
+        :param gains: those that are to make the step.
+        :raises RelayAutotuneError: if the model is not there, or the loop would be unstable.
+        """
+        record = self._record()
+        if record is None:
+            return StepRange()
+        names = ("law", "law_period", "apply_to")
+        rate = rate_from(self.values(self.name, names))
+        model = self.model()
+        peak = plan(gains, model, Step(setpoint=1.0), record.mean_interval, rate=rate).peak
+        return allowed_steps(record, model, *self._limits(), peak, self.noise())
+
+    def _limits(self) -> tuple[Limits, Limits]:
+        """Return the ranges of measurement and command."""
+        low, high, least, most = self.values(self.name, LIMITS).values()
+        return Limits(low, high), Limits(least, most)
+
+    def _record(self) -> Record | None:
+        """Return the newest record of a tune with a limit cycle; None: there is none."""
         found = self.latched(
             RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
         )
-        if found is None:
-            return None
-        within, commands = Limits(low, high), Limits(least, most)
-        record = record_from_message(found)
-        return proving_step(record, self.model(), within, commands, self.noise()) or None
+        return None if found is None else record_from_message(found)
 
     def prove(
         self,

@@ -6,12 +6,16 @@
 from __future__ import annotations
 
 import math
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from relay_autotune.cli import apply_gains
 from relay_autotune.cli.apply_gains import beside, found_lines, verdict_lines
+from relay_autotune.control.verification import StepRange
+from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
@@ -92,6 +96,32 @@ def test_the_result_of_a_step_carries_no_samples() -> None:
     assert not (summary.time or summary.measurement or summary.command or summary.predicted)
     assert (summary.kind, summary.step, summary.ms) == (whole.kind, whole.step, whole.ms)
     assert (summary.reason, summary.passed) == (whole.reason, True)
+
+
+def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[str] = []
+    client: Any = SimpleNamespace(
+        in_force=lambda: None, model=lambda: MODEL, noise=lambda: 0.01,
+        waiting=lambda: (GAINS, ""), has=lambda gains: False, usual_step=lambda: 3.0,
+        ask=asked.append,
+        allowed_steps=lambda gains: StepRange(-1.5, 2.0 if gains is GAINS else 0.0),
+        values=lambda node, names: {"verify_step": 0.0}, name="controller_node",
+    )  # fmt: skip
+    given = apply_gains._parser().parse_args(["--yes", "--step", "2.5"])
+    with pytest.raises(TuningError, match=r"is 2.5 y, expected from -1.5 to 2 y"):
+        apply_gains.apply_and_verify(client, given)
+    # The usual step is made smaller, and another is asked for until it is within.
+    given = apply_gains._parser().parse_args([])
+    answers = ["-1.6", "n"]
+    monkeypatch.setattr("builtins.input", lambda shown: answers.pop(0))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    assert apply_gains.apply_and_verify(client, given) == 1
+    told = capsys.readouterr()
+    assert "a step of the set-point by 2 y" in told.out
+    assert "from -1.5 to 2 y" in told.err
+    assert not asked and not answers
 
 
 def test_a_command_line_that_does_not_fit_ends_with_two() -> None:

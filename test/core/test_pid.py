@@ -17,6 +17,7 @@ from relay_autotune.control.controller import GainBounds, PidController, run_loo
 from relay_autotune.control.verification import (
     NARROWLY,
     Step,
+    StepRange,
     allowed_steps,
     compare,
     describe,
@@ -226,13 +227,20 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     wanted = plan(gains, model, Step(setpoint=1.0), 0.01)
     assert 1.1 < wanted.peak < 2.0
     limits = Limits(30.0, 42.0)
-    low, high = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted.peak, 0.02)
+    allowed = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted.peak, 0.02)
+    low, high = allowed.low, allowed.high
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
     assert low == -3.3
     at_peak = [plan(gains, model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)]
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
     narrow = allowed_steps(record, model, Limits(39.9, 40.05), Limits(0.0, 5.0), 1.2, 0.02)
-    assert narrow == (-0.033, 0.0)
+    assert narrow == StepRange(-0.033, 0.0)
+    narrow.require(-0.03)
+    for wrong in (0.01, 0.0, -0.04, math.nan):
+        with pytest.raises(TuningError, match=r"expected from -0\.033 to 0 y: the limits allow"):
+            narrow.require(wrong)
+    StepRange().require(-1e9)
+    assert (narrow.nearest(-0.04), narrow.nearest(-0.02)) == (-0.033, -0.02)
 
 
 def test_a_longer_dead_time_fails():
