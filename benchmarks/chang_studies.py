@@ -32,10 +32,10 @@ from relay_autotune.identification.methods.chang import (
     time_constant_from_period,
     two_time_constants,
 )
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import RelaySettings
 
 EXAMPLE = TransferFunction.fopdt(1.65, 20.0, 10.0)

@@ -26,7 +26,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from relay_autotune.bag.definitions import find_definition
-from relay_autotune.bag.joints import Choice, named_pair
+from relay_autotune.bag.foreign import Choice, named_pair
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.topics import Topics
 

@@ -32,9 +32,9 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, Law, SampledLaw
 from relay_autotune.loop.sampled_loop import SampledLoop
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 

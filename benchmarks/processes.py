@@ -6,19 +6,23 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 from relay_autotune import threads  # noqa: F401  before numpy
 
 # isort: split
 import numpy as np
 
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import RelayRun, exact_limit_cycle, simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+from sampled_relay import simulate_sampled_relay
 
 PER_CYCLE = 200
 

@@ -21,11 +21,10 @@ from relay_autotune.experiment.experiment import (
     SafePolicy,
     State,
 )
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.record.record import Cycle, Outcome, RelaySettings
 
 STRUCTURES = (

@@ -35,10 +35,9 @@ from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.loop.control_law import ControlLaw
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, VirtualProcess
 from relay_autotune.record.record import Record
 from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict

@@ -27,9 +27,8 @@ from relay_autotune.analysis import analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop.gains import Gains
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict
 

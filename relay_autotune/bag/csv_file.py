@@ -18,10 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.bag.signals import Signal
+from relay_autotune.bag.signals import TIME_UNITS, Signal
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
-from relay_autotune.bag.timing import TIME_UNITS
 from relay_autotune.errors import BagError, SelectionError
 
 # Least time that is taken as seconds since 1970: no experiment lasts that long.

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Message definitions and type hashes of the installed interface packages."""
+"""Names, definitions and type hashes of messages, as the installed packages have them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from relay_autotune.bag.names import FLOAT64
 from relay_autotune.bag.ros2msg import PRIMITIVE
 from relay_autotune.errors import BagError
+
+# Types in the recordings of relay_node.
+EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
+CYCLE = "relay_autotune_msgs/msg/RelayCycle"
+FLOAT64 = "std_msgs/msg/Float64"
+
+# The metadata record of the file that names the loop's topics.
+EXPERIMENT_METADATA = "relay_autotune"
 
 SEPARATOR = "=" * 80
 

@@ -11,11 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from relay_autotune.bag.fields import split_name
-from relay_autotune.bag.joints import Choice, has_joints, named_pair
-from relay_autotune.bag.pairing import Pair, characterise, plausible_pairs
+from relay_autotune.bag.pairing import (
+    Choice,
+    Pair,
+    characterise,
+    has_joints,
+    named_pair,
+    plausible_pairs,
+)
 from relay_autotune.bag.signals import Signal, join, preceded
-from relay_autotune.bag.topics import Topics
+from relay_autotune.bag.topics import Topics, split_name
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.excitation import find_experiments
 from relay_autotune.record.record import Record

@@ -27,10 +27,15 @@ from relay_autotune.bag.locate import (
     record_offsets,
     sorted_records,
 )
-from relay_autotune.bag.mcap_layout import Segment, damage_note, is_chunk_there, segment_content
+from relay_autotune.bag.mcap_layout import (
+    Segment,
+    damage_note,
+    is_chunk_there,
+    layout_by_summary,
+    scan,
+    segment_content,
+)
 from relay_autotune.bag.mcap_records import RECORD, Channel, DamageError
-from relay_autotune.bag.mcap_scan import scan
-from relay_autotune.bag.mcap_summary import layout_by_summary
 from relay_autotune.bag.source import Source
 
 # Least distance between the beginnings of two records [bytes].

@@ -1,18 +1,36 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which of a bag's signals could be the measurement and the command of one loop."""
+"""Which signals of a bag could be the measurement and the command of one loop.
+
+They are found by their names and values, those of a joint by its name in a robot's recording.
+"""
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from relay_autotune.bag.field_path import (
+    NAME_LISTS,
+    Element,
+    Step,
+    names_in,
+    reading,
+    steps_of,
+    written,
+)
+from relay_autotune.bag.schema import numeric_paths
 from relay_autotune.bag.signals import Signal
+from relay_autotune.bag.topics import Topics
+from relay_autotune.errors import FieldError, SelectionError
+from relay_autotune.escape import visible
 
 _WORDS = {
     "set-point": "setpoint reference ref target desired goal",
@@ -132,3 +150,311 @@ def _overlap(measurement: Signal, command: Signal) -> bool:
 
 def _namespace(name: str) -> str:
     return name.rsplit("/", 1)[0]
+
+
+# A definition without a list or a field of names has no joints; a robot's bag has hundreds of
+# types, and to parse all of them takes seconds.
+_NAMING = re.compile(rb"\bstring\b[^\n]{0,40}\b(?:" + "|".join(NAME_LISTS).encode() + rb")\b")
+_STATES = {
+    "JointState", "MultiDOFStateStamped", "DynamicJointState", "JointTrajectoryControllerState"
+}  # fmt: skip
+_ARRAYS = ("std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float32MultiArray")
+
+# The role of fields, by their names, in topics whose names do not tell it.
+_NEITHER = {"reference", "error", "error_dot", "desired", "values_dot", "feedback_dot"}
+_MEASURED = {"feedback", "position", "positions", "velocity", "velocities"}
+_COMMANDED = {"position", "positions", "velocity", "velocities", "effort", "values", "data"}
+# The quantity that a command sets, by the names of topic and field, and what measures it.
+_QUANTITIES = ({"position", "positions"}, {"velocity", "velocities"})
+# Interfaces of a joint in messages that name these, too.
+_INTERFACES = ("position", "velocity", "effort")
+
+# Joint states come from several nodes: the first messages need not have all joints.
+_LOOKED_AT = 50
+# Largest number of joints that an error lists.
+_LISTED = 20
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Where measurement and command of a joint are.
+
+    :param joint: its name.
+    :param measurement: ``TOPIC[:FIELD]`` of the measurement as the user gave it, with or without
+        the element; None: found.
+    :param command: likewise of the command.
+    :param order: the joints in the order of commands that do not name them; (): not known.
+    """
+
+    joint: str
+    measurement: str | None = None
+    command: str | None = None
+    order: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    topic: str
+    path: str
+    role: str
+    # The steps, where the joint's name is one of them.
+    steps: tuple[Step, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return f"{self.topic}:{self.path}" if self.path else self.topic
+
+    @property
+    def words(self) -> set[str]:
+        return set(re.split(r"[^a-z]+", self.name.lower()))
+
+    def fits(self, wanted: str) -> bool:
+        """Tell whether it is what a user named, perhaps without the element."""
+        wanted = wanted if wanted.startswith("/") else f"/{wanted}"
+        own = {self.name, f"/{self.name}", _bare(self.name), self.topic}
+        return wanted in own or _bare(wanted) in own
+
+
+def has_joints(topics: Topics) -> bool:
+    """Tell by its types whether a bag has the states of joints."""
+    return any(kind.rpartition("/")[2] in _STATES for kind in topics.types().values())
+
+
+def named_pair(topics: Topics, choice: Choice) -> tuple[str, str, str]:
+    """Return ``TOPIC:FIELD`` of a joint's measurement and command, and the reason.
+
+    :param topics: the bag.
+    :param choice: the joint, and what the user chose.
+    :raises SelectionError: if they are not there, or not the only ones.
+    """
+    found, joints = _candidates(topics, choice)
+    if not any(c.steps or not c.path for c in found):
+        raise _nowhere(topics, choice.joint, joints)
+    measured = _of_role(found, "measurement", choice.measurement)
+    commanded = _of_role(found, "command", choice.command)
+    read = {c.name for c in (*measured, *commanded) if c.role != "named"}
+    signals = topics.signals(read)
+    still = {
+        name for name, t in signals.items() if not len(t.signal) or not np.ptp(t.signal.values)
+    }
+    measured = [c for c in measured if c.name not in still]
+    commanded = [c for c in commanded if c.name not in still]
+    measured, commanded = _together(measured, commanded)
+    if any(c.steps for c in commanded):
+        commanded = [c for c in commanded if c.steps]
+    if len(measured) > 1 and len(commanded) == 1:
+        measured = _of_quantity(measured, commanded[0])
+    if len(measured) != 1 or len(commanded) != 1:
+        raise _unclear(topics, choice, measured, commanded)
+    (y,), (u,) = measured, commanded
+    why = f"both name {choice.joint}" if u.steps else f"{y.name} names {choice.joint}"
+    if u.path and not u.steps and not choice.order and choice.command is None:
+        _require_most_moved(topics, choice.joint, y, u, joints)
+        why += f", which moves most, and {u.path} alone changes"
+    elif choice.order and not u.steps:
+        why += f", and --joint-order puts it at {u.path}"
+    return y.name, u.name, why
+
+
+def _candidates(topics: Topics, choice: Choice) -> tuple[list[_Candidate], dict[str, list[str]]]:
+    """Return what may belong to a joint, and the joints that each topic names."""
+    found: list[_Candidate] = []
+    joints: dict[str, list[str]] = {}
+    for topic, kind in topics.types().items():
+        if kind in _ARRAYS:
+            found += _elements(topics, topic, choice)
+        elif _NAMING.search(topics.definition_of(topic)):
+            for candidate, names in _by_name(topics, topic, choice.joint):
+                joints.setdefault(topic, []).extend(n for n in names if n not in joints[topic])
+                if choice.joint in names:
+                    found.append(candidate)
+    for topic in topics.single_numbers():
+        if choice.joint in topic:
+            found.append(_Candidate(topic, "", role_by_name(topic) or ""))
+    return found, joints
+
+
+def _by_name(topics: Topics, topic: str, joint: str) -> Iterator[tuple[_Candidate, list[str]]]:
+    """Yield the numbers of named elements in a topic, as of a joint, and the elements' names."""
+    root = topics.root_of(topic)
+    messages = topics.first_messages(topic, _LOOKED_AT)
+    for path in numeric_paths(root, without=("header", "stamp")):
+        if "[" not in path:
+            continue
+        for interface in _INTERFACES:
+            steps = _named(steps_of(root, path, topic), joint, interface)
+            if steps is None:
+                continue
+            names = list(dict.fromkeys(n for m in messages for n in names_in(steps, m)))
+            role = _role(topic, steps)
+            if role and (joint not in names or any(_has(steps, m) for m in messages)):
+                yield _Candidate(topic, written(steps), role, steps), names
+            if interface not in (s.chosen for s in steps if isinstance(s, Element)):
+                break
+
+
+def _named(steps: Iterable[Step], joint: str, interface: str) -> tuple[Step, ...] | None:
+    """Return the steps with the joint, and its interface, in place of the places."""
+    found: list[Step] = []
+    chosen = iter((joint, interface))
+    for step in steps:
+        if isinstance(step, Element):
+            if step.names is None or (name := next(chosen, None)) is None:
+                return None
+            step = Element(name, step.names)
+        found.append(step)
+    return tuple(found)
+
+
+def _has(steps: Sequence[Step], message: object) -> bool:
+    try:
+        reading(steps)(message)
+    except FieldError:
+        return False
+    return True
+
+
+def _role(topic: str, steps: Sequence[Step]) -> str:
+    """Return the role of a number, "" where it is neither measurement nor command."""
+    fields = [step for step in steps if isinstance(step, str)]
+    chosen = [step.chosen for step in steps if isinstance(step, Element)]
+    last = chosen[-1] if len(chosen) > 1 else fields[-1]
+    if _NEITHER & set(fields):
+        return ""
+    role = role_by_name(topic)
+    if role == "command":
+        return "command" if last in _COMMANDED else ""
+    if role == "set-point":
+        return ""
+    if "output" in fields:
+        return "command"
+    if last in _MEASURED or "feedback" in fields:
+        return "measurement"
+    if last != "values":
+        return ""
+    return "measurement" if role == "measurement" else "command"
+
+
+def _elements(topics: Topics, topic: str, choice: Choice) -> list[_Candidate]:
+    """Return the elements of an array of commands that may be the joint's."""
+    role = role_by_name(topic)
+    first = topics.first_messages(topic, 1)
+    if not first or role in ("set-point", "measurement"):
+        return []
+    count = len(first[0].data)
+    if choice.order:
+        if choice.joint not in choice.order or count != len(choice.order):
+            return []
+        places: Iterable[int] = (choice.order.index(choice.joint),)
+    else:
+        places = range(count)
+    return [_Candidate(topic, f"data[{k}]", "command") for k in places]
+
+
+def _of_role(found: Sequence[_Candidate], role: str, wanted: str | None) -> list[_Candidate]:
+    if wanted is None:
+        return [c for c in found if c.role == role]
+    # The user's choice counts, whatever role its name tells.
+    exact = [c for c in found if c.name.lstrip("/") == wanted.lstrip("/")]
+    fits = exact or [c for c in found if c.fits(wanted)]
+    topic, _, path = wanted.partition(":")
+    own = [c for c in fits if c.role == role]
+    return own or fits or [_Candidate(topic, path, "named")]
+
+
+def _together(
+    measured: list[_Candidate], commanded: list[_Candidate]
+) -> tuple[list[_Candidate], list[_Candidate]]:
+    """Keep feedback and output of one controller, where they are there: they have one stamp."""
+    outputs = {c.topic for c in commanded if "output" in c.words}
+    both = outputs & {c.topic for c in measured if "feedback" in c.words}
+    if len(both) != 1:
+        return measured, commanded
+    return [c for c in measured if c.topic in both], [c for c in commanded if c.topic in both]
+
+
+def _of_quantity(measured: list[_Candidate], command: _Candidate) -> list[_Candidate]:
+    """Keep the measurement of the quantity that a command sets, where its name says which."""
+    for names in _QUANTITIES:
+        if names & command.words:
+            return [c for c in measured if names & c.words] or measured
+    return measured
+
+
+def _require_most_moved(
+    topics: Topics, joint: str, y: _Candidate, u: _Candidate, joints: dict[str, list[str]]
+) -> None:
+    """Refuse an element of commands without names unless it is this joint that moves."""
+    if not y.steps or len(topics.first_messages(u.topic, 1)[0].data) == 1:
+        return
+    others = [
+        f"{y.topic}:{written(_renamed(y.steps, joint, name))}"
+        for name in joints[y.topic]
+        if name != joint
+    ]
+    signals = topics.signals([y.name, *others])
+    swing = {name: float(np.ptp(timed.signal.values)) for name, timed in signals.items()}
+    most = max(swing, key=lambda name: swing[name])
+    if most != y.name:
+        raise SelectionError(
+            f"{u.path} is the only element of {u.topic} that changes, but {most} moves more than "
+            f"{y.name}: say whose command it is with --joint-order, the joints in the order of "
+            f"the controller's parameter joints, or with --command {u.name}"
+        )
+
+
+def _renamed(steps: Sequence[Step], joint: str, name: str) -> tuple[Step, ...]:
+    return tuple(
+        Element(name, s.names) if isinstance(s, Element) and s.chosen == joint else s
+        for s in steps
+    )
+
+
+def _nowhere(topics: Topics, joint: str, joints: dict[str, list[str]]) -> SelectionError:
+    known = list(dict.fromkeys(name for names in joints.values() for name in names))
+    if not known:
+        return SelectionError(
+            f"{topics.path} has no topic whose messages name joints; it has {topics.listing()}"
+        )
+    near = difflib.get_close_matches(joint, known, n=1)
+    meant = f"; write --joint {near[0]}" if near else ""
+    listed = ", ".join(map(visible, known[:_LISTED])) + (", ..." if known[_LISTED:] else "")
+    return SelectionError(
+        f"{topics.path} has no joint {joint!r}; {', '.join(joints)} name {listed}{meant}"
+    )
+
+
+def _unclear(
+    topics: Topics, choice: Choice, measured: list[_Candidate], commanded: list[_Candidate]
+) -> SelectionError:
+    said = f"{topics.path}: of {choice.joint}"
+    for role, found in (("measurement", measured), ("command", commanded)):
+        if not found:
+            return SelectionError(
+                f"{said} no {role} is there that changes; name one with --{role} TOPIC[:FIELD]; "
+                f"it has {topics.listing()}"
+            )
+    several = [
+        (role, found)
+        for role, found in (("measurement", measured), ("command", commanded))
+        if len(found) > 1
+    ]
+    listed = "".join(
+        f"\n  --{role} {shlex.quote(name)}"
+        for role, found in several
+        # Without the element, so that it can be used for several joints.
+        for name in sorted({_bare(c.name) if c.steps else c.name for c in found})
+    )
+    hint = ""
+    if len(commanded) > 1 and not any(c.steps for c in commanded):
+        hint = (
+            "\n  --joint-order JOINT,JOINT,...  (the joints of such commands, in the order of the "
+            "controller's parameter joints)"
+        )
+    what = " and ".join(f"several {role}s" for role, _ in several)
+    return SelectionError(f"{said} {what} change; choose by{listed}{hint}")
+
+
+def _bare(name: str) -> str:
+    """Return a name without elements."""
+    return re.sub(r"\[[^\]]*\]", "", name)

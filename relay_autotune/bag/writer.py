@@ -14,7 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import relay_autotune
-from relay_autotune.bag.definitions import Definition, find_definition
+from relay_autotune.bag.definitions import (
+    EXPERIMENT_METADATA,
+    FLOAT64,
+    Definition,
+    find_definition,
+)
 from relay_autotune.bag.metadata import (
     Qos,
     TopicSummary,
@@ -22,7 +27,6 @@ from relay_autotune.bag.metadata import (
     metadata_yaml,
     qos_yaml,
 )
-from relay_autotune.bag.names import EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.errors import BagError
 
 if TYPE_CHECKING:

@@ -30,8 +30,8 @@ from relay_autotune.loop.closed_loop import ClosedLoop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LawRate, RunningLaw
 from relay_autotune.loop.sampled import UNLIMITED, Limits, PidLaw, filter_matrices
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 
 # A measurement, set-point or command of a larger magnitude is an error of its sender [y, u].
 LARGEST_VALUE = 1e12

@@ -13,8 +13,8 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import SampledController, SampledPid
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from relay_autotune.loop.responses import (
     has_settled,
     horizon,
 )
-from relay_autotune.process.held import HeldProcess
+from relay_autotune.process.response import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 
 _PER_DECADE = 60

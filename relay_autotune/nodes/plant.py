@@ -20,10 +20,9 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.nodes.parameters import declare, values_of
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.structures import FIELDS, TABLE, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.quantities import Quantity
 
 MODES = ("realtime", "clock", "lockstep")

@@ -16,25 +16,23 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError, look_up
-from relay_autotune.process.factors import (
-    PAIR,
-    TWO_LAGS,
-    Denominator,
-    Factor,
-    Lag,
-    Quadratic,
-    UnstableLag,
-)
 from relay_autotune.process.model_parameters import (
     DEAD_TIME,
     GAIN,
     INVERSE,
+    PAIR,
     PARAMETERS,
     TIME_CONSTANT_1,
     TIME_CONSTANT_2,
     TIME_CONSTANT_3,
+    TWO_LAGS,
     ZERO,
+    Denominator,
+    Factor,
+    Lag,
     Parameter,
+    Quadratic,
+    UnstableLag,
     at_least_one,
     exactly,
 )

@@ -6,14 +6,135 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.errors import ParameterError
-from relay_autotune.process.actuator import Actuator
-from relay_autotune.process.plant import Plant
+from relay_autotune.errors import ModelError, ParameterError
+from relay_autotune.process.modes import Modes
 from relay_autotune.process.transfer_function import TransferFunction
+
+
+class Actuator:
+    """Turn commands into positions; it keeps the position between calls.
+
+    A command passes, in this order:
+
+    1. the limits ``minimum`` and ``maximum``;
+    2. the dead band (play): the position follows at a distance of half the dead band, so that
+       after a reversal it stays until the command has moved by the whole of it;
+    3. stiction in the one-parameter form of Stenman, Gustafsson and Forsman (2003): the position
+       sticks until the command is further away than ``stiction``, and then jumps to it;
+    4. ``falling_gain``: the distance of the position below ``initial`` is multiplied by this, as
+       for a process that heats fast and cools slowly.
+
+    :param initial: position at the start [u].
+    :param minimum: lower limit of the position [u]; -inf: none.
+    :param maximum: upper limit of the position [u]; inf: none.
+    :param dead_band: width of the play [u], >= 0.
+    :param stiction: width of the band in which it sticks [u], >= 0.
+    :param falling_gain: factor on the position's distance below ``initial``, > 0; 1: no effect.
+    :raises ParameterError: if the limits cross, or a width is negative or not finite.
+    """
+
+    def __init__(
+        self,
+        initial: float,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+        dead_band: float = 0.0,
+        stiction: float = 0.0,
+        falling_gain: float = 1.0,
+    ) -> None:
+        if not minimum < maximum:
+            raise ParameterError(
+                f"the actuator's lower limit must be below its upper one, "
+                f"found {minimum:g} and {maximum:g}"
+            )
+        for name, width in (("dead_band", dead_band), ("stiction", stiction)):
+            if not (math.isfinite(width) and width >= 0.0):
+                raise ParameterError(f"{name} must be finite and not negative, found {width}")
+        if not (math.isfinite(falling_gain) and falling_gain > 0.0):
+            raise ParameterError(f"falling_gain must be finite and > 0, found {falling_gain}")
+        if not minimum <= initial <= maximum:
+            raise ParameterError(
+                f"the actuator cannot start at {initial:g}, outside its limits "
+                f"{minimum:g} to {maximum:g}"
+            )
+        self._minimum = minimum
+        self._maximum = maximum
+        self._half_play = 0.5 * dead_band
+        self._stiction = stiction
+        self._follower = initial
+        self._initial = initial
+        self._falling_gain = falling_gain
+        self.position = initial
+
+    def move(self, command: float) -> float:
+        """Give a command and return the resulting input of the process [u].
+
+        :param command: [u]; ignored if it is not finite.
+        """
+        if not math.isfinite(command):
+            return self.acting
+        wanted = min(max(command, self._minimum), self._maximum)
+        half = self._half_play
+        follower = min(max(self._follower, wanted - half), wanted + half)
+        self._follower = follower
+        if self._stiction == 0.0 or abs(follower - self.position) > self._stiction:
+            self.position = follower
+        return self.acting
+
+    @property
+    def acting(self) -> float:
+        """Input of the process at the present position [u]."""
+        below = min(self.position - self._initial, 0.0)
+        return self.position + (self._falling_gain - 1.0) * below
+
+
+class Plant:
+    """A process whose input is held between calls, exact for any real dead time.
+
+    :param model: the process.
+    :param initial_command: the command at which it rests [u].
+    """
+
+    def __init__(self, model: TransferFunction, *, initial_command: float = 0.0) -> None:
+        self.time = 0.0
+        self._dead_time = model.dead_time
+        self._modes = Modes.of(model)
+        self._z = self._modes.rest()
+        self._weights = self._modes.weights(self._z)
+        self._since = 0.0
+        self._command = initial_command
+        self._arrived = initial_command
+        self._on_the_way: deque[tuple[float, float]] = deque()
+
+    def advance(self, time: float, command: float) -> float:
+        """Hold ``command`` from now on, move to ``time`` and return the output there.
+
+        :param time: not before the present time [s].
+        :param command: [u].
+        :return: deviation of the output from rest [y].
+        :raises ModelError: if ``time`` lies in the past.
+        """
+        if time < self.time:
+            raise ModelError(f"the plant is at {self.time:g} s and cannot go back to {time:g} s")
+        if command != self._command:
+            self._on_the_way.append((self.time + self._dead_time, command))
+            self._command = command
+        while self._on_the_way and self._on_the_way[0][0] <= time:
+            self._arrive(*self._on_the_way.popleft())
+        self.time = time
+        return float(self._modes.outputs(self._weights, np.array([time - self._since]))[0, 0])
+
+    def _arrive(self, time: float, command: float) -> None:
+        z = self._modes.move(self._z, time - self._since)
+        self._z = z + (command - self._arrived) * self._modes.input_direction
+        self._weights = self._modes.weights(self._z)
+        self._since, self._arrived = time, command
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from dataclasses import dataclass
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.control_law import InternalModelLaw
 from relay_autotune.loop.sampled import Limits, require_period
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.tuning.rules.applicability import fopdt_of, named, process_of
 from relay_autotune.tuning.task import DesignTask
 

@@ -17,7 +17,7 @@ from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import Law
 from relay_autotune.loop.sampled_loop import SampledLoop, sampled_grid
-from relay_autotune.process.held import HeldProcess
+from relay_autotune.process.response import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 
 _Constants = Sequence[tuple[complex, ...]]

@@ -28,7 +28,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import Law, Rational, Slope
 from relay_autotune.loop.margins import peaks
 from relay_autotune.loop.sampled_loop import SampledLoop, circle, sampled_grid, step_response
-from relay_autotune.process.held import HeldProcess
+from relay_autotune.process.response import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import Candidates
 from relay_autotune.tuning.frontier import Bounds, Responses, design_grid, envelope, first_crossing

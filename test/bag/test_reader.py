@@ -25,9 +25,8 @@ from made_bags import (
 )
 from mcap.writer import CompressionType, Writer
 
-from relay_autotune.bag.decode import DEFAULTS
-from relay_autotune.bag.definitions import Definition
-from relay_autotune.bag.names import CYCLE, EXPERIMENT
+from relay_autotune.bag.cdr import DEFAULTS
+from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.reader import Selection, read_experiments
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import BagError, SelectionError

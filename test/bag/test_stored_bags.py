@@ -14,9 +14,8 @@ from made_bags import REPOSITORY, assert_same_record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from relay_autotune.analysis import analyse
-from relay_autotune.bag.experiments import interrupted_experiment
 from relay_autotune.bag.mcap_file import McapFile
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import Selection, interrupted_experiment, read_experiments
 from relay_autotune.bag.topics import Topics
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.tuning import design

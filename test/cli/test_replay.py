@@ -21,13 +21,12 @@ from made_bags import (
     write_pair,
     write_samples,
 )
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import analyse
-from relay_autotune.bag.definitions import Definition
-from relay_autotune.bag.names import CYCLE, EXPERIMENT
+from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli import csv_to_bag, replay
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 

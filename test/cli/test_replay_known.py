@@ -11,15 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_bags import START, definition, experiment_message, serialize, write_samples
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import analyse, analyse_jointly
-from relay_autotune.bag.definitions import Definition
-from relay_autotune.bag.names import EXPERIMENT
+from relay_autotune.bag.definitions import EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic
 from relay_autotune.cli import replay
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.known import Known
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.process.actuator import Actuator
+from relay_autotune.process.virtual_process import Actuator
 
 COMMANDS = st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=50)
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import Analysis, analyse, analyse_alone, model_so_far
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.disturbance import last_cycles
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import cycles_of

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
@@ -19,11 +20,9 @@ from relay_autotune.identification.judgement.checks import (
 )
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.response import response
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import Disturbances, Plant, VirtualProcess
 from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)

@@ -12,10 +12,10 @@ import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import Record
 
 

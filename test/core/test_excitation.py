@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 import pytest
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import analyse
 from relay_autotune.process.response import response
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.excitation import find_experiments
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings

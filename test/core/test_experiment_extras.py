@@ -15,9 +15,9 @@ from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, SafePolicy
 from relay_autotune.experiment.faults.process import RunawayWatch, is_growing
 from relay_autotune.experiment.faults.sensor import ClockWatch, FrozenWatch
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome
 

@@ -26,7 +26,7 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import FitReport, Identification, Rival, Validation
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains, Performance
-from relay_autotune.process.factors import Quadratic
+from relay_autotune.process.model_parameters import Quadratic
 from relay_autotune.process.structures import TABLE, Structure
 from relay_autotune.quantities import Told, told_fields
 from relay_autotune.record.cycles import LimitCycle

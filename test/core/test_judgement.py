@@ -24,11 +24,10 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.waveform.theta import theta_of
 from relay_autotune.loop.analysis import ms_on
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import GivenModel, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict, judge
 

@@ -15,10 +15,9 @@ from relay_autotune.experiment.experiment import ExperimentParameters, RelayExpe
 from relay_autotune.identification.judgement.disturbance import without_disturbance
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from relay_autotune.errors import ParameterError, RecordError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, State
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Outcome
 

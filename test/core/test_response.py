@@ -14,10 +14,10 @@ from scipy.linalg import expm
 
 from relay_autotune.errors import RecordError
 from relay_autotune.identification.waveform.theta import columns_of
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import PiecewiseConstant
 
 INPUT = PiecewiseConstant(np.array([0.0, 3.3, 7.7, 20.0]), np.array([1.0, -1.0, 0.5, -0.3]), 0.0)

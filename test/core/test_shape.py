@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
@@ -29,7 +30,6 @@ from relay_autotune.identification.shown.shape import (
     shape_of_record,
 )
 from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings

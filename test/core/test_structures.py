@@ -19,7 +19,7 @@ from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.rational import free_motion, responses
 from relay_autotune.identification.waveform.selection import support
 from relay_autotune.identification.waveform.theta import columns_of
-from relay_autotune.process.factors import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic, UnstableLag
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import FOPDT

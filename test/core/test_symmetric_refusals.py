@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
@@ -19,7 +20,6 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import atv_from_numbers
 from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

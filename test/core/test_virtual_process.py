@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.process.actuator import Actuator
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 
 MODEL = TransferFunction.fopdt(2.0, 5.0, 1.3)
 

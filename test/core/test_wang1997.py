@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
@@ -23,7 +24,6 @@ from relay_autotune.identification.methods.wang import (
     identify_unbiased,
 )
 from relay_autotune.identification.shown.fourier import cycle_means, frequency_point
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
 from relay_autotune.process.response import response
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.process.sampled_relay import simulate_sampled_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings
 

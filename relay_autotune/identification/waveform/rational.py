@@ -9,7 +9,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.partial_fractions import follow, partial_fractions
-from relay_autotune.process.factors import Denominator, Lag, UnstableLag
+from relay_autotune.process.model_parameters import Denominator, Lag, UnstableLag
 from relay_autotune.process.modes import Modes
 from relay_autotune.process.response import coordinates_at_changes
 from relay_autotune.record.record import Input, PiecewiseLinear

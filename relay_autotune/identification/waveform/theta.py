@@ -15,8 +15,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.partial_fractions import MANY_CHANGES, doubled
 from relay_autotune.identification.waveform.rational import responses
-from relay_autotune.process.factors import Quadratic
-from relay_autotune.process.model_parameters import DEAD_TIME
+from relay_autotune.process.model_parameters import DEAD_TIME, Quadratic
 from relay_autotune.process.structures import FOPDT, Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
-from relay_autotune.process.plant import Plant
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 
 
