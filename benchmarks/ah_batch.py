@@ -23,13 +23,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.load_cost import load_iaes
+from relay_autotune.tuning.search import load_iaes
 
 FloatArray = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from markdown import table
 
 from relay_autotune import threads  # noqa: F401  before numpy
 from relay_autotune.arrays import FloatArray
-from relay_autotune.confidence import NORMAL_95
+from relay_autotune.quantities import NORMAL_95
 
 # isort: split
 import numpy as np

@@ -21,11 +21,11 @@ from processes import PROCESSES, Process
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import TABLE
+from relay_autotune.quantities import NORMAL_95
 
 RECORDS = 2_000
 RATIO = 0.1

@@ -24,7 +24,7 @@ from relay_autotune import threads  # noqa: F401  before numpy
 from markdown import table, three
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.control_law import ControlLaw
+from relay_autotune.loop.gains import ControlLaw
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import (
     RULES,

@@ -35,9 +35,9 @@ from markdown import table, three
 
 from relay_autotune.analysis import Analysis, analyse_alone
 from relay_autotune.bag.reader import read_records
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import ms_on
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 
 _MOST_SECONDS = 300.0

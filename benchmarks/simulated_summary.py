@@ -13,7 +13,7 @@ import numpy as np
 from markdown import table
 from random_experiments import DISTURBANCES, FAULTS, HAPPENINGS, NOTHING
 
-from relay_autotune.confidence import NORMAL_95
+from relay_autotune.quantities import NORMAL_95
 
 if TYPE_CHECKING:
     from simulated_experiments import Result

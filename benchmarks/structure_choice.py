@@ -20,9 +20,9 @@ from processes import PROCESSES, Process, same_structure
 # isort: split
 import numpy as np
 
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.methods import identify
+from relay_autotune.quantities import NORMAL_95
 
 RECORDS = 30
 RATIO = 0.1

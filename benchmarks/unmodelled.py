@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from relay_autotune.analysis import analyse_alone
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.loop.control_law import ControlLaw
+from relay_autotune.loop.gains import ControlLaw
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, VirtualProcess
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from relay_autotune.identification.known import Known
     from relay_autotune.identification.methods import METHODS, identify
     from relay_autotune.identification.result import Identification
-    from relay_autotune.loop.closed_loop import simulate_closed_loop
+    from relay_autotune.loop.sampled import simulate_closed_loop
     from relay_autotune.process.structures import STRUCTURES
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.process.ultimate import ultimate_point
@@ -62,7 +62,7 @@ _HOMES = {
     "experiment.parameters": ("ExperimentParameters",),
     "report": ("draw", "write_report"),
     "tuning": ("RULES", "Controller", "DesignOptions", "Gains", "tune"),
-    "loop.closed_loop": ("simulate_closed_loop",),
+    "loop.sampled": ("simulate_closed_loop",),
     "process.ultimate": ("ultimate_point",),
     "process.virtual_process": ("Disturbances", "VirtualProcess"),
 }

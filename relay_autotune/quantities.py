@@ -291,3 +291,7 @@ def check_told(values: object, error: type[RelayAutotuneError], of: str) -> None
             problem = each.problem(getattr(values, each.name))
             if problem is not None:
                 raise error(f"{each.name} {of} {problem}")
+
+
+NORMAL_95 = 1.96
+"""Half of the width of the 95 % interval of a normal estimate, in standard deviations."""

@@ -36,7 +36,7 @@ from relay_autotune.bag.schema import (
     message_type,
 )
 from relay_autotune.errors import BagError, FieldError
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 
 _ENCAPSULATION = 4
 _UINT32 = Number("uint32", "u4")

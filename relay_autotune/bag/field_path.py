@@ -27,7 +27,7 @@ from typing import Any
 
 from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type, numeric_paths
 from relay_autotune.errors import FieldError
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 
 # Lists of texts that name the elements of the arrays beside them, and of those in structures
 # beside them; and the field by which an element of an array of messages is named.

@@ -15,7 +15,7 @@ import numpy as np
 
 from relay_autotune.arrays import IntArray
 from relay_autotune.bag.limits import MOST_DECLARATIONS
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 0x07, 0x08, 0x0B

@@ -30,7 +30,7 @@ from relay_autotune.bag.schema import numeric_paths
 from relay_autotune.bag.signals import Signal
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import FieldError, SelectionError
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 
 _WORDS = {
     "set-point": "setpoint reference ref target desired goal",

@@ -15,7 +15,7 @@ from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIE
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.ros2msg import types_from_ros2msg
 from relay_autotune.errors import BagError
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 
 _NUMBERS = {
     **dict.fromkeys(("bool", "byte", "octet", "char", "uint8"), "u1"),

@@ -26,7 +26,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.bag.limits import LARGEST_TEXT, LONGEST_LINE
 from relay_autotune.errors import BagError
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 
 # Each is preferred to those after it where both make as many numbers: beside a semicolon, a tab
 # or a space a comma may be the decimal point.

@@ -17,9 +17,9 @@ from relay_autotune.cli.arguments import add_quantities, finite, given_quantitie
 from relay_autotune.cli.design_arguments import add_design, design_options
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import RelayAutotuneError, SelectionError
-from relay_autotune.escape import visible
 from relay_autotune.identification.known import Known
 from relay_autotune.quantities import declared
+from relay_autotune.text import visible
 
 
 def add_analysis(parser: argparse.ArgumentParser) -> None:

@@ -17,8 +17,8 @@ from typing import Any
 
 from relay_autotune.cli.layout import broken, width
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
-from relay_autotune.escape import visible
 from relay_autotune.quantities import Quantity
+from relay_autotune.text import visible
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
 # From best to worst; a command for several bags ends with the worst of their statuses.

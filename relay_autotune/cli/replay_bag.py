@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from relay_autotune.bag.reader import Selection, read_experiments
 from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
-from relay_autotune.escape import visible
+from relay_autotune.text import visible
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:

@@ -202,7 +202,7 @@ _Source = tuple[tuple[str, ...], Callable[[], Sequence["Case"]]]
 
 def _sources(options: argparse.Namespace) -> list[_Source]:
     """Return the names of each source, with what reads it, in the order of the command line."""
-    from relay_autotune.report.from_document import read_documents
+    from relay_autotune.report.case import read_documents
 
     names = list(dict.fromkeys(options.sources))
     jobs = jobs_of(options, [name for name in names if not _is_result(name)])

@@ -15,12 +15,12 @@ from typing import Any, Self
 
 from relay_autotune.cli.arguments import DONE, deserved, worst
 from relay_autotune.errors import BagError, SelectionError
-from relay_autotune.escape import cell
 from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.loop.gains import Gains
 from relay_autotune.quantities import told_fields
+from relay_autotune.text import cell
 
 ENDINGS = (".jsonl", ".csv", ".parquet")
 

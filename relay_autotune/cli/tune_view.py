@@ -17,8 +17,8 @@ from typing import Any
 
 from relay_autotune.cli.layout import WIDEST, labelled
 from relay_autotune.cli.table import gains_lines
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.text import digits, duration, process_text
 from relay_autotune.verdict import Verdict
 

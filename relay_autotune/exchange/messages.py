@@ -24,10 +24,10 @@ from relay_autotune.errors import (
     RelayAutotuneError,
     TuningError,
 )
-from relay_autotune.escape import visible
 from relay_autotune.exchange.fields import float64_array, of_message, to_message
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.text import visible
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import html
 import math
 from typing import TYPE_CHECKING
 
-from relay_autotune.confidence import NORMAL_95
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.text import digits, plus_minus, process_mathml, process_text
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import ParameterError
-from relay_autotune.quantities import told
+from relay_autotune.quantities import NORMAL_95, told
 
 ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)

@@ -12,11 +12,15 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.faults.repetition import SilenceWatch
-from relay_autotune.experiment.faults.sensor import FrozenWatch, SampleCheck
+from relay_autotune.experiment.faults import (
+    FrozenWatch,
+    ProportionalHold,
+    SafePolicy,
+    SampleCheck,
+    SilenceWatch,
+)
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import Procedure, State
-from relay_autotune.experiment.safe_command import ProportionalHold, SafePolicy
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 

@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import replace
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.experiment.faults.process import (
+from relay_autotune.experiment.faults import (
     NO_ANSWER,
     TELL,
     RunawayWatch,
@@ -21,10 +21,9 @@ from relay_autotune.experiment.faults.process import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.levels import Levels, clear_swing
 from relay_autotune.experiment.narration import while_switching
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.relay_law import Patience, Relay
+from relay_autotune.experiment.relay_law import Levels, Patience, Relay, clear_swing
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
 from relay_autotune.experiment.turns import Turns

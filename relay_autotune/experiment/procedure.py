@@ -24,14 +24,13 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from relay_autotune.experiment.faults.process import count_cycles
+from relay_autotune.experiment.faults import count_cycles
 from relay_autotune.experiment.kick import (
     LAST_LOOK,
     LAST_LOOK_SAMPLES,
     DirectionWatch,
     ResponseDetector,
 )
-from relay_autotune.experiment.levels import Levels
 from relay_autotune.experiment.narration import (
     while_finding_direction,
     while_settling,
@@ -39,7 +38,7 @@ from relay_autotune.experiment.narration import (
 )
 from relay_autotune.experiment.oscillation import Oscillation
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.relay_law import Relay
+from relay_autotune.experiment.relay_law import Levels, Relay
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import (
     NOISE_SAMPLES,

@@ -1,11 +1,17 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The relay: when it switches, and how long it waits for the measurement to come back."""
+"""The relay: its two command levels, when it switches, how long it waits for a return.
+
+The levels are given, or grown from small to large within the limits.
+"""
 
 from __future__ import annotations
 
 import math
+
+from relay_autotune.arrays import FloatArray
+from relay_autotune.experiment.parameters import ExperimentParameters
 
 
 class Relay:
@@ -90,3 +96,190 @@ class Patience:
         """
         self._longest = max(self._longest, stay)
         self.limit = max(self._ratio * self._longest, self.LEAST_SAMPLES * interval)
+
+
+# An amplitude that is not given starts at this part of the command's range.
+FIRST_SHARE = 0.01
+# Half swing that is clear of noise (in standard deviations), of the hysteresis (in half widths),
+# and of the sensor's resolution (in steps).
+CLEAR_OF_NOISE = 10.0
+CLEAR_OF_HYSTERESIS = 3.0
+CLEAR_OF_STEPS = 5.0
+
+# Least and largest growth of a too small amplitude at a time.
+_LEAST_GROWTH = 1.5
+_MOST_GROWTH = 4.0
+# Reserve on a target, since the swing is not exactly proportional to the amplitude.
+_TO_SPARE = 1.2
+
+# First share of a given amplitude, if its levels may lie beyond the actuator's ends.
+_SMALL = 0.25
+
+# Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
+# The hysteresis makes small swings larger than proportional, by a third at most.
+_GROWN, _CLIPPED = 3.0, 1.5
+
+
+class Levels:
+    """The levels of a relay about its baseline.
+
+    A given amplitude stays as it is; with ``from_small`` it starts at a quarter, so that the two
+    swings of the measurement show whether the actuator goes as far. Otherwise the amplitude starts
+    at a hundredth of the range of the command and grows. A level beyond a limit is cut to the
+    limit; the upper and the lower step then differ, which counts as bias.
+
+    :param parameters: the user's parameters, valid for the baseline.
+    :param baseline: command of the operating point [u].
+    :param from_small: True: a given amplitude is not applied at once.
+    """
+
+    def __init__(
+        self, parameters: ExperimentParameters, baseline: float, *, from_small: bool = False
+    ) -> None:
+        self._parameters = parameters
+        self._baseline = baseline
+        self.from_small = from_small and not parameters.finds_amplitude
+        """True if a given amplitude starts at a quarter."""
+        self.searching = parameters.finds_amplitude or self.from_small
+        """True while the amplitude may still grow."""
+        self._wanted = parameters.amplitude
+        self._shift = 0.0
+        if self.from_small:
+            self.begin_small()
+        elif parameters.finds_amplitude:
+            span = parameters.command_max - parameters.command_min
+            self._wanted = FIRST_SHARE * span
+            if abs(parameters.bias) >= self._wanted:
+                self._wanted = 1.5 * abs(parameters.bias)
+        # Amplitude, half swing and levels of the first cycle that was clear of the noise.
+        self._first_clear: tuple[float, float, float, float] | None = None
+        self._set()
+
+    def _set(self) -> None:
+        p = self._parameters
+        if p.finds_amplitude:
+            bias = p.bias if p.bias != 0.0 else p.bias_ratio * self._wanted
+        else:
+            bias = p.relay_bias * (self._wanted / p.amplitude)
+        middle = self._baseline + bias + self._shift
+        # Shifted levels also stay within the limits.
+        self.low = max(middle - self._wanted, p.command_min)
+        """The lower level [u]."""
+        self.high = min(middle + self._wanted, p.command_max)
+        """The upper level [u]."""
+
+    @property
+    def _as_given(self) -> bool:
+        # Keep the exact digits of the user's numbers.
+        return self._wanted == self._parameters.amplitude and self._shift == 0.0
+
+    @property
+    def amplitude(self) -> float:
+        """Half the distance of the levels, mu [u]."""
+        if self._as_given:
+            return self._parameters.amplitude
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def bias(self) -> float:
+        """Middle of the levels minus the baseline, mu0 [u]."""
+        if self._as_given:
+            return self._parameters.relay_bias
+        return 0.5 * (self.high + self.low) - self._baseline
+
+    @property
+    def can_grow(self) -> bool:
+        """True if the amplitude may be made larger."""
+        p = self._parameters
+        if self.from_small and self._wanted == p.amplitude:
+            return False
+        return self.searching and (self.low > p.command_min or self.high < p.command_max)
+
+    def grow(self, factor: float = 2.0) -> None:
+        """Make the amplitude larger, within the limits, if it is not given."""
+        self._wanted *= factor
+        if self.from_small:
+            self._wanted = min(self._wanted, self._parameters.amplitude)
+        self._set()
+
+    def begin_small(self) -> None:
+        """Apply the first share of a given amplitude, whatever the kick needed."""
+        self._wanted = _SMALL * self._parameters.amplitude
+        self._set()
+
+    def shift(self, by: float) -> None:
+        """Move both levels, to compensate a load [u]."""
+        self._shift += by
+        self._set()
+
+    def note_small(self, half_swing: float, clear: float) -> None:
+        """Keep the first swing of the measurement that is clear of noise.
+
+        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param clear: the half swing that is clear of noise, hysteresis and resolution [y].
+        """
+        if self._first_clear is None and half_swing >= clear:
+            self._first_clear = self.amplitude, half_swing, self.low, self.high
+
+    @property
+    def grew_enough(self) -> bool:
+        """True if the levels have grown enough for the response to have grown, too."""
+        first = self._first_clear
+        return first is not None and self.amplitude >= _GROWN * first[0]
+
+    def why_clipped(self, half_swing: float, *, settled: bool) -> str:
+        """Return why the actuator must be at its ends, or "".
+
+        A response that is clear of noise must grow with the levels.
+
+        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param settled: True: the swing does not grow any more, and must have grown by at least
+            the square root of the growth of the levels.
+        """
+        if self._first_clear is None or not self.grew_enough:
+            return ""
+        amplitude, swing, low, high = self._first_clear
+        if half_swing >= swing * (math.sqrt(self.amplitude / amplitude) if settled else _CLIPPED):
+            return ""
+        return (
+            f"the actuator is clipped: the amplitude grew from {amplitude:.3g} to "
+            f"{self.amplitude:.3g}, and half the swing of the measurement from {swing:.3g} to "
+            f"{half_swing:.3g} only; give its true ends for command_min and command_max, or an "
+            f"amplitude with which it stays between {low:.3g} and {high:.3g}"
+        )
+
+    def growth_for(self, half_swing: float, least: float) -> float:
+        """Return the factor by which the amplitude must grow, 1 if it is large enough.
+
+        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param least: the half swing that is large enough [y].
+        """
+        if not self.can_grow:
+            return 1.0
+        if self.from_small:
+            return self._parameters.amplitude / self._wanted
+        if half_swing >= least:
+            return 1.0
+        ratio = _TO_SPARE * least / half_swing if half_swing > 0.0 else math.inf
+        return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)
+
+
+def clear_swing(
+    target: float, noise_std: float, hysteresis: float, measurement: FloatArray
+) -> float:
+    """Return the half swing at which the amplitude is large enough [y].
+
+    :param target: the user's target [y]; 0: clear of noise, hysteresis and resolution.
+    :param noise_std: standard deviation of the noise [y].
+    :param hysteresis: half width of the relay's band [y].
+    :param measurement: samples of the oscillation [y], shape (n,); the smallest difference
+        between two that follow each other is taken for the sensor's resolution.
+    """
+    if target > 0.0:
+        return target
+    steps = abs(measurement[1:] - measurement[:-1])
+    steps = steps[steps > 0.0]
+    resolution = float(steps.min()) if steps.size else 0.0
+    return max(
+        CLEAR_OF_NOISE * noise_std, CLEAR_OF_HYSTERESIS * hysteresis, CLEAR_OF_STEPS * resolution
+    )

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.differences import exact_steps, jacobian
 from relay_autotune.process.structures import GivenModel, Structure
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.quantities import NORMAL_95
 
 # Largest change of a logarithm. Steps for derivatives: their bounds, and their share of a
 # standard deviation.

@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.combinations import DETERMINED, Combination
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.quantities import told, told_fields
+from relay_autotune.quantities import NORMAL_95, told, told_fields
 from relay_autotune.text import process_text
 
 NOT_AT_REST = "the process was not at rest at the baseline when the test began"

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.loop.control_law import ControlLaw
-from relay_autotune.loop.gains import Performance, StepFigures
+from relay_autotune.loop.gains import ControlLaw, Performance, StepFigures
 from relay_autotune.loop.margins import LoopMargins, frequencies, margins, sensitivity_peaks
 from relay_autotune.loop.noise import noise_gain
 from relay_autotune.loop.responses import step_figures

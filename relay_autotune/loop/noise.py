@@ -11,8 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
-from relay_autotune.loop.control_law import ControlLaw
-from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.gains import ControlLaw, Controller
 from relay_autotune.loop.margins import frequencies
 from relay_autotune.loop.sampled import filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction

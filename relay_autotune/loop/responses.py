@@ -19,8 +19,7 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.control_law import ControlLaw
-from relay_autotune.loop.gains import StepFigures
+from relay_autotune.loop.gains import ControlLaw, StepFigures
 from relay_autotune.process.transfer_function import TransferFunction
 
 _POINTS = 4096

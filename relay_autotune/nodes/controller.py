@@ -35,13 +35,13 @@ from relay_autotune.nodes.controller_parameters import (
     range_from,
     rate_from,
 )
-from relay_autotune.nodes.following import FOLLOW_EVERY, Following
 from relay_autotune.nodes.gains_journal import GainsJournal
 from relay_autotune.nodes.gains_keeper import GainsKeeper
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.own_gains import OwnGains, controller_of, said, set_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
 from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
 from relay_autotune.nodes.results import ResultCheck, why_doubtful

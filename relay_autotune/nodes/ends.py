@@ -17,8 +17,8 @@ from rclpy.subscription import Subscription
 
 from relay_autotune.nodes import quality, signs_of_life
 from relay_autotune.nodes.command_message import CommandMessage
-from relay_autotune.nodes.following import Following
 from relay_autotune.nodes.live_types import Reader
+from relay_autotune.nodes.quality import Following
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 
 # Interval and largest number of repeats of the safe command until it is acknowledged.

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tell each second what a running tune waits for and what it sees."""
+"""What a running action tells: each second what it waits for and sees, and its end."""
 
 from __future__ import annotations
 
@@ -36,3 +36,23 @@ class Narrator:
         self._timer.reset()
         self._node.get_logger().info(words)
         self._tell(words)
+
+
+def conclude(goal: Any, result: Any, *, succeeded: bool) -> None:
+    """End an accepted goal: cancelled if the client asked for that, else succeeded or aborted.
+
+    :param goal: its handle.
+    :param result: the result for its client.
+    :param succeeded: False: it is aborted.
+    """
+
+    def finish(handle: Any) -> Any:
+        if handle.is_cancel_requested:
+            handle.canceled()
+        elif succeeded:
+            handle.succeed()
+        else:
+            handle.abort()
+        return result
+
+    goal.execute(finish)

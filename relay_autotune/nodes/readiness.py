@@ -15,8 +15,8 @@ from rclpy.parameter import Parameter as RosParameter
 
 from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
-from relay_autotune.experiment.levels import Levels
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.parameters import merged
 from relay_autotune.nodes.quality import why_no_publisher, why_no_subscriber

@@ -35,14 +35,13 @@ from relay_autotune.nodes.checklist import (
 )
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
-from relay_autotune.nodes.following import FOLLOW_EVERY
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
 from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.nodes.parameters import declare, values_of
-from relay_autotune.nodes.quality import described, who, why_no_publisher
+from relay_autotune.nodes.quality import FOLLOW_EVERY, described, who, why_no_publisher
 from relay_autotune.nodes.readiness import (
     NotReadyError,
     Ready,

@@ -18,7 +18,7 @@ import numpy.ma
 from relay_autotune.exchange.messages import start_seconds
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, State
-from relay_autotune.experiment.faults.sensor import ClockWatch
+from relay_autotune.experiment.faults import ClockWatch
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.record.record import Record
 

@@ -15,7 +15,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from relay_autotune.errors import FieldError, ParameterError
-from relay_autotune.experiment.faults.repetition import Repetition
+from relay_autotune.experiment.faults import Repetition
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import Reader

@@ -15,7 +15,7 @@ from rclpy.node import Node
 
 from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.goals import conclude
+from relay_autotune.nodes.narrator import conclude
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
 

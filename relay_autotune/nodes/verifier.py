@@ -26,9 +26,8 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.goals import conclude
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
-from relay_autotune.nodes.narrator import Narrator
+from relay_autotune.nodes.narrator import Narrator, conclude
 from relay_autotune.nodes.results import keep
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import duration

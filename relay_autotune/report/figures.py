@@ -12,10 +12,14 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from relay_autotune.escape import visible
 from relay_autotune.report.case import Case
 from relay_autotune.report.experiment import draw_experiment, draw_fit, draw_phase_plane
-from relay_autotune.report.frequency import draw_bode, draw_nyquist
+from relay_autotune.report.frequency import (
+    draw_bode,
+    draw_nyquist,
+    draw_uncertainty,
+    uncertainty_height,
+)
 from relay_autotune.report.loops import (
     distinct_gains,
     draw_closed_loop,
@@ -23,7 +27,7 @@ from relay_autotune.report.loops import (
     rules_height,
 )
 from relay_autotune.report.style import INK, MUTED, NARROW, SQUARE, WIDE, new_figure, save
-from relay_autotune.report.uncertainty import draw_uncertainty, uncertainty_height
+from relay_autotune.text import visible
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure

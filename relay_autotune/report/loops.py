@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.closed_loop import ClosedLoop, simulate_closed_loop
 from relay_autotune.loop.laws import LAWS
+from relay_autotune.loop.sampled import ClosedLoop, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.report.style import BLUE, INK, MUTED, SKY, VERMILLION, finish, in_steps, legend

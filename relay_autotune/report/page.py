@@ -14,7 +14,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import relay_autotune
-from relay_autotune.escape import visible
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
@@ -33,7 +32,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import COLOURS, inline
-from relay_autotune.text import digits, plus_minus, process_mathml, process_text
+from relay_autotune.text import digits, plus_minus, process_mathml, process_text, visible
 
 # Colours of the page in dark mode; those of the figures come from COLOURS.
 _NIGHT = (

@@ -18,12 +18,12 @@ from relay_autotune.loop.sampled_loop import analyse_sampled
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
-from relay_autotune.tuning.law_cost import cost_of
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
 from relay_autotune.tuning.rules.applicability import is_first_order
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
+from relay_autotune.tuning.sampled_search import cost_of
 from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}

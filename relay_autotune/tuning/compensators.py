@@ -26,7 +26,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.control_law import InternalModelLaw
+from relay_autotune.loop.gains import InternalModelLaw
 from relay_autotune.loop.sampled import Limits, require_period
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant

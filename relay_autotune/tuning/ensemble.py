@@ -22,9 +22,9 @@ from relay_autotune.loop.stability import (
     winding,
 )
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.tuning.candidates import allowed_outside
 from relay_autotune.tuning.model_set import HeldSet, ModelSet
 from relay_autotune.tuning.rules import Rule
-from relay_autotune.tuning.surroundings import allowed_outside
 from relay_autotune.tuning.task import DesignTask
 
 _MODELS = 100

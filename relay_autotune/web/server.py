@@ -27,11 +27,11 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
-from relay_autotune.escape import visible
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
+from relay_autotune.text import visible
 from relay_autotune.tuning import RULES
 from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire

@@ -16,9 +16,8 @@ from relay_autotune.cli.replay_bag import status_of
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.document import document
 from relay_autotune.exchange.messages import fill_gains
-from relay_autotune.report.case import case_of
+from relay_autotune.report.case import case_of, cases_of_document
 from relay_autotune.report.findings import checks_of, verdict_of
-from relay_autotune.report.from_document import cases_of_document
 from relay_autotune.report.page import page
 from relay_autotune.verdict import NOT_JUDGED, Verdict
 

@@ -16,8 +16,7 @@ from scipy.integrate import trapezoid
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import analyse_loop, is_stable
-from relay_autotune.loop.control_law import InternalModelLaw
-from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.gains import Controller, InternalModelLaw
 from relay_autotune.loop.responses import step_responses
 from relay_autotune.loop.stability import closed_loop_unstable_poles, winding
 from relay_autotune.process.transfer_function import TransferFunction

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.closed_loop import simulate_closed_loop
+from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, analyse_loop
 from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator

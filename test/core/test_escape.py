@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from relay_autotune.escape import cell, visible
+from relay_autotune.text import cell, visible
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,12 @@ from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, SafePolicy
-from relay_autotune.experiment.faults.process import RunawayWatch, is_growing
-from relay_autotune.experiment.faults.sensor import ClockWatch, FrozenWatch
+from relay_autotune.experiment.faults import (
+    ClockWatch,
+    FrozenWatch,
+    RunawayWatch,
+    is_growing,
+)
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant

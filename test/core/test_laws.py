@@ -14,10 +14,9 @@ from fopdt_plant import FopdtPlant
 from relay_autotune.control.controller import LawController
 from relay_autotune.control.verification import Step, compare, plan
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.closed_loop import simulate_closed_loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, LawRate, law_named
-from relay_autotune.loop.sampled import Limits, SampledPid
+from relay_autotune.loop.sampled import Limits, SampledPid, simulate_closed_loop
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
 from relay_autotune.process.transfer_function import TransferFunction
 

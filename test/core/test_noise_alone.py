@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.experiment.faults.process import why_noise_alone
+from relay_autotune.experiment.faults import why_noise_alone
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome

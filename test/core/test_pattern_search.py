@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relay_autotune.tuning.pattern_search import pattern_search
+from relay_autotune.tuning.search import pattern_search
 
 
 @pytest.mark.parametrize("tilt", [0.3, 1.0, 2.0])

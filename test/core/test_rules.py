@@ -21,22 +21,19 @@ from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, analyse_loop, design
 from relay_autotune.tuning.rules import PUBLISHED
-from relay_autotune.tuning.rules.amigo import amigo
 from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae
 from relay_autotune.tuning.rules.limit_cycle import (
     describing_point_of,
     describing_point_of_cycle,
     half_cycle,
-)
-from relay_autotune.tuning.rules.simc import half_rule, simc
-from relay_autotune.tuning.rules.step_response import step_response, two_point_fopdt
-from relay_autotune.tuning.rules.thyagarajan2003 import lcmax, phase_margin, thyagarajan
-from relay_autotune.tuning.rules.ultimate_point import (
     tyreus_luyben,
     tyreus_luyben_cycle,
     ziegler_nichols,
     ziegler_nichols_cycle,
 )
+from relay_autotune.tuning.rules.simc import half_rule, simc
+from relay_autotune.tuning.rules.step_response import amigo, step_response, two_point_fopdt
+from relay_autotune.tuning.rules.thyagarajan2003 import lcmax, phase_margin, thyagarajan
 from relay_autotune.tuning.rules.unstable import unstable
 
 _T = TransferFunction

@@ -22,9 +22,9 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.nodes.domain import free_domain
-from relay_autotune.nodes.executor import Executor
 from relay_autotune.nodes.identifier import IdentifierNode
 from relay_autotune.nodes.identifier_parameters import KNOWN, PARAMETERS, known_from
+from relay_autotune.nodes.lifetime import Executor
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

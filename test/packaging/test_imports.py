@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # know each other.
 FLOORS = (
     {"errors", "threads", "arrays"},
-    {"quantities", "confidence", "text", "escape"},
+    {"quantities", "text"},
     {"record", "verdict"},
     {"process"},
     {"experiment"},

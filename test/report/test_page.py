@@ -25,10 +25,16 @@ from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import FOPDT, GivenModel, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.report.case import Case, case_of, in_loop, true_value
+from relay_autotune.report.case import (
+    Case,
+    case_of,
+    cases_of_document,
+    in_loop,
+    read_documents,
+    true_value,
+)
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.findings import beside_present
-from relay_autotune.report.from_document import cases_of_document, read_documents
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
 

@@ -15,13 +15,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.judgement.checks import followed_share, lost_effect
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.identification.result import NOT_AT_REST
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.text import digits, process_text
 from relay_autotune.verdict import Check, Measured
 

@@ -18,7 +18,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.differences import jacobian
 from relay_autotune.identification.estimate import Estimate
@@ -44,6 +43,7 @@ from relay_autotune.process.model_parameters import DEAD_TIME, GAIN, TIME_CONSTA
 from relay_autotune.process.structures import FOPDT, IPDT, LAG_N, UNSTABLE_FOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 
 METHOD = "thyagarajan"

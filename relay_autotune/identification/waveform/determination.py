@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.confidence import NORMAL_95
 from relay_autotune.identification.combinations import determined_combinations, is_determined
 from relay_autotune.identification.estimate import Uncertain
 from relay_autotune.identification.judgement.advice import advice
@@ -23,6 +22,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
 )
 from relay_autotune.identification.waveform.profiles import profile_ends
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 
 _MOST_FOR_PROFILES = 4096

@@ -35,9 +35,8 @@ from relay_autotune.tuning.rules.applicability import (
     wants_pid,
 )
 from relay_autotune.tuning.rules.fopdt import ITAE_RANGE, imc, itae
-from relay_autotune.tuning.rules.limit_cycle import half_cycle
+from relay_autotune.tuning.rules.limit_cycle import half_cycle, tyreus_luyben
 from relay_autotune.tuning.rules.resonance import resonant_gain
-from relay_autotune.tuning.rules.ultimate_point import tyreus_luyben
 from relay_autotune.tuning.task import DesignTask
 
 RESONANCE = 3.0
