@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -55,6 +55,13 @@ _NO_GAINS = {
 }
 # Parameters of a load step: its instant and size.
 _LOAD = 2
+
+# Takes a sentence on what begins.
+Tell = Callable[[str], object]
+
+
+def _quiet(_: str) -> None:
+    """Tell nobody."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -155,6 +162,7 @@ def analyse(
     known: Known = NOTHING,
     options: DesignOptions | None = None,
     rng: np.random.Generator | None = None,
+    tell: Tell = _quiet,
 ) -> Analysis:
     """Identify a record and, where the experiment was completed, tune: by all methods and rules.
 
@@ -179,16 +187,19 @@ def analyse(
         they are not given.
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
+    :param tell: called with what begins, such as ``comparing structures``.
     :raises RelayAutotuneError: if method or rule are unknown, or it is not a record.
     """
     record = one_record(record, "analyse")
     check_names(method, rule)
+    tell("comparing structures" if method == DEFAULT_METHOD else f"identifying by {method}")
     chosen = _chosen(record, method, known)
     if isinstance(chosen, Analysis):
         return chosen
+    tell("comparing methods")
     models = [chosen.model, *_others(chosen.driven, method, known, chosen.model)]
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
-    return _assessed(chosen, models, known, _first(rule), simple, options, rng)
+    return _assessed(chosen, models, known, _first(rule), simple, options, rng, tell)
 
 
 def analyse_alone(
@@ -337,9 +348,11 @@ def _assessed(
     simple: TransferFunction | None,
     options: DesignOptions | None,
     rng: np.random.Generator | None,
+    tell: Tell = _quiet,
 ) -> Analysis:
     """Judge models, the selected one first, and tune it."""
     record = chosen.record
+    tell("judging the model")
     found = Analysis(record, chosen.cycles, assess(models, record), 0)
     evidence = Evidence(
         record,
@@ -351,7 +364,7 @@ def _assessed(
         settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
         driven=chosen.driven,
     )
-    return _judged(found, evidence, (record,), rules, simple, options, rng)
+    return _judged(found, evidence, (record,), rules, simple, options, rng, tell)
 
 
 def analyse_jointly(
@@ -412,6 +425,7 @@ def _judged(
     simple: TransferFunction | None,
     options: DesignOptions | None,
     rng: np.random.Generator | None,
+    tell: Tell = _quiet,
 ) -> Analysis:
     """Judge the model, add gains if they are allowed, and judge the gains."""
     refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")
@@ -419,6 +433,7 @@ def _judged(
     judgement = Judgement(findings, refused=refused)
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
+    tell("designing the gains")
     shaping = Shaping(_task(found, rng, simple, options), evidence, findings)
     found = replace(found, shaping=shaping)
     tuned = _tuned(found, shaping.task, rules)

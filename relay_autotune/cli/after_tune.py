@@ -154,9 +154,10 @@ def _designed(client: TuneClient, law: str, against: str) -> _Written:
     period = asked(
         f"time between two runs of {law} [s]", "--sample-period", interval, "0.1", _positive
     )
-    with Working(f"designing for {law}"):
+    with Working(f"designing for {law}") as working:
         values = client.identifier_values(PATIENCE) or defaults()
-        found = analysed_as_there(record, {**values, "law": law, "sample_period": period})
+        asked_for = {**values, "law": law, "sample_period": period}
+        found = analysed_as_there(record, asked_for, working.at)
     gains = found.best_gains
     if gains is None:
         raise RelayAutotuneError(found.reason)

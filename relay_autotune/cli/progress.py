@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from relay_autotune.cli.layout import width
 from relay_autotune.text import TOLD_EVERY, duration
@@ -66,6 +66,34 @@ class ProgressLine:
         self._line.clear()
 
 
+class Stages:
+    """Say each second on a terminal what the computation of a model is at, until the block ends.
+
+    :param before: a line that is shown until then.
+    """
+
+    def __init__(self, before: ProgressLine) -> None:
+        self._before = before
+        self._stack = ExitStack()
+        self._working: Working | None = None
+
+    def __call__(self, stage: str) -> None:
+        """Note what begins."""
+        if not sys.stderr.isatty():
+            return
+        if self._working is None:
+            self._before.clear()
+            self._working = self._stack.enter_context(Working("computing the model"))
+        self._working.at(stage)
+
+    def __enter__(self) -> Stages:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+        self._before.clear()
+
+
 class Working:
     """Say each second on standard error what is being done, until the block ends.
 
@@ -74,6 +102,7 @@ class Working:
 
     def __init__(self, what: str) -> None:
         self._what = what
+        self._stage = ""
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
 
@@ -85,8 +114,15 @@ class Working:
         self._over.set()
         self._thread.join()
 
+    def at(self, stage: str) -> None:
+        """Note what the work is at; any thread may call it.
+
+        :param stage: such as ``comparing structures``.
+        """
+        self._stage = f": {stage}"
+
     def _tell(self) -> None:
         began, line = time.monotonic(), StatusLine()
         while not self._over.wait(TOLD_EVERY):
-            line(f"{self._what}, {duration(time.monotonic() - began)}")
+            line(f"{self._what}, {duration(time.monotonic() - began)}{self._stage}")
         line.clear()

@@ -19,7 +19,7 @@ from relay_autotune.cli.design_arguments import add_export, export_target
 from relay_autotune.cli.export import write
 from relay_autotune.cli.layout import width
 from relay_autotune.cli.page import add_web, check_web, show
-from relay_autotune.cli.progress import ProgressLine
+from relay_autotune.cli.progress import ProgressLine, Stages
 from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.cli.report import (
     add_present,
@@ -225,8 +225,8 @@ def _in_order(
         return
     for job in jobs:
         progress = ProgressLine(f"{PROGRAM}: {job.name} read")
-        found = replay(job, progress)
-        progress.clear()
+        with Stages(progress) as stages:
+            found = replay(job, progress, stages)
         yield found
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from relay_autotune.tuning.task import DesignOptions
 
 Progress = Callable[[int, int], None]
+Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -80,15 +81,18 @@ def work(job: Job) -> Done:
     return replay(job)[0]
 
 
-def replay(job: Job, progress: Progress | None = None) -> tuple[Done, tuple[Analysis, ...]]:
+def replay(
+    job: Job, progress: Progress | None = None, tell: Tell = lambda _: None
+) -> tuple[Done, tuple[Analysis, ...]]:
     """Read, identify and tune; return also the analyses themselves.
 
     :param job: what to do.
     :param progress: told of how far a bag has been read.
+    :param tell: told of what the computation is at.
     """
     said: list[str] = []
     try:
-        analyses = analysed(job, said, progress)
+        analyses = analysed(job, said, progress, tell)
         if job.export is not None:
             text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
             return Done(job.name, status_of(analyses), tuple(said), text), analyses
@@ -118,12 +122,15 @@ def status_of(analyses: Sequence[Analysis]) -> int:
     )
 
 
-def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tuple[Analysis, ...]:
+def analysed(
+    job: Job, said: list[str], progress: Progress | None = None, tell: Tell = lambda _: None
+) -> tuple[Analysis, ...]:
     """Read, identify and tune.
 
     :param job: what to do.
     :param said: gets sentences for standard error.
     :param progress: told of how far a bag has been read.
+    :param tell: told of what the computation is at.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
     # Loading scipy takes longer than finding out that a bag does not exist.
@@ -144,7 +151,14 @@ def analysed(job: Job, said: list[str], progress: Progress | None = None) -> tup
     from relay_autotune.analysis import analyse
 
     return tuple(
-        analyse(record, method=job.method, rule=job.rule, known=job.known, options=job.options)
+        analyse(
+            record,
+            method=job.method,
+            rule=job.rule,
+            known=job.known,
+            options=job.options,
+            tell=tell,
+        )
         for record in recording.experiments
     )
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
+from relay_autotune.cli.progress import ProgressLine, Stages
 from relay_autotune.cli.replay_bag import Job, analysed
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
@@ -222,7 +223,9 @@ def _cases(job: Job) -> list[Case]:
 
     said: list[str] = []
     try:
-        return [case_of(analysis, job.name) for analysis in analysed(job, said)]
+        with Stages(ProgressLine(f"{PROGRAM}: {job.name} read")) as stages:
+            found = analysed(job, said, tell=stages)
+        return [case_of(analysis, job.name) for analysis in found]
     finally:
         for sentence in said:
             say(PROGRAM, sentence)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -41,11 +41,14 @@ def flags_of(values: Mapping[str, Any]) -> str:
     return shlex.join(found)
 
 
-def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
+def analysed_as_there(
+    record: Record, values: Mapping[str, Any], tell: Callable[[str], None] = lambda _: None
+) -> Analysis:
     """Identify and tune as the identifier_node does.
 
     :param record: the samples.
     :param values: of its parameters, by name.
+    :param tell: called with what begins.
     """
     from relay_autotune.analysis import analyse
     from relay_autotune.nodes.identifier_parameters import known_from, options_from
@@ -56,6 +59,7 @@ def analysed_as_there(record: Record, values: Mapping[str, Any]) -> Analysis:
         rule=values["rule"],
         known=known_from(values),
         options=options_from(values),
+        tell=tell,
     )
 
 

@@ -236,7 +236,7 @@ class IdentifierNode(ServedNode):
             self._earlier = record
         if asked["method"] in ONLY_JOINT and earlier is not None:
             return partial(analyse_jointly, (record, earlier), **asked)
-        return partial(analyse, record, **asked)
+        return partial(analyse, record, **asked, tell=self._signs.at)
 
     # Output.
 

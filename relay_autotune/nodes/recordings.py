@@ -176,7 +176,7 @@ class _Recording:
         self.timer: Timer | None = None
         self.until = 0.0
         self.waits_since = self.heard_at = -math.inf
-        self.reason = ""
+        self.reason = self.stage = ""
         self.closed: Callable[[str], None] | None = None
 
 
@@ -259,23 +259,23 @@ class Recordings:
         """
         return self._paths.get(experiment_id, "") if not self.problem() else ""
 
-    def told(self, experiment_id: str, working: bool, lacking: str) -> None:
+    def told(self, experiment_id: str, working: bool, text: str) -> None:
         """Take a sign of life of the identifier.
 
         :param experiment_id: the experiment that it works on, or has finished.
         :param working: True if it still works on it.
-        :param lacking: why model or gains will not come; "": both were sent.
+        :param text: what the work is at, or why model or gains will not come; "": not told.
         """
         recording = self._open.get(experiment_id)
         if recording is None or recording.timer is None:
             return
         if not working:
-            recording.reason = lacking or recording.reason
+            recording.reason = text or recording.reason
             period = min(recording.timer.timer_period_ns, round(ON_THE_WAY * 1e9))
             recording.timer.timer_period_ns = period
             recording.timer.reset()
         elif time.monotonic() < recording.until:
-            recording.heard_at = time.monotonic()
+            recording.heard_at, recording.stage = time.monotonic(), text
             recording.timer.reset()
 
     def awaited(self, experiment_id: str, timeout: float) -> str:
@@ -291,7 +291,8 @@ class Recordings:
         is_there = self._node.count_publishers(self._names["pi_gains"]) > 0
         heard_at = max(recording.heard_at, recording.waits_since if is_there else -math.inf)
         if heard_at > now - HEARD_WITHIN:
-            return f"computing the model, {duration(now - recording.waits_since)} so far"
+            stage = f": {recording.stage}" if recording.stage else " so far"
+            return f"computing the model, {duration(now - recording.waits_since)}{stage}"
         silent = duration(now - max(recording.waits_since, recording.heard_at))
         return f"waiting for identifier_node, {silent} of {duration(timeout)} at most"
 

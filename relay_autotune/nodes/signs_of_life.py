@@ -31,6 +31,7 @@ class SignsOfLife:
         self._name = node.get_fully_qualified_name().lstrip("/")
         self._publisher = quality.publisher(node, DiagnosticStatus, TOPIC, quality.RESULT)
         self._working: list[str] = []
+        self._stage = _WORKING
         self._timer = node.create_timer(EVERY, self._tell, clock=STEADY, autostart=False)
 
     def work_on(self, experiment_id: str) -> None:
@@ -41,6 +42,13 @@ class SignsOfLife:
         self._working.append(experiment_id)
         self._publish(experiment_id, _WORKING, "")
         self._timer.reset()
+
+    def at(self, stage: str) -> None:
+        """Note what the work is at; any thread may call it.
+
+        :param stage: such as ``comparing structures``.
+        """
+        self._stage = stage
 
     def _tell(self) -> None:
         for experiment_id in self._working:
@@ -64,18 +72,20 @@ class SignsOfLife:
             DiagnosticStatus(
                 level=DiagnosticStatus.WARN if reason else DiagnosticStatus.OK,
                 name=self._name,
-                message=reason or state,
+                message=reason or (self._stage if state == _WORKING else state),
                 values=[KeyValue(key=key, value=value) for key, value in values.items()],
             )
         )
 
 
 def said_by(message: Any) -> tuple[str, bool, str]:
-    """Return experiment id, whether it is still in work, and why results are missing.
+    """Return experiment id, whether it is still in work, and a text.
+
+    That is what the work is at, or after it why results are missing; empty: neither is told.
 
     :param message: the `DiagnosticStatus`.
     """
     values = {pair.key: pair.value for pair in message.values}
     working = values.get(_STATE) == _WORKING
-    lacking = message.message if message.level != DiagnosticStatus.OK else ""
-    return values.get(_EXPERIMENT, ""), working, lacking
+    told = message.message != _WORKING if working else message.level != DiagnosticStatus.OK
+    return values.get(_EXPERIMENT, ""), working, message.message if told else ""

@@ -262,7 +262,7 @@ def shown(
     nodes: Any = SimpleNamespace(require_alive=lambda: None)
     monkeypatch.chdir(tmp_path)
 
-    def analysed(_: Any, values: dict[str, Any]) -> Any:
+    def analysed(_: Any, values: dict[str, Any], __: Any) -> Any:
         asked = DesignOptions(law=values["law"], sample_period=values["sample_period"])
         gains = design(DesignTask(model=process, options=asked), "imc")
         judgement = SimpleNamespace(reason="")

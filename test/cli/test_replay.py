@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 
@@ -26,7 +27,7 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.cli import csv_to_bag, replay
+from relay_autotune.cli import csv_to_bag, progress, replay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 
@@ -134,10 +135,16 @@ def test_the_process_is_found(tmp_path, capsys):
     assert model["dead_time"] == pytest.approx(10.0, rel=0.02)
 
 
-def test_the_table_says_what_a_person_needs(tmp_path, capsys):
+def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
+    # On a terminal it says meanwhile what the computation is at.
+    monkeypatch.setattr(progress, "TOLD_EVERY", 0.02)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_bag(tmp_path / "bag", tmp_path, relay_test())
     status, out, err = run(capsys, tmp_path / "bag")
-    assert (status, err) == (0, "")
+    assert status == 0
+    *lines, left = err.split("\r\x1b[K")
+    assert left == ""
+    assert any(re.fullmatch(r"computing the model, .* s: comparing structures", x) for x in lines)
     for word in (
         "completed  (run-1)",
         "1400 samples",

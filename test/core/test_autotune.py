@@ -40,7 +40,10 @@ def _analysed(method: str = "waveform", rule: str = "robust") -> Analysis:
 
 @pytest.mark.long
 def test_a_completed_experiment_yields_models_and_gains():
-    found = analyse(_record())
+    told: list[str] = []
+    found = analyse(_record(), tell=told.append)
+    stages = "comparing structures", "comparing methods", "judging the model"
+    assert told == [*stages, "designing the gains"]
     # Equal records give equal numbers.
     assert found.model.values.tolist() == _analysed().model.values.tolist()
     assert found.model.covariance.tolist() == _analysed().model.covariance.tolist()

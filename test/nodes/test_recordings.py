@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import rclpy
@@ -18,6 +20,7 @@ from std_msgs.msg import Float64
 from relay_autotune import nodes
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.recordings import RESULTS, Recordings
+from relay_autotune.nodes.signs_of_life import SignsOfLife, said_by
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
 PATIENCE = 500
@@ -35,7 +38,10 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
 
 
 def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
-    node: Node, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    node: Node,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     results = dict(zip(RESULTS, (TransferFunction, PidGains), strict=True))
     topics = {"measurement": Float64, "command": Float64, **results}
@@ -52,6 +58,19 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
                 recordings.message(experiment, name, 2, kind(final=True))
         closed: list[str] = []
         recordings.close_with_results(experiment, 0.05, closed.append)
+        # What the identifier is at goes on, as it says it.
+        signs: list[Any] = []
+        life = SignsOfLife(node)
+        monkeypatch.setattr(life, "_publisher", SimpleNamespace(publish=signs.append))
+        life.work_on(experiment)
+        life.at("comparing structures")
+        life._tell()
+        assert [said_by(sign) for sign in signs] == [
+            (experiment, True, ""), (experiment, True, "comparing structures"),
+        ]  # fmt: skip
+        recordings.told(*said_by(signs[-1]))
+        waits_for = recordings.awaited(experiment, 0.05)
+        assert waits_for.endswith("s: comparing structures") is not complete
         # The identifier has sent all, of which the model was refused.
         recordings.told(experiment, False, "the model was refused")
         recordings.told(experiment, False, "")
