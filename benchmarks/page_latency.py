@@ -113,7 +113,8 @@ def memory(tab: Tab, live: Live, minutes: float) -> tuple[float, float]:
     sizes = []
     for _ in range(5):
         tab.call("HeapProfiler.collectGarbage")
-        sizes.append(tab.call("Runtime.getHeapUsage")["usedSize"])
+        used = tab.call("Runtime.getHeapUsage")
+        sizes.append(used["usedSize"] + used["backingStorageSize"])
         time.sleep(0.5)
     heap = min(sizes)
     pages = int(Path("/proc/self/statm").read_text().split()[1])

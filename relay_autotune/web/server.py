@@ -38,7 +38,7 @@ from relay_autotune.web import wire
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import WISHES, Live, Wish
 from relay_autotune.web.shape import Asked, Subject, asked_of
-from relay_autotune.web.worker import Worker
+from relay_autotune.web.worker import Worker, yield_to_nodes
 
 Export = Callable[[Gains, str, str], str]
 
@@ -54,7 +54,7 @@ _ENDS_WITHIN = 5.0
 # Interval of what is told without being asked [s].
 _EVERY = 0.5
 # Interval of samples [s]; the eye sees no more, and relay_node needs the processor.
-_LIVE_EVERY = 0.025
+_LIVE_EVERY = 0.04
 # Answers that are kept; the oldest is dropped first.
 _MOST_KEPT = 2000
 
@@ -505,6 +505,7 @@ def in_background(page: Page) -> Iterator[str]:
     address: Future[str] = Future()
 
     async def until_cancelled() -> None:
+        yield_to_nodes()
         try:
             await serve(page, address.set_result)
         except asyncio.CancelledError:

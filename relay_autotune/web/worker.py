@@ -20,6 +20,18 @@ _PAUSE = 0.25
 _NICE = 10
 
 
+def yield_to_nodes() -> None:
+    """Let all other processes go before this thread, which nodes of a loop may need to wait for.
+
+    Linux has a priority for each thread, and a policy under which one that wakes up interrupts
+    no other.
+    """
+    this = threading.get_native_id()
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, this, _NICE)
+        os.sched_setscheduler(this, os.SCHED_BATCH, os.sched_param(0))
+
+
 class Worker:
     """Compute one thing after the other: first what is asked for, then what may be asked.
 
@@ -57,9 +69,7 @@ class Worker:
         self._queue.put(lambda: None)
 
     def _run(self) -> None:
-        # Nodes of the loop may need the same processor. Linux has a priority for each thread.
-        with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        yield_to_nodes()
         while self._open:
             try:
                 work: _Work | None = self._queue.get_nowait()

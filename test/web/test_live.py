@@ -202,6 +202,42 @@ def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
 
 
 @pytest.mark.browser
+def test_an_open_page_draws_so_many_points_at_most_and_none_while_it_is_hidden(tmp_path):
+    live = Live("/relay_node")
+
+    def hidden(told):
+        tab.eval(
+            f"Object.defineProperty(document, 'hidden', {{value: {told}, configurable: true}})"
+        )
+        tab.eval("document.dispatchEvent(new Event('visibilitychange')); 0")
+
+    def newest():
+        return live.everything()["samples"]["measurement"][0][-1]
+
+    with Chromium(tmp_path) as browser, served([], live=live) as url:
+        tab = browser.tab(url)
+        tab.wait("document.body.dataset.phase === 'idle'")
+        for k in range(5001):
+            live.sample("measurement", float(k))
+        tab.wait(f"Number(document.body.dataset.measured) >= {newest() - 1e-3}")
+        drawn = "document.querySelector('#plot-live-measurement path.measured').getAttribute('d')"
+        points = [point.split() for point in tab.eval(drawn).removeprefix("M").split("L")]
+        x, y = np.array(points, float).T
+        assert 1000 <= x.size <= 2000
+        # All from the left end of the figure on, in their order.
+        assert x[0] == x.min() == 54.0
+        assert np.all(np.diff(y) <= 0.0)
+        assert np.ptp(y) > 150.0
+        hidden("true")
+        before = tab.eval("document.body.dataset.measured")
+        live.sample("measurement", 6000.0)
+        live.tell(status="told after it")
+        tab.wait("document.querySelector('#live-status').innerText === 'told after it'")
+        assert tab.eval("document.body.dataset.measured") == before
+        hidden("false")
+        tab.wait(f"Number(document.body.dataset.measured) >= {newest() - 1e-3}")
+
+
 def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tmp_path):
     live = Live("/relay_node")
     live.tell(phase="tuning", state="relay", setpoint=40.0, hysteresis=0.1)

@@ -6,8 +6,8 @@
 import { Plot } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
-// More points than this are not drawn; every second of the older ones is dropped then.
-const MOST = 3000;
+// More points than this are not kept, some for each pixel of a figure.
+const MOST = 2000;
 const TONES = { settling: "warn", kick: "warn", relay: "warn", completed: "good", aborted: "bad", failed: "bad" };
 
 export function table(host, rows, cells) {
@@ -35,6 +35,36 @@ function texts(host, name, lines) {
   }));
 }
 
+// The samples of a signal. Where there are too many, every second one of the older half is dropped.
+// The memory is taken once: a page that is open for hours needs no more.
+class Signal {
+  constructor() {
+    this.times = new Float64Array(MOST);
+    this.values = new Float64Array(MOST);
+    this.clear();
+  }
+
+  clear() { this.count = 0; }
+
+  push(time, value) {
+    if (this.count === MOST) {
+      this.count = 0;
+      for (let k = 0; k < MOST; k += k < MOST / 2 ? 2 : 1) this.push(this.times[k], this.values[k]);
+    }
+    this.times[this.count] = time;
+    this.values[this.count] = value;
+    this.count += 1;
+  }
+
+  get first() { return this.times[0]; }
+
+  get last() { return this.times[this.count - 1]; }
+
+  get now() { return this.values[this.count - 1]; }
+
+  get curve() { return { x: this.times.subarray(0, this.count), y: this.values.subarray(0, this.count) }; }
+}
+
 // What is known of one loop.
 class Loop {
   constructor(number) {
@@ -42,7 +72,7 @@ class Loop {
     this.told = null;
     this.shown = {};
     this.asking = 0; // number of the check after which the start is to be confirmed; 0: none
-    this.signals = { measurement: [[], []], command: [[], []] };
+    this.signals = { measurement: new Signal(), command: new Signal() };
   }
 
   get phase() { return this.told ? this.told.phase : ""; }
@@ -52,24 +82,15 @@ class Loop {
   take(message) {
     Object.assign(this.shown, message.shown);
     for (const [name, [times, values]] of Object.entries(message.samples || {})) {
-      const [t, v] = message.all ? [[], []] : this.signals[name];
+      const signal = this.signals[name];
+      if (message.all) signal.clear();
       for (let k = 0; k < times.length; k += 1) {
         // A command holds until the next one.
-        if (name === "command" && !message.all && v.length && v[v.length - 1] !== values[k]) {
-          t.push(times[k]);
-          v.push(v[v.length - 1]);
-        }
-        t.push(times[k]);
-        v.push(values[k]);
+        const steps = name === "command" && !message.all && signal.count && signal.now !== values[k];
+        if (steps) signal.push(times[k], signal.now);
+        signal.push(times[k], values[k]);
       }
-      this.signals[name] = t.length < MOST ? [t, v] : this.thinned(t, v);
     }
-  }
-
-  thinned(t, v) {
-    const half = t.length >> 1;
-    const keep = (_, k) => k >= half || k % 2 === 0;
-    return [t.filter(keep), v.filter(keep)];
   }
 }
 
@@ -84,7 +105,8 @@ export class Live {
     this.chosen = chosen;
     this.loops = [];
     this.loop = null; // the one that is shown
-    this.drawn = false;
+    this.drawn = false; // just now
+    this.stale = false; // samples came since it was drawn
     const send = (what) => this.send(what);
     this.plots = {
       measurement: new Plot($("plot-live-measurement"), { label: "Measurement as it comes", y: "measurement [y]" }),
@@ -101,6 +123,7 @@ export class Live {
     $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
     $("revert").addEventListener("click", () => this.revert());
     $("step").addEventListener("input", () => this.showForce());
+    document.addEventListener("visibilitychange", () => this.drawSoon());
   }
 
   get told() { return this.loop.told; }
@@ -131,14 +154,24 @@ export class Live {
     const { proof, model } = message.shown || {};
     if (proof) this.showProof(proof);
     if (model !== undefined) this.showModel(model);
-    if (this.drawn || !message.samples) return;
+    if (message.samples) this.drawSoon();
+  }
+
+  // Nobody sees a page that is hidden; it is drawn when it is shown again.
+  drawSoon() {
+    this.stale = true;
+    if (this.drawn || document.hidden) return;
     this.drawn = true;
     // Not by frames, which a window behind others never gets.
     setTimeout(() => {
       const begun = performance.now();
+      this.stale = false;
       this.draw();
       // A slow machine, which may be the one that tunes, draws less often.
-      setTimeout(() => { this.drawn = false; }, Math.max(30, 4 * (performance.now() - begun)));
+      setTimeout(() => {
+        this.drawn = false;
+        if (this.stale) this.drawSoon();
+      }, Math.max(30, 4 * (performance.now() - begun)));
     }, 0);
   }
 
@@ -180,21 +213,20 @@ export class Live {
   }
 
   draw() {
-    const [t, y] = this.signals.measurement;
-    const [tu, u] = this.signals.command;
-    const ends = [t, tu].filter((each) => each.length);
-    if (!ends.length) return;
-    const xs = [Math.min(...ends.map((e) => e[0])), Math.max(...ends.map((e) => e[e.length - 1]))];
+    const { measurement, command } = this.signals;
+    const known = [measurement, command].filter((each) => each.count);
+    if (!known.length) return;
+    const xs = [Math.min(...known.map((each) => each.first)), Math.max(...known.map((each) => each.last))];
     const lines = [];
     const { setpoint, hysteresis } = this.told || {};
     if (setpoint !== null && setpoint !== undefined) {
       lines.push({ y: setpoint, kind: "setpoint" });
       if (hysteresis > 0) lines.push({ y: setpoint + hysteresis, kind: "band-edge" }, { y: setpoint - hysteresis, kind: "band-edge" });
     }
-    const last = (values) => (values.length ? values[values.length - 1].toPrecision(4) : "none");
-    this.plots.measurement.draw({ xs, curves: [{ x: t, y, kind: "measured", name: "measurement" }], lines, said: `now ${last(y)} y` });
-    this.plots.command.draw({ xs, curves: [{ x: tu, y: u, kind: "command", name: "command" }], said: `now ${last(u)} u` });
-    document.body.dataset.measured = t.length ? t[t.length - 1] : "";
+    const said = (signal, unit) => `now ${signal.count ? signal.now.toPrecision(4) : "none"} ${unit}`;
+    this.plots.measurement.draw({ xs, curves: [{ ...measurement.curve, kind: "measured", name: "measurement" }], lines, said: said(measurement, "y") });
+    this.plots.command.draw({ xs, curves: [{ ...command.curve, kind: "command", name: "command" }], said: said(command, "u") });
+    document.body.dataset.measured = measurement.count ? measurement.last : "";
   }
 
   show(before) {
