@@ -32,7 +32,12 @@ class Shaping:
 
         :param options: what is asked of the gains.
         """
-        return replace(self, task=replace(self.task, options=options))
+        task, others = replace(self.task, options=options), self.task.options
+        loops = [(each.law, each.sample_period, each.loop_delay) for each in (options, others)]
+        if loops[0] == loops[1]:
+            # The models around are those of the same loop, and so are their responses.
+            task.__dict__.update(around=self.task.around, exact=self.task.exact)
+        return replace(self, task=task)
 
     def judgement(self, gains: Gains) -> Judgement:
         """Return the judgement of an experiment with some gains.

@@ -59,20 +59,20 @@ def abscissae(duration: float, points: int) -> ComplexArray:
 def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatArray:
     """Return the function of a Laplace transform at equally spaced times from 0 on.
 
-    :param values: the transform at :func:`abscissae`, shape (points + 1,); it must not have poles
-        right of the imaginary axis.
+    :param values: the transform at :func:`abscissae`, shape (..., points + 1); it must not have
+        poles right of the imaginary axis.
     :param duration: s; the last instant is one step before it.
     :param jump: value just after t = 0.
-    :return: shape (points,).
+    :return: shape (..., points).
     """
-    points = values.size - 1
+    points = values.shape[-1] - 1
     step, decay = duration / points, 20.0 / duration
     time = np.arange(points) * step
     if jump:
         values = values - jump / (abscissae(duration, points) + decay)
     # Lanczos' factors remove the ringing caused by the cut at the last frequency.
     values = values * np.sinc(np.arange(points + 1) / points)
-    found = np.fft.irfft(values)[:points] * np.exp(_DECAY / (2.0 * duration) * time) / step
+    found = np.fft.irfft(values)[..., :points] * np.exp(_DECAY / (2.0 * duration) * time) / step
     return np.asarray(found + jump * np.exp(-decay * time) if jump else found)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -151,31 +150,16 @@ def swept_parts(values: ComplexArray) -> list[FloatArray]:
     """
     angles = np.linspace(0.0, 2.0 * math.pi, _CORNERS, endpoint=False)
     turn = np.column_stack((np.cos(angles), np.sin(angles)))
-    rings = []
-    for column in values.T:
-        plane = np.column_stack((column.real, column.imag))
-        spread, axes = np.linalg.eigh(np.cov(plane.T))
-        scale = axes * (_ELLIPSE * np.sqrt(np.maximum(spread, 0.0)))
-        rings.append(plane.mean(axis=0) + turn @ scale.T)
-    return [_hull(np.vstack(pair)) for pair in pairwise(rings)]
-
-
-def _hull(points: FloatArray) -> FloatArray:
-    """Return the convex hull of points in the plane, counterclockwise (Andrew 1979)."""
-    order = points[np.lexsort((points[:, 1], points[:, 0]))]
-
-    def chain(ordered: FloatArray) -> list[FloatArray]:
-        kept: list[FloatArray] = []
-        for p in ordered:
-            while len(kept) > 1:
-                a, b = kept[-1] - kept[-2], p - kept[-1]
-                if a[0] * b[1] - a[1] * b[0] > 0.0:
-                    break
-                kept.pop()
-            kept.append(p)
-        return kept[:-1]
-
-    return np.array(chain(order) + chain(order[::-1]))
+    points = np.stack((values.real, values.imag), axis=-1)
+    middle = points.mean(axis=0)
+    off = points - middle
+    spread = np.einsum("mfi,mfj->fij", off, off) / (len(values) - 1)
+    # The point of an ellipse that lies farthest in a direction u is m + k C u/sqrt(u' C u).
+    far = np.einsum("fij,cj->fci", spread, turn)
+    reach = np.sqrt(np.maximum(np.einsum("fci,ci->fc", far, turn), np.finfo(float).tiny))
+    rings = middle[:, None] + _ELLIPSE * far / reach[..., None]
+    farther = np.einsum("fci,ci->fc", np.diff(rings, axis=0), turn) > 0.0
+    return list(np.where(farther[..., None], rings[1:], rings[:-1]))
 
 
 def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:

@@ -41,8 +41,8 @@ class ModelSet:
         for k, model in enumerate(self.models):
             alike[len(model.zeros), len(model.time_constants), model.integrators].append(k)
         self._groups = [(integrators, np.array(of)) for (_, _, integrators), of in alike.items()]
-        self._known: FloatArray = np.empty(0)
-        self._responses: ComplexArray = np.empty((0, len(self.models)), dtype=np.complex128)
+        # Frequencies and responses in one, for several threads.
+        self._known: tuple[FloatArray, ComplexArray] | None = None
 
     def __call__(self, frequency: FloatArray) -> ComplexArray:
         """Return the response of each model at each frequency.
@@ -53,12 +53,12 @@ class ModelSet:
         :param frequency: rad/s, shape (n,), increasing.
         :return: y/u, shape (n, m).
         """
-        if self._known.size == 0:
-            self._known, self._responses = frequency, self._evaluate(frequency)
-            return self._responses
-        place = np.minimum(np.searchsorted(self._known, frequency), self._known.size - 1)
-        found = self._responses[place]
-        new = self._known[place] != frequency
+        if self._known is None:
+            self._known = frequency, self._evaluate(frequency)
+        known, responses = self._known
+        place = np.minimum(np.searchsorted(known, frequency), known.size - 1)
+        found = responses[place]
+        new = known[place] != frequency
         found[new] = self._evaluate(frequency[new])
         return found
 

@@ -19,7 +19,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.loop.responses import step_responses
+from relay_autotune.loop.responses import abscissae, inverted, step_responses
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case
 from relay_autotune.report.frequency import loop_frequencies, swept_parts
@@ -339,19 +339,20 @@ def _ms(k: int) -> float:
 def _steps(
     gains: Gains, model: TransferFunction, around: list[TransferFunction], half: float, load: float
 ) -> Steps:
-    def run(process: TransferFunction) -> tuple[FloatArray, FloatArray, FloatArray]:
-        setpoint, loaded = step_responses(gains, process, 2.0 * half, _POINTS)
-        measurement, command = setpoint.measurement.copy(), setpoint.command.copy()
-        measurement[_POINTS // 2 :] += load * loaded.measurement[: _POINTS // 2]
-        command[_POINTS // 2 :] += load * loaded.command[: _POINTS // 2]
-        return setpoint.time, measurement, command
-
-    time, measurement, command = run(model)
+    duration = 2.0 * half
+    setpoint, loaded = step_responses(gains, model, duration, _POINTS)
+    measurement, command = setpoint.measurement.copy(), setpoint.command.copy()
+    measurement[_POINTS // 2 :] += load * loaded.measurement[: _POINTS // 2]
+    command[_POINTS // 2 :] += load * loaded.command[: _POINTS // 2]
     low = high = np.empty(0)
     if around:
-        runs = np.array([run(process)[1] for process in around])
+        # All models at once, each with both steps in one transform.
+        s = abscissae(duration, _POINTS)
+        steps = (gains.from_setpoint(s) + load * np.exp(-half * s)) / s
+        processes = np.array([process(s) for process in around])
+        runs = inverted(processes / (1.0 + gains(s) * processes) * steps, duration)
         low, high = np.quantile(runs, (0.025, 0.975), axis=0)
-    return Steps(time, measurement, command, low, high, half)
+    return Steps(setpoint.time, measurement, command, low, high, half)
 
 
 def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> LoopCurve:
