@@ -55,6 +55,8 @@ _ENDS_WITHIN = 5.0
 _EVERY = 0.5
 # Interval of samples [s]; the eye sees no more, and relay_node needs the processor.
 _LIVE_EVERY = 0.04
+# Priority of the thread; one that ends a tune has to be heard on a busy machine, too.
+_NICE = 5
 # Answers that are kept; the oldest is dropped first.
 _MOST_KEPT = 2000
 
@@ -505,7 +507,7 @@ def in_background(page: Page) -> Iterator[str]:
     address: Future[str] = Future()
 
     async def until_cancelled() -> None:
-        yield_to_nodes()
+        yield_to_nodes(_NICE)
         try:
             await serve(page, address.set_result)
         except asyncio.CancelledError:

@@ -20,15 +20,17 @@ _PAUSE = 0.25
 _NICE = 10
 
 
-def yield_to_nodes() -> None:
-    """Let all other processes go before this thread, which nodes of a loop may need to wait for.
+def yield_to_nodes(nice: int) -> None:
+    """Let the nodes of a loop, which may need the same processor, go before this thread.
 
     Linux has a priority for each thread, and a policy under which one that wakes up interrupts
     no other.
+
+    :param nice: how far to step back, 1 to 19.
     """
     this = threading.get_native_id()
     with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, this, _NICE)
+        os.setpriority(os.PRIO_PROCESS, this, nice)
         os.sched_setscheduler(this, os.SCHED_BATCH, os.sched_param(0))
 
 
@@ -69,7 +71,7 @@ class Worker:
         self._queue.put(lambda: None)
 
     def _run(self) -> None:
-        yield_to_nodes()
+        yield_to_nodes(_NICE)
         while self._open:
             try:
                 work: _Work | None = self._queue.get_nowait()
