@@ -26,6 +26,7 @@ from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
 
 if TYPE_CHECKING:
+    from relay_autotune.loop.gains import Controller
     from relay_autotune.nodes.controller_manager import ManagedController
     from relay_autotune.nodes.tune_client import TuneClient
 
@@ -519,6 +520,16 @@ class JointTune:
         """Whether the gains go to the controller."""
         return not self._options.keep_gains
 
+    def present(self) -> Controller | None:
+        """Return the gains that the joint's controller has; None: it has none.
+
+        :raises LoopError: if it does not answer.
+        """
+        from relay_autotune.nodes.remote_gains import controller_of
+
+        p, i, d = self._client.values(self._loop.node, self._loop.parameters).values()
+        return controller_of({"p": p, "i": i, "d": d}) if p else None
+
     def apply(self, nodes: OwnNodes, doubt: str) -> int:
         """Offer the gains to the controller, verify them, and return the exit status.
 
@@ -564,7 +575,6 @@ class JointTune:
             transfer_function_from_message,
         )
         from relay_autotune.nodes.joint_loop import put_gains, told
-        from relay_autotune.nodes.remote_gains import controller_of
 
         loop, client = self._loop, self._client
         found = client.result
@@ -572,9 +582,7 @@ class JointTune:
         model = transfer_function_from_message(found.transfer_function)
         before = client.values(loop.node, loop.parameters)
         wanted = {name: float(getattr(gains, name[-1])) for name in loop.parameters}
-        p, i, d = before.values()
-        present = controller_of({"p": p, "i": i, "d": d}) if p else None
-        print("\n".join(beside(present, gains, model)))
+        print("\n".join(beside(self.present(), gains, model)))
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
         if not agrees(question, yes=self._options.yes):
             say("tune_loop", "nothing was changed")

@@ -76,6 +76,7 @@ from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.cli.own_nodes import OwnNodes
+    from relay_autotune.loop.gains import Controller
     from relay_autotune.nodes.tune_client import TuneClient
 # Time between two updates of a terminal [s].
 _TICK = 0.25
@@ -350,7 +351,7 @@ def _conclude(
         new = nodes is not None and joint is None
         told = left(result, options.at, outside) if new else ""
         print("\n".join(result_lines(result, cancelled, paint, width(), told)), flush=True)
-    flags, report = _afterwards(client, options)
+    flags, report = _afterwards(client, options, joint)
     # Gains of nodes that end with this command cannot be asked for later.
     controllers = client.controllers() if nodes is None else []
     done = HandedOver()
@@ -387,7 +388,25 @@ def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
     return DONE if client.succeeded else NOTHING_FOUND
 
 
-def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, str]:
+def _present(client: TuneClient, joint: JointTune | None) -> Controller | None:
+    """Return the gains in force in the loop's controller; None: they are not known."""
+    from relay_autotune.nodes.gains_client import GainsClient
+
+    try:
+        if joint is not None:
+            return joint.present()
+        for name in client.controllers()[:1]:
+            with GainsClient("", name, beside=client) as loop:
+                return loop.in_force()
+    except RelayAutotuneError:
+        # The report is as good without them.
+        pass
+    return None
+
+
+def _afterwards(
+    client: TuneClient, options: argparse.Namespace, joint: JointTune | None
+) -> tuple[str, str]:
     """Write the report if it is wanted; return the flags for `replay`, and the report's name."""
     result = client.result
     with Working("asking identifier_node for its parameters"):
@@ -408,6 +427,7 @@ def _afterwards(client: TuneClient, options: argparse.Namespace) -> tuple[str, s
                 result,
                 result.bag or client.name,
                 options.report,
+                _present(client, joint),
             )
     except RelayAutotuneError as error:
         say(PROGRAM, f"no report: {error}")

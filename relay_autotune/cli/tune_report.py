@@ -16,6 +16,7 @@ from relay_autotune.cli.report import write_report
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis
+    from relay_autotune.loop.gains import Controller
     from relay_autotune.record.record import Record
 
 _NEAR = 1e-6
@@ -71,7 +72,12 @@ def defaults() -> dict[str, Any]:
 
 
 def report_of_tune(
-    record: Record, values: Mapping[str, Any], result: Any, source: str, output: str
+    record: Record,
+    values: Mapping[str, Any],
+    result: Any,
+    source: str,
+    output: str,
+    present: Controller | None = None,
 ) -> str:
     """Write a report of a tune.
 
@@ -80,15 +86,18 @@ def report_of_tune(
     :param result: the `Tune.Result`.
     :param source: name of the tune in the report.
     :param output: file of the report.
+    :param present: the gains in force; None: not known.
     :return: a warning for the user; empty: none.
     :raises BagError: if it cannot be written.
     """
     from relay_autotune.report.case import case_of
 
     found = analysed_as_there(record, values)
-    case = case_of(found, source)
+    case = replace(case_of(found, source), present=present)
     if result.bag:
         again = f"report {shlex.quote(result.bag)} {flags_of(values)}".rstrip()
+        if present is not None:
+            again += f" --present {present.kc:.6g} {present.ti:.6g} {present.td:.6g}"
         case = replace(case, command=f"{again} -o {shlex.quote(output)}")
     write_report([case], output)
     gains, published = found.best_gains, result.gains

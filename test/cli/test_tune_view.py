@@ -32,6 +32,7 @@ from relay_autotune.cli.tune_view import (
     result_lines,
     wants_colour,
 )
+from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.identifier_parameters import known_from, options_from
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Tune
@@ -294,8 +295,13 @@ def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_pa
     told = (tmp_path / "page.html").read_text()
     assert "Gains to type in" in told
     assert f"report '{tune.bag}' -o {page}" in html.unescape(told)
+    assert "Beside the present gains" not in told
     tune.gains.kc *= 1.1
-    assert "identifier_node gave" in report_of_tune(record, defaults(), tune, "x", page)
+    before = Controller(0.1, 3.0)
+    assert "identifier_node gave" in report_of_tune(record, defaults(), tune, "x", page, before)
+    told = html.unescape((tmp_path / "page.html").read_text())
+    assert f"report '{tune.bag}' --present 0.1 3 0 -o {page}" in told
+    assert "Beside the present gains" in told
 
 
 def test_a_tune_without_gains_offers_none() -> None:
