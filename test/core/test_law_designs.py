@@ -70,7 +70,7 @@ def test_no_other_gains_within_the_bounds_have_a_clearly_smaller_error(law):
     rng = np.random.default_rng(5)
     tried = 0
     for size in (0.02, 0.1, 0.3):
-        for p, i, d in np.exp(size * rng.standard_normal((40, 3))):
+        for p, i, d in np.exp(size * rng.standard_normal((20, 3))):
             ki = gains.i * i
             kp = gains.kc * p
             other = Controller(kp, kp / ki, gains.td * d, gains.tf)
@@ -80,7 +80,7 @@ def test_no_other_gains_within_the_bounds_have_a_clearly_smaller_error(law):
             tried += 1
             figures = loop.figures(loop.margins().ms_frequency)
             assert figures.iae_load > 0.985 * gains.iae_load
-    assert tried > 20
+    assert tried > 10
 
 
 def test_a_named_law_matters_at_a_slow_rate():

@@ -86,13 +86,13 @@ PROCESSES = [(1.65, 20.0, 10.0), (1.0, 2.0, 2.0), (1.0, 1.0, 0.1), (1.0, 1.0, 10
 )
 def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
     run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
-    records = [_noisy(run, 0.1, seed) for seed in range(80)]
+    records = [_noisy(run, 0.1, seed) for seed in range(40)]
     bounds = _bound(run, process, records[0].noise_std)
     found = [identify_waveform(r, FOPDT) for r in records]
     gain = [f.ultimate_gain / truth.gain - 1.0 for f in found]
     frequency = [f.ultimate_frequency / truth.frequency - 1.0 for f in found]
     for errors, bound in zip((gain, frequency), bounds, strict=True):
-        # The rms of 80 draws scatters by 8 %.
+        # The rms of 40 draws scatters by 11 %.
         assert 0.75 < math.sqrt(float(np.mean(np.square(errors)))) / bound < 1.3
     stated = float(np.mean([f.ultimate_gain_std for f in found])) / truth.gain
     assert stated == pytest.approx(bounds[0], rel=0.1)
@@ -168,7 +168,7 @@ def test_a_start_away_from_rest_is_estimated():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("start", [600, 700, 800, 900])
+@pytest.mark.parametrize("start", [600, 900])
 def test_a_record_cut_out_of_an_oscillation(start):
     record = _run(1.65, 20.0, 10.0, 0.3, 2000).record()
     part = slice(start, 2000)
@@ -237,10 +237,10 @@ def test_an_unknown_structure_is_refused():
 
 
 @pytest.mark.long
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=5)
 @given(
     seed=st.integers(0, 10_000),
-    samples=st.integers(12, 120),
+    samples=st.integers(12, 60),
     scale=st.floats(1e-6, 1e6),
     switches=st.integers(1, 6),
 )
@@ -297,7 +297,7 @@ def test_spikes_of_the_sensor_are_left_out_and_told():
 
 @pytest.mark.long
 def test_clean_records_have_no_outliers():
-    for seed in range(20):
+    for seed in range(8):
         found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)
         assert not any("left out" in w for w in found.warnings)
 

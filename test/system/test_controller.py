@@ -31,7 +31,7 @@ from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction,
 PLANT = {
     "mode": "clock",
     "speed": 4.0,
-    "sample_period": 0.02,
+    "sample_period": 0.04,
     "structure": "fopdt",
     "gain": 2.0,
     "time_constants": [0.8],

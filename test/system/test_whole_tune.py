@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,21 @@ def replay(*arguments: str) -> dict[str, Any]:
     return document
 
 
-def test_lockstep_finds_the_process_and_replays_to_the_same_digits(rig: Rig) -> None:
-    results, bag = tune_in_lockstep(rig)
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Rig, Results, Path]]:
+    """Return a rig after a tune in lockstep, what its nodes said, and the bag."""
+    with free_domain() as domain:
+        rig = Rig(domain, tmp_path_factory.mktemp("tuned"))
+        try:
+            yield rig, *tune_in_lockstep(rig)
+        finally:
+            rig.close()
+
+
+def test_lockstep_finds_the_process_and_replays_to_the_same_digits(
+    tuned: tuple[Rig, Results, Path],
+) -> None:
+    _, results, bag = tuned
     model, gains = results.models[-1], results.gains[-1]
     assert model.final
     assert model.gain == pytest.approx(GAIN, rel=1e-6)
@@ -122,8 +136,8 @@ def test_lockstep_gives_the_same_numbers_every_time(tmp_path: Path) -> None:
         assert getattr(first.gains[-1], name) == getattr(second.gains[-1], name)
 
 
-def test_cycles_that_came_late_join_to_the_record(rig: Rig) -> None:
-    results, _ = tune_in_lockstep(rig)
+def test_cycles_that_came_late_join_to_the_record(tuned: tuple[Rig, Results, Path]) -> None:
+    rig, results, _ = tuned
     late = rig.listen("relay_cycle", RelayCycle)
     rig.until(lambda: len(late) == len(results.cycles), "latched cycles")
     whole = record_from_message(results.experiments[-1])
