@@ -13,6 +13,7 @@ import sys
 
 import numpy as np
 import pytest
+from analysed import relay_record
 from made_bags import (
     REPOSITORY,
     START,
@@ -22,35 +23,12 @@ from made_bags import (
     write_pair,
     write_samples,
 )
-from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli import csv_to_bag, progress, replay
-from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Outcome, Record, RelaySettings
-
-MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
-
-
-def relay_test(*, outcome=Outcome.COMPLETED, samples=1400, name="run-1") -> Record:
-    """Record a biased relay on 1.65 e^(-10 s)/(1 + 20 s)."""
-    levels = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
-    noise = np.random.default_rng(5).normal(0.0, 0.02, samples)
-    found = simulate_sampled_relay(MODEL, levels, period=0.2, noise=noise)
-    return Record(
-        time=found.time,
-        measurement=found.measurement,
-        command=found.command,
-        settings=levels,
-        noise_std=0.02,
-        cycle_start=found.cycle_start,
-        outcome=outcome,
-        reason="" if outcome == Outcome.COMPLETED else "the operator pressed the button",
-        experiment_id=name,
-        start=START / 1e9,
-    )
+from relay_autotune.record.record import Outcome, Record
 
 
 def write_bag(path, folder, *records):
@@ -82,7 +60,7 @@ def documents(text):
 
 
 def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, capsys):
-    record = relay_test()
+    record = relay_record()
     write_bag(tmp_path / "bag", tmp_path, record)
     status, out, err = run(capsys, "--json", tmp_path / "bag")
     assert (status, err) == (0, "")
@@ -127,7 +105,7 @@ def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, ca
 
 
 def test_the_process_is_found(tmp_path, capsys):
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     _, out, _ = run(capsys, "--json", tmp_path / "bag")
     model = documents(out)[0]["experiments"][0]["models"][0]
     assert model["gain"] == pytest.approx(1.65, rel=0.02)
@@ -139,7 +117,7 @@ def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
     # On a terminal it says meanwhile what the computation is at.
     monkeypatch.setattr(progress, "TOLD_EVERY", 0.02)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     status, out, err = run(capsys, tmp_path / "bag")
     assert status == 0
     *lines, left = err.split("\r\x1b[K")
@@ -147,7 +125,7 @@ def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
     assert any(re.fullmatch(r"computing the model, .* s: comparing structures", x) for x in lines)
     for word in (
         "completed  (run-1)",
-        "1400 samples",
+        "700 samples",
         "limit cycle",
         "converged",
         "process ",
@@ -165,11 +143,11 @@ def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
 
 
 def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
-    write_bag(tmp_path / "bag", tmp_path, relay_test(name="a"), relay_test(name="b"))
-    _, out, _ = run(capsys, "--json", tmp_path / "bag")
+    write_bag(tmp_path / "bag", tmp_path, relay_record(name="a"), relay_record(name="b"))
+    _, out, _ = run(capsys, "--json", "--structure", "fopdt", tmp_path / "bag")
     (found,) = documents(out)
     assert [e["experiment_id"] for e in found["experiments"]] == ["a", "b"]
-    _, out, _ = run(capsys, tmp_path / "bag")
+    _, out, _ = run(capsys, "--structure", "fopdt", tmp_path / "bag")
     assert "experiment 1 of 2" in out
     assert "experiment 2 of 2" in out
 
@@ -178,7 +156,11 @@ def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     "outcome", [Outcome.ABORTED, pytest.param(Outcome.FAILED, marks=pytest.mark.nightly)]
 )
 def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, capsys, outcome):
-    write_bag(tmp_path / "bag", tmp_path, relay_test(outcome=outcome))
+    write_bag(
+        tmp_path / "bag",
+        tmp_path,
+        relay_record(outcome=outcome, reason="the operator pressed the button"),
+    )
     status, out, _ = run(capsys, "--json", tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 0
@@ -193,7 +175,7 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
 
 
 def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
-    record = relay_test()
+    record = relay_record()
     text = definition(CYCLE, tmp_path).text
     topics = [
         Topic("/measurement"),
@@ -215,7 +197,7 @@ def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
 
 
 def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
-    record = relay_test()
+    record = relay_record()
     write_pair(
         tmp_path / "bag",
         list(zip(record.time, record.measurement, strict=True)),
@@ -232,7 +214,7 @@ def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
 
 
 def test_other_methods_and_rules(tmp_path, capsys):
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     _, out, _ = run(capsys, "--json", "--method", "wang_biased", "--rule", "imc", tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert experiment["models"][experiment["selected"]]["method"] == "wang_biased"
@@ -240,7 +222,7 @@ def test_other_methods_and_rules(tmp_path, capsys):
 
 
 def test_one_bad_bag_does_not_stop_the_others(tmp_path, capsys):
-    good = write_bag(tmp_path / "good", tmp_path, relay_test())
+    good = write_bag(tmp_path / "good", tmp_path, relay_record())
     status, out, err = run(capsys, "--json", tmp_path / "none", good)
     bad, fine = documents(out)
     assert status == 1
@@ -333,7 +315,7 @@ def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
     ],
 )
 def test_choices_that_do_not_fit_end_with_status_2(tmp_path, capsys, options, sentence):
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     status, out, err = run(capsys, tmp_path / "bag", *options)
     assert (status, out) == (2, "")
     assert sentence in err
@@ -362,7 +344,7 @@ def test_wrong_usage_has_status_2(arguments, capsys):
 
 
 def test_a_constant_measurement_in_an_experiment_is_said(tmp_path, capsys):
-    record = relay_test()
+    record = relay_record()
     flat = Record(
         time=record.time,
         measurement=np.full(len(record), 3.0),
@@ -391,7 +373,7 @@ def process(*arguments, **options):
 
 
 def test_two_processes_print_the_same_bytes(tmp_path):
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     first, second = (process("--json", tmp_path / "bag") for _ in range(2))
     assert first.returncode == 0
     assert first.stdout == second.stdout
@@ -410,7 +392,7 @@ UNWANTED = {
 
 
 def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     code = (
         "import sys; from relay_autotune.cli.replay import main; "
         f"status = main([{str(tmp_path / 'bag')!r}]); "
@@ -425,7 +407,7 @@ def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
 
 
 def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
-    write_bag(tmp_path / "bag", tmp_path, relay_test())
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
     command = f"{sys.executable} -m relay_autotune.cli.replay {tmp_path / 'bag'} | true"
     done = subprocess.run(
         ["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, timeout=120

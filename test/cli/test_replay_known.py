@@ -27,8 +27,8 @@ MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 
 def unbiased(extra_delay: float = 0.0) -> Record:
     relay = RelaySettings(50.0, 30.0, 3.0, 0.0, 0.1, extra_delay)
-    noise = np.random.default_rng(5).normal(0.0, 0.01, 1400)
-    record = simulate_sampled_relay(MODEL, relay, period=0.2, noise=noise)
+    noise = np.random.default_rng(5).normal(0.0, 0.01, 700)
+    record = simulate_sampled_relay(MODEL, relay, period=0.4, noise=noise)
     return replace(record, noise_std=0.01, experiment_id=f"run-{extra_delay:g}", start=START / 1e9)
 
 

@@ -21,7 +21,9 @@ MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 SETTINGS = RelaySettings(setpoint=50.0, baseline=30.0, amplitude=3.0, bias=0.9, hysteresis=0.1)
 
 
-def relay_record(*, outcome: Outcome = Outcome.COMPLETED, reason: str = "") -> Record:
+def relay_record(
+    *, outcome: Outcome = Outcome.COMPLETED, reason: str = "", name: str = "run-1"
+) -> Record:
     """Record a biased relay on 1.65 e^(-10 s)/(1 + 20 s), with noise."""
     noise = np.random.default_rng(5).normal(0.0, 0.02, 700)
     found = simulate_sampled_relay(MODEL, SETTINGS, period=0.4, noise=noise)
@@ -34,7 +36,7 @@ def relay_record(*, outcome: Outcome = Outcome.COMPLETED, reason: str = "") -> R
         cycle_start=found.cycle_start,
         outcome=outcome,
         reason=reason,
-        experiment_id="run-1",
+        experiment_id=name,
         start=1_790_000_000.0,
     )
 

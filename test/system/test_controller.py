@@ -229,7 +229,7 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
 
 
 def test_gains_for_another_law_are_proven_by_a_node_that_runs_it(rig: Rig) -> None:
-    rig.plant(**PLANT)
+    rig.plant(**PLANT | {"sample_period": 0.02})
     commands = rig.listen("command", Float64, RELIABLE)
     law = {"law": "pid_controller", "law_period": 0.1}
     controller = rig.start(

@@ -44,7 +44,7 @@ def loop_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str]
                 stack.callback(rig.close)
                 made[kind] = Loop(rig, kind)
                 if kind == "plain":
-                    # No gains come of any method, and the quickest leaves the processor to the loop.
+                    # No gains come of any method; the quickest leaves the processor to the loop.
                     rig.identifier(method="atv")
             return made[kind]
 
