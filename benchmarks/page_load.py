@@ -11,10 +11,11 @@ Usage, after `. ./env.sh`:
 The sender, relay_node and the clock are those of `latency.py`. Phases take turns, so that all meet
 the same machine: nobody looks; `tune_loop --web` runs, and no page is open; readers have the page,
 which take every frame and draw nothing, as browsers on other machines; as many windows of a
-headless Chromium on this machine draw measurement and command as they come. Readers and browsers
-run at the lowest priority (nice 19), `tune_loop` as it always does. The table is Markdown; the
-exit status is 1 if the target is missed with readers. With --quick a few seconds are run and the
-status is 0.
+headless Chromium on this machine draw measurement and command as they come. Readers, and in one
+of two kinds of phases the browsers, get only time that nobody else wants (the policy SCHED_IDLE).
+The processor time is that of `tune_loop`, and of those who look. The table is Markdown; the exit
+status is 1 if the target is missed with readers. With --quick a few seconds are run and the status
+is 0.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from threading import Thread
 
@@ -46,12 +49,27 @@ from served import OpenPage
 
 # Largest p99 with readers over that with nobody.
 TARGET = 1.1
-NOBODY, CLOSED, READERS, BROWSERS = "nobody", "the page, not open", "readers", "browsers"
+NOBODY, CLOSED, READERS = "nobody", "the page, not open", "{} readers"
+GUESTS, BROWSERS = "{} browsers, in time that is left", "{} browsers"
+# Begins a command that gets only time that nobody else wants.
+GUEST = ("chrt", "--idle", "0")
+
+
+@dataclass(frozen=True)
+class Looked:
+    """A page that is looked at.
+
+    :param url: of the page.
+    :param processes: that which serves it, and the first of those who look; 0: there is none.
+    """
+
+    url: str
+    processes: tuple[int, int]
 
 
 @contextlib.contextmanager
-def looked_at(who: str, count: int) -> Iterator[str]:
-    """Serve the page of the loop, and yield its address.
+def looked_at(who: str, count: int) -> Iterator[Looked]:
+    """Serve the page of the loop, and let somebody look.
 
     :param who: opens it.
     :param count: how many of them.
@@ -70,28 +88,28 @@ def looked_at(who: str, count: int) -> Iterator[str]:
             raise SystemExit(f"page_load: tune_loop has not served its page: {said}")
         # Nobody reads what it says from here on.
         Thread(target=command.stderr.read, daemon=True).start()
-        with {READERS: read_by, BROWSERS: drawn_by}.get(who, unopened)(found[1], count):
-            yield found[1]
+        with LOOK[who](found[1], count) as first:
+            yield Looked(found[1], (command.pid, first))
     finally:
         command.terminate()
         command.wait(20)
 
 
 @contextlib.contextmanager
-def unopened(_url: str, _count: int) -> Iterator[None]:
+def unopened(_url: str, _count: int) -> Iterator[int]:
     """Open nothing."""
-    yield
+    yield 0
 
 
 @contextlib.contextmanager
-def read_by(url: str, count: int) -> Iterator[None]:
+def read_by(url: str, count: int) -> Iterator[int]:
     """Let a process read all that open pages are told."""
-    this = [sys.executable, __file__, "--role", "read", "--browsers", str(count), url]
-    reader = subprocess.Popen(["nice", "-n", "19", *this], stdout=subprocess.PIPE, text=True)
+    this = [*GUEST, sys.executable, __file__, "--role", "read", "--browsers", str(count), url]
+    reader = subprocess.Popen(this, stdout=subprocess.PIPE, text=True)
     try:
         assert reader.stdout is not None
         reader.stdout.readline()
-        yield
+        yield reader.pid
     finally:
         reader.terminate()
         reader.wait(20)
@@ -111,25 +129,35 @@ async def read(url: str, count: int) -> None:
 
 
 @contextlib.contextmanager
-def drawn_by(url: str, count: int) -> Iterator[None]:
+def drawn_by(url: str, count: int, before: Sequence[str] = ()) -> Iterator[int]:
     """Let windows of a browser draw what comes."""
-    with tempfile.TemporaryDirectory() as folder, Chromium(Path(folder)) as browser:
+    with tempfile.TemporaryDirectory() as folder, Chromium(Path(folder), before) as browser:
         for _ in range(count):
             browser.tab(url).wait("document.body.dataset.phase === 'idle'")
-        for process in _family(browser.pid):
-            with contextlib.suppress(ProcessLookupError):
-                os.setpriority(os.PRIO_PROCESS, process, 19)
-        yield
+        yield browser.pid
 
 
-def _family(first: int) -> list[int]:
-    """Return a process and all that it has started."""
+LOOK: dict[str, Callable[[str, int], contextlib.AbstractContextManager[int]]] = {
+    CLOSED: unopened,
+    READERS: read_by,
+    GUESTS: partial(drawn_by, before=GUEST),
+    BROWSERS: drawn_by,
+}
+
+
+def used(first: int) -> float:
+    """Return the processor time that a process and all that it has started have used [s]."""
     listed = subprocess.run(["ps", "-e", "-o", "pid=,ppid="], capture_output=True, text=True)
     pairs = [tuple(map(int, line.split())) for line in listed.stdout.splitlines()]
-    found = [first]
+    found = [first] * (first > 0)
     for parent in found:
         found += [child for child, of in pairs if of == parent]
-    return found
+    ticks = 0
+    for process in found:
+        with contextlib.suppress(FileNotFoundError):
+            fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+            ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def wish(bench: Bench, url: str, what: str, phase: str) -> None:
@@ -148,28 +176,30 @@ def wish(bench: Bench, url: str, what: str, phase: str) -> None:
     page.close()
 
 
-def phase(bench: Bench, count: int, url: str | None) -> np.ndarray:
-    """Run one phase; return its latencies [ms].
+def phase(bench: Bench, count: int, page: Looked) -> tuple[np.ndarray, np.ndarray]:
+    """Run one phase with a page on which the tune is started.
 
     :param bench: with the loop.
     :param count: of the measurements.
-    :param url: of the page on which the tune is started; None: by its service.
+    :param page: the page.
+    :return: latencies [ms], and the processor time of its processes as parts of one processor.
     """
-    if url is None:
-        return bench.phase("tuned", count)[0]
     bench.send("tuned", 1)
-    wish(bench, url, "start", "tuning")
-    first = len(bench.arrived["tuned"])
+    wish(bench, page.url, "start", "tuning")
+    first, begun = len(bench.arrived["tuned"]), time.monotonic()
+    before = np.array([used(each) for each in page.processes])
     sent = bench.send("tuned", count)
     arrived = np.array(bench.arrived["tuned"][first:][:count])
-    wish(bench, url, "abort", "idle")
-    return (arrived - sent[: arrived.size]) * 1e-6
+    spent = np.array([used(each) for each in page.processes]) - before
+    spent /= time.monotonic() - begun
+    wish(bench, page.url, "abort", "idle")
+    return (arrived - sent[: arrived.size]) * 1e-6, spent
 
 
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each of the four [s]")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each of the five [s]")
     parser.add_argument("--rate", type=float, default=100.0, help="measurements a second")
     parser.add_argument("--phases", type=int, default=6, help="turns of each")
     parser.add_argument("--browsers", type=int, default=5, help="how many look")
@@ -183,7 +213,8 @@ def main() -> int:
     if options.quick:
         options.seconds, options.phases, options.browsers = 3.0, 1, 2
     count = int(options.seconds * options.rate / options.phases)
-    parts: dict[str, list[np.ndarray]] = {w: [] for w in (NOBODY, CLOSED, READERS, BROWSERS)}
+    parts: dict[str, list[np.ndarray]] = {who: [] for who in (NOBODY, *LOOK)}
+    times_used: dict[str, list[np.ndarray]] = {who: [] for who in LOOK}
     with free_domain() as domain, tempfile.TemporaryDirectory() as folder:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -194,31 +225,38 @@ def main() -> int:
             for _ in range(options.phases):
                 for who, times in parts.items():
                     if who == NOBODY:
-                        times.append(phase(bench, count, None))
+                        times.append(bench.phase("tuned", count)[0])
                         continue
-                    with looked_at(who, options.browsers) as url:
-                        times.append(phase(bench, count, url))
+                    with looked_at(who, options.browsers) as page:
+                        found, spent = phase(bench, count, page)
+                    times.append(found)
+                    times_used[who].append(spent)
         finally:
             bench.close()
             rclpy.try_shutdown()
-    found = {who: np.concatenate(times) for who, times in parts.items()}
-    p99 = {who: float(np.percentile(times, 99.0)) for who, times in found.items()}
+    latencies = {who: np.concatenate(times) for who, times in parts.items()}
+    p99 = {who: float(np.percentile(times, 99.0)) for who, times in latencies.items()}
     ratios = {who: each / p99[NOBODY] for who, each in p99.items()}
-    many = {READERS: f"{options.browsers} readers", BROWSERS: f"{options.browsers} browsers"}
+
+    def processors(who: str) -> list[str]:
+        parts_used = np.mean(times_used[who], axis=0) if who in LOOK else np.zeros(2)
+        return [f"{100.0 * part:.0f} %" if part else "" for part in parts_used]
+
     rows = [
         (
-            many.get(who, who),
+            who.format(options.browsers),
             times.size,
             three(np.median(times)),
             three(p99[who]),
             f"{ratios[who]:.2f}",
             f"<= {TARGET:g}" if who == READERS else "",
             three(times.max()),
+            *processors(who),
         )
-        for who, times in found.items()
+        for who, times in latencies.items()
     ]
     titles = ("who looks", "samples", "median [ms]", "p99 [ms]", "p99 / nobody's", "target",
-              "max [ms]")  # fmt: skip
+              "max [ms]", "tune_loop", "those who look")  # fmt: skip
     print(table(titles, rows))
     return 0 if ratios[READERS] <= TARGET or options.quick else 1
 

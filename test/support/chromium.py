@@ -13,7 +13,7 @@ import re
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -39,13 +39,14 @@ class Chromium:
     """A browser with a new, empty profile.
 
     :param profile: an empty folder for it.
+    :param before: words of a command that starts it, such as nice.
     """
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path, before: Sequence[str] = ()) -> None:
         program = found()
         assert program is not None, "no Chromium found"
         self._process = subprocess.Popen(
-            [program, f"--user-data-dir={profile}", *_FLAGS],
+            [*before, program, f"--user-data-dir={profile}", *_FLAGS],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         file, deadline = profile / "DevToolsActivePort", time.monotonic() + _STARTS_WITHIN
