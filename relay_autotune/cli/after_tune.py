@@ -94,7 +94,7 @@ def hand_over(
         outcome = prove(client, nodes, options)
         done.proven, against = outcome.passed, outcome.against
         if not against:
-            done.steps += _own_controller(client, options, gains)
+            done.steps += _own_controller(client, options, nodes, gains)
     first = _Written(gains, exports_of(gains.law)[0], against or doubt)
     written, file = first, options.export
     if not (file or joint or options.yes) and sys.stdin.isatty():
@@ -130,7 +130,7 @@ def _asked(client: TuneClient, first: _Written, against: str) -> tuple[_Written,
     told = f"{first.how}{whose}; type another name to design for it: {names}"
     print("\n" + "\n".join(labelled("file for", told, width())))
     while True:
-        what = f"Write the gains for {chosen.how}{' all the same' * bool(chosen.doubt)}"
+        what = f"Write the gains for {chosen.how}{' all the same' * bool(against)}"
         answer = asked_for_file(what, EXPORTS)
         if answer not in EXPORTS:
             return chosen, answer
@@ -160,7 +160,7 @@ def _designed(client: TuneClient, law: str, against: str) -> _Written:
         found = analysed_as_there(record, asked_for, working.at)
     gains = found.best_gains
     if gains is None:
-        raise RelayAutotuneError(found.reason)
+        raise RelayAutotuneError(found.reason.removeprefix("no gains: "))
     told = ", ".join(f"{name} {digits(getattr(gains, name))}" for name in ("kc", "ti", "td"))
     told += f", every {period:g} s; {'; '.join(gains.warnings) or 'Ms ' + digits(gains.ms, 3)}"
     print("\n".join(labelled(f"for {law}", told, width())))
@@ -173,16 +173,16 @@ def _positive(text: str) -> float | None:
     return value if value is not None and value > 0.0 else None
 
 
-def _own_controller(client: TuneClient, options: argparse.Namespace, gains: Gains) -> Steps:
-    """Return the command that controls the loop with the gains, without any other controller."""
+def _own_controller(
+    client: TuneClient, options: argparse.Namespace, nodes: OwnNodes, gains: Gains
+) -> Steps:
+    """Return the commands that control the loop with the gains, without any other controller."""
     # Imported here, because it loads slowly.
     from relay_autotune.nodes.controller_parameters import FIXED, GAINS, parameters_of_law
     from relay_autotune.nodes.live_types import FLOAT64
 
-    if client.values(client.name, ["command_type"])["command_type"] != FLOAT64:
-        # It sends Float64 alone.
-        return []
-    kind = client.values(client.name, ["measurement_type"])["measurement_type"]
+    names = ["measurement_type", "command_type"]
+    kind, command_kind = client.values(client.name, names).values()
     default = {entry.name: entry.default for entry in FIXED}
     sensor = {"measurement_type": kind, "measurement_field": options.field}
     values: dict[str, Any] = {each.name: getattr(gains, each.name) for each in GAINS}
@@ -193,9 +193,16 @@ def _own_controller(client: TuneClient, options: argparse.Namespace, gains: Gain
         if limits:
             values |= dict(zip((f"{name}_min", f"{name}_max"), limits, strict=True))
     values |= parameters_of_law(gains.law, gains.law_period)
-    topics = {"measurement": options.measurement, "controller_command": options.command}
+    topics, steps = {"measurement": options.measurement}, []
+    if command_kind == FLOAT64:
+        topics["controller_command"] = options.command
+    else:
+        # controller_node sends Float64 alone, and relay_node passes that on.
+        words = [w for w in nodes.arguments("relay_node") if not w.startswith("__ns:=")][1:]
+        words = ["relay_node", "--ros-args", *words, "-p", f"initial_command:={options.at}"]
+        steps.append(("pass its commands on", prefix() + shlex.join(words)))
     words = ["controller_node", "--ros-args", *ros_arguments("", topics, values)]
-    return [("control with these gains", prefix() + shlex.join(words))]
+    return [("control with these gains", prefix() + shlex.join(words)), *steps]
 
 
 def left(result: Any, command: float, outside: bool) -> str:

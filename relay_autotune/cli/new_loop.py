@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.cli.arguments import finite
 from relay_autotune.cli.asking import asked, number_of, pair_of
 from relay_autotune.cli.export import number
+from relay_autotune.cli.layout import broken, width
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import ParameterError, SelectionError
@@ -161,13 +162,14 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         kind = client.kind_of(options.measurement, options.wait, published=True)
         command_kind = client.kind_of(options.command, options.wait, published=False)
         others = options.command_message or ""
-        command_field = options.command_field or "data"
-        try:
-            client.require_field(kind, options.field)
-            present = client.commanded(options.command, command_kind, command_field, others)
-        except ParameterError as error:
-            raise SelectionError(_as_flags(str(error))) from None
         client.require_uncontrolled()
+    _choose_field(client, kind, options)
+    command_field = options.command_field or "data"
+    try:
+        with Working(f"listening to {options.command}"):
+            present = client.commanded(options.command, command_kind, command_field, others)
+    except ParameterError as error:
+        raise SelectionError(_as_flags(str(error))) from None
     if sys.stdin.isatty() and None in (options.at, options.within, options.command_within):
         print("u is the command's unit, y the measurement's", file=sys.stderr)
     told = "" if math.isnan(present) else f"{present:.6g}"
@@ -209,6 +211,28 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         given = {name: value for name, value in asked_for.items() if value is not None}
         nodes["identifier_node"] = ros_arguments(space, values=given)
     return OwnNodes(nodes)
+
+
+def _choose_field(client: TuneClient, kind: str, options: argparse.Namespace) -> None:
+    """Ask for the number that measures where the messages do not have the one of --field.
+
+    :param client: a node of the graph.
+    :param kind: message type of the measurement.
+    :param options: with the flags of `add_new_loop`.
+    :raises SelectionError: if nobody can be asked.
+    """
+    while True:
+        try:
+            client.require_field(kind, options.field)
+            return
+        except ParameterError as error:
+            told = _as_flags(str(error))
+        first = client.first_number(kind)
+        if not (first and sys.stdin.isatty()):
+            raise SelectionError(f"{told}: give it, such as --field {first}" if first else told)
+        print("\n".join(broken(told, width())), file=sys.stderr)
+        what = "the number that measures"
+        options.field = asked(what, "--field", first, first, lambda text: text or None)
 
 
 def ros_arguments(

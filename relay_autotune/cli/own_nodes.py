@@ -61,13 +61,21 @@ class OwnNodes:
             preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
         )
 
+    def arguments(self, name: str) -> Sequence[str]:
+        """Return the arguments for ROS with which a node was started.
+
+        :param name: of its executable.
+        """
+        return self._nodes[name]
+
     def end(self, name: str) -> None:
         """End one node before the others, if it was started.
 
         :param name: of its executable.
         """
         if (process := self._running.pop(name, None)) is not None:
-            _end([process])
+            with Working(f"ending {name}"):
+                _end([process])
 
     def require_alive(self) -> None:
         """Refuse to go on without a node.

@@ -191,7 +191,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     try:
         namespace = own_namespace(options) if new else options.namespace
         spaces = namespace.split(",") if options.web else [namespace]
-        clients = [TuneClient(space, options.node, ros) for space in spaces]
+        with Working("joining the ROS graph"):
+            clients = [TuneClient(space, options.node, ros) for space in spaces]
     except ParameterError as error:
         say(PROGRAM, str(error))
         return USAGE

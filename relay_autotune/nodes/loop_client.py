@@ -25,10 +25,11 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
+from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.command_message import CommandMessage
-from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
@@ -311,6 +312,14 @@ class LoopClient:
         :raises ParameterError: with the fields that it has.
         """
         reader_of(type_name, field)
+
+    def first_number(self, type_name: str) -> str:
+        """Return the path of the first number of a message type; empty: it has none.
+
+        :param type_name: such as ``sensor_msgs/msg/Temperature``.
+        """
+        struct = struct_of(message_class(type_name, "measurement_type"))
+        return next(iter(first_numbers(struct, 1)), "")
 
     def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         """Return the mean of the commands that are published now; NaN: none are.

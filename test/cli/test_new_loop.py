@@ -51,6 +51,9 @@ class Looker:
         if field == "nothing":
             raise ParameterError(f"measurement_field: {type_name} has no field {field!r}")
 
+    def first_number(self, type_name: str) -> str:
+        return "temperature"
+
     def require_uncontrolled(self) -> None:
         pass
 
@@ -206,9 +209,14 @@ def test_commands_within_messages_become_parameters() -> None:
     assert found["command_period"] == "0.1"
 
 
-def test_a_field_that_is_not_there_is_named_by_its_flag() -> None:
-    with pytest.raises(SelectionError, match="--field: std_msgs/msg/Float32 has no field"):
-        arguments(Looker(), options("--within", "0", "1", "--at", "0", "--field", "nothing"))
+def test_a_field_that_is_not_there_is_asked_for_or_named_by_its_flag(typed: list[str]) -> None:
+    words = "--within", "0", "1", "--at", "0", "--field", "nothing", "--command-within", "0", "1"
+    typed += ["nothing", ""]
+    assert arguments(Looker(), options(*words))["measurement_field"] == "temperature"
+    assert not typed
+    sys.stdin.isatty = lambda: False  # type: ignore[method-assign]
+    with pytest.raises(SelectionError, match=r"Float32 has no field .*, such as --field temp"):
+        arguments(Looker(), options(*words))
 
 
 def ended(reason: str, **values: Any) -> Any:
@@ -251,7 +259,7 @@ def shown(
     fill_gains(message, design(task, "imc"), experiment_id="x")
     result = Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
     result.experiment.settings.setpoint = 50.0
-    kinds = {"command_type": FLOAT64, "measurement_type": "std_msgs/msg/Float32"}
+    kinds = {"measurement_type": "std_msgs/msg/Float32", "command_type": FLOAT64}
     client: Any = SimpleNamespace(
         name="relay_node", result=result, record=lambda patience: record,
         identifier_values=lambda patience: None, values=lambda node, names: kinds,
@@ -259,7 +267,8 @@ def shown(
     parser = tune_loop._parser()
     given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
     given.at, given.within, given.command_within = 35.0, [0.0, 90.0], [0.0, 100.0]
-    nodes: Any = SimpleNamespace(require_alive=lambda: None)
+    words = ["-r", "__ns:=/tune_loop_1", "-r", "command:=/tank/valve", "-p", "baseline:=35.0"]
+    nodes: Any = SimpleNamespace(require_alive=lambda: None, arguments=lambda name: words)
     monkeypatch.chdir(tmp_path)
 
     def analysed(_: Any, values: dict[str, Any], __: Any) -> Any:
@@ -271,8 +280,9 @@ def shown(
     # The whole analysis takes seconds.
     monkeypatch.setattr(tune_report, "analysed_as_there", analysed)
 
-    def show(passed: bool | None, against: str, *answers: str) -> str:
+    def show(passed: bool | None, against: str, *answers: str, command_type: str = FLOAT64) -> str:
         typed.extend(answers)
+        kinds["command_type"] = command_type
         monkeypatch.setattr(proof, "_offered", lambda *_: proof.Outcome(passed, against))
         done = hand_over(client, given, parser, nodes, None)
         assert done.proven is passed
@@ -326,6 +336,12 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
         "90.0",
     )
     assert set(given) - {"measurement", "controller_command"} <= {e.name for e in PARAMETERS}
+    # For another type relay_node stands between controller and actuator.
+    both = shown(None, "", "", command_type="std_msgs/msg/Float32").partition("NEXT ")[2]
+    assert "controller_command:=" not in both
+    assert both.endswith(
+        "relay_node --ros-args -r command:=/tank/valve -p baseline:=35.0 -p initial_command:=35.0"
+    )
 
 
 @pytest.mark.parametrize(
