@@ -159,8 +159,10 @@ _INWARD = np.array(
     [(p, f, d) for p in (-0.03, 0.0, 0.03) for f in (-0.02, -0.1) for d in (0.0, 0.03)]
 )
 _TRIED_AT_ONCE = 40
-# Range of a bound above 1, and the relative tolerance in it.
-_LEAST_EXCESS, _LARGEST_EXCESS, _EXCESS_TOLERANCE = 0.01, 100.0, 0.01
+# Range of a bound, and the relative tolerance of its excess over 1: on the process, and where the
+# models around it are asked too.
+_LEAST_BOUND, _LARGEST_BOUND = 1.01, 101.0
+_EXCESS_TOLERANCE, _ROUGH_TOLERANCE = 0.01, 0.03
 _MARGIN = 1.2
 # Integral gains have to be above the lower end of their range by this factor.
 _CLEAR = 1.02
@@ -358,16 +360,21 @@ class Search:
         return _TIMES * 2.0 * math.pi / self.frequency if derivative else np.zeros(1)
 
     def scan(
-        self, bounds: Bounds, times: FloatArray, gains: tuple[float, float] = (0.0, math.inf)
+        self,
+        bounds: Bounds,
+        times: FloatArray,
+        gains: tuple[float, float] = (0.0, math.inf),
+        every: int = 1,
     ) -> Candidates | None:
         """Return controllers from the whole stable range that keep the bounds; None: none does.
 
         :param bounds: on the sensitivities.
         :param times: derivative times [s], shape (n,); one of 0: PI.
         :param gains: least and largest proportional gain to look at.
+        :param every: n: every n-th gain and time is looked at.
         """
         derivative = bool(np.any(times))
-        count = _GAINS[derivative]
+        count, times = _GAINS[derivative] // every, times[::every]
         parts = []
         for time in times.tolist():
             span = self._span(time)
@@ -389,22 +396,34 @@ class Search:
         return found if found.kp.size else None
 
     def least_ms(self, *, derivative: bool) -> float:
-        """Return the least Ms that some controller attains, infinite where none is stable."""
-        return self._least_bound(lambda ms: Bounds(ms), derivative)
+        """Return the least Ms that some controller attains, infinite where none is stable.
+
+        :param derivative: True: PID, False: PI.
+        """
+        return self._least_bound(Bounds, derivative, _LARGEST_BOUND)
 
     def least_mt(self, ms: float, *, derivative: bool) -> float:
-        """Return the least Mt that some controller attains while it keeps a bound on Ms."""
-        return self._least_bound(lambda mt: Bounds(ms, mt), derivative)
+        """Return the least Mt that some controller attains while it keeps a bound on Ms.
 
-    def _least_bound(self, bounds: Callable[[float], Bounds], derivative: bool) -> float:
-        low, high = math.log(_LEAST_EXCESS), math.log(_LARGEST_EXCESS)
+        :param ms: the bound, which some controller keeps.
+        :param derivative: True: PID, False: PI.
+        """
+        # Mt is at most Ms + 1, because T = 1 - S.
+        return self._least_bound(partial(Bounds, ms), derivative, ms + 1.0)
+
+    def _least_bound(
+        self, bounds: Callable[[float], Bounds], derivative: bool, most: float
+    ) -> float:
+        low, high = math.log(_LEAST_BOUND - 1.0), math.log(most - 1.0)
         times, gains = self._times(derivative), (0.0, math.inf)
-        found = self.scan(bounds(1.0 + math.exp(high)), times)
+        # A scan of all models takes long, and the bound will be relaxed by more than it misses.
+        every, tolerance = (2, _ROUGH_TOLERANCE) if self.models else (1, _EXCESS_TOLERANCE)
+        found = self.scan(bounds(1.0 + math.exp(high)), times, gains, every)
         if found is None:
             return math.inf
-        while high - low > _EXCESS_TOLERANCE:
+        while high - low > tolerance:
             middle = 0.5 * (low + high)
-            found = self.scan(bounds(1.0 + math.exp(middle)), times, gains)
+            found = self.scan(bounds(1.0 + math.exp(middle)), times, gains, every)
             if found is None:
                 low = middle
                 continue

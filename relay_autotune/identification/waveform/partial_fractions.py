@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtbtrs, ztbtrs
 
 from relay_autotune.arrays import FloatArray
 
@@ -32,18 +33,11 @@ Numbers = NDArray[Any]
 _MOST_CANCELLATION = math.log(1e4)
 # Longest time constant in horizons: a longer one cancels with the held input.
 _LONGEST = 10.0
-# Number of changes up to which a plain loop is as quick as array operations.
-_FEW_CHANGES = 64
 # Taylor coefficients of powers of s: binomial coefficients, and the power that is left.
 _MOST = 24
 _POWERS = np.maximum(np.subtract.outer(np.arange(_MOST), np.arange(_MOST)), 0)
 _BINOMIALS = np.array([[float(math.comb(i, j)) for j in range(_MOST)] for i in range(_MOST)])
-# From this number of changes on, arrays are quicker than plain numbers.
-MANY_CHANGES = 100
-# A state that has decayed to this share of itself is zero.
-_FORGOTTEN = 1e-20
-# Exponents x of a block, and of one factor: exp(x) and exp(-x) are normal numbers.
-_BLOCK = 200.0
+# Largest exponent of a growing mode.
 _OVERFLOW = 300.0
 
 
@@ -165,24 +159,32 @@ def follow(
     :param changes: when the input steps [s], shape (m,).
     """
     since = time - changes[segment]
-    total = np.zeros((time.size, poles[0].numerators.shape[1]))
+    motions: list[FloatArray] = []
+    shares: list[FloatArray] = []
     for pole, state in zip(poles, states, strict=True):
-        output: Numbers | None = None
-        for power in range(pole.multiplicity - 1, -1, -1):
-            # The coefficient of (t - t_k)^power exp(p (t - t_k)) after each change.
-            rows = state[: pole.multiplicity - power].T @ pole.numerators[power:]
-            here = (rows / math.factorial(power)).take(segment, axis=0)
-            output = here if output is None else output * since[:, None] + here
-        assert output is not None
-        if pole.value != 0j:
-            motion = pole.number * since
-            if pole.value.real > 0.0:
-                # A state that decayed from beyond this bound is zero: exp() must not overflow.
-                motion = np.minimum(motion, _OVERFLOW)
-            output = output * np.exp(motion)[:, None]
-        # A conjugate pair gives twice the real part of one pole's output.
-        total += 2.0 * output.real if pole.value.imag else output
-    return total.T
+        exponent = pole.number * since
+        if pole.value.real > 0.0:
+            # A state that decayed from beyond this bound is zero: exp() must not overflow.
+            exponent = np.minimum(exponent, _OVERFLOW)
+        decay = np.exp(exponent) if pole.value != 0j else 1.0
+        at_change = [row.take(segment) for row in state]
+        powers = [np.ones(since.size)]
+        for j, here in enumerate(at_change):
+            moved = here
+            for i, earlier in enumerate(reversed(at_change[:j]), start=1):
+                if i == len(powers):
+                    powers.append(powers[-1] * since / i)
+                moved = moved + earlier * powers[i]
+            moved = moved * decay
+            numerators = pole.numerators[j]
+            if pole.value.imag:
+                # A conjugate pair gives twice the real part of one pole's output.
+                motions += [moved.real, moved.imag]
+                shares += [2.0 * numerators.real, -2.0 * numerators.imag]
+            else:
+                motions.append(moved)
+                shares.append(numerators)
+    return np.stack(shares, axis=1) @ np.stack(motions)
 
 
 def _recursions(
@@ -192,56 +194,26 @@ def _recursions(
     gaps = instants[1:] - instants[:-1]
     decay = np.exp(p * gaps)
     state = np.zeros((terms, instants.size), dtype=decay.dtype)
-    state[0] = _recursion(p, instants, decay, steps)
+    state[0] = recursion(decay, steps)
     weights = [decay]
     for j in range(1, terms):
         weights.append(weights[-1] * gaps * (direction / j))
         drive = np.zeros(instants.size, dtype=decay.dtype)
         for i in range(j):
             drive[1:] += weights[j - i] * state[i, :-1]
-        state[j] = _recursion(p, instants, decay, drive)
+        state[j] = recursion(decay, drive)
     return state
 
 
-def doubled(decay: Numbers, drive: Numbers) -> Numbers:
-    """Return ``x_k = decay_(k-1) x_(k-1) + drive_k`` by joining ever longer stretches.
-
-    Hillis and Steele 1986: m numbers take log2(m) sums of arrays.
+def recursion(decay: Numbers, drive: FloatArray | Numbers) -> Numbers:
+    """Return ``x_k = decay_(k-1) x_(k-1) + drive_k``, a triangular system of two bands.
 
     :param decay: of magnitude at most 1, shape (m - 1,).
     :param drive: shape (m,).
     """
-    found = drive.astype(decay.dtype)
-    over = np.concatenate(([0.0], decay))
-    reach = 1
-    while reach < found.size and np.abs(over[reach:]).max() > _FORGOTTEN:
-        found[reach:] += over[reach:] * found[:-reach]
-        over[reach:] = over[reach:] * over[:-reach]
-        reach *= 2
-    return found
-
-
-def _recursion(p: Any, changes: FloatArray, decay: Numbers, drive: Numbers) -> Numbers:
-    """Return ``x_k = exp(p (t_k - t_(k-1))) x_(k-1) + drive_k``, shape (m,)."""
-    span = abs(p.real) * abs(float(changes[-1] - changes[0])) if changes.size else 0.0
-    if changes.size <= _FEW_CHANGES * (1.0 + span / _BLOCK):
-        # A block would hold too few changes to pay, as with a fast pole and a busy input.
-        if changes.size > MANY_CHANGES and (p.real * (changes[-1] - changes[0])) < 0.0:
-            return doubled(decay, drive)
-        x = drive.tolist()
-        for k, a in enumerate(decay.tolist(), start=1):
-            x[k] += a * x[k - 1]
-        return np.array(x, dtype=decay.dtype)
-    found = np.empty(changes.size, dtype=decay.dtype)
-    first, carried = 0, 0.0
-    while first < changes.size:
-        # Within a block: a cumulative sum of the changes, referred to the block's beginning.
-        reach = _BLOCK / abs(p.real) if p.real else math.inf
-        last = int(np.searchsorted(changes, changes[first] + reach, side="right"))
-        motion = np.exp(p * (changes[first:last] - changes[first]))
-        if first:
-            carried = carried * decay[first - 1]
-        found[first:last] = motion * (np.cumsum(drive[first:last] / motion) + carried)
-        carried = found[last - 1]
-        first = last
+    # Each column of the bands holds a diagonal element, and what the next x takes of this one.
+    bands = np.ones((drive.size, 2), dtype=decay.dtype).T
+    bands[1, :-1] = -decay
+    solve = ztbtrs if np.iscomplexobj(decay) else dtbtrs
+    found: Numbers = solve(bands, drive[:, None], uplo="L", diag="U")[0][:, 0]
     return found

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.partial_fractions import MANY_CHANGES, doubled
+from relay_autotune.identification.waveform.partial_fractions import recursion
 from relay_autotune.identification.waveform.rational import responses
 from relay_autotune.process.model_parameters import DEAD_TIME, Quadratic
 from relay_autotune.process.structures import FOPDT, Structure
@@ -139,17 +139,6 @@ def _at_changes(levels: FloatArray, gaps: FloatArray) -> tuple[FloatArray, Float
     :param gaps: between changes, over tau, shape (m - 1,).
     """
     decay = np.exp(-gaps)
-    if levels.size > MANY_CHANGES:
-        state = doubled(decay, np.append(0.0, -np.expm1(-gaps) * levels[:-1]))
-        away = state[:-1] - levels[:-1]
-        return state, doubled(decay, np.append(0.0, decay * away * gaps))
-    # For so few numbers plain floats are quicker than arrays.
-    states, slopes = [0.0], [0.0]
-    s = q = 0.0
-    for level, gap, a in zip(levels.tolist(), gaps.tolist(), decay.tolist(), strict=False):
-        apart = s - level
-        q = a * (q + apart * gap)
-        s = level + apart * a
-        states.append(s)
-        slopes.append(q)
-    return np.array(states), np.array(slopes)
+    state = recursion(decay, np.append(0.0, -np.expm1(-gaps) * levels[:-1]))
+    away = state[:-1] - levels[:-1]
+    return state, recursion(decay, np.append(0.0, decay * away * gaps))
