@@ -77,8 +77,10 @@ def halves_of(fit: Fit, frequency: float) -> Halves | None:
     if parts is None:
         return None
     found: list[tuple[Estimate, complex, FloatArray]] = []
+    evidence = 0.0
     for half in parts:
         own = refine(half, fit.state.theta, tolerance=_TRIAL, most=_STEPS)
+        evidence += _evidence(half, own, fit.state)
         estimate = estimate_of(half, own, fit, Noise(False))
         if estimate is None or not estimate.known:
             return None
@@ -90,12 +92,29 @@ def halves_of(fit: Fit, frequency: float) -> Halves | None:
     if not bool(np.all(np.isfinite(covariance))):
         return None
     square = 0.5 * float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart)
+    # Where a half determines little, its fit may end far away, at a covariance that holds there
+    # alone. No difference is more certain than that the halves differ at all.
+    square = min(square, 0.5 * evidence)
     models = tuple(
         estimate.model
         for estimate, own in ((first, of_first), (second, of_second))
         if math.sqrt(float(np.trace(own))) <= _TOLD
     )
     return Halves(square, models)
+
+
+def _evidence(half: Problem, own: Trial, whole: Trial) -> float:
+    """Return twice the logarithm of the likelihood ratio of a half's fit and the whole's.
+
+    :param half: the samples of the half.
+    :param own: their fit.
+    :param whole: the fit to all samples; the half has an offset, drift and past of its own.
+    """
+    k = len(half.structure.powers)
+    columns = half.seen(half.columns(whole.theta)[0])
+    left = half.seen(half.y) - whole.coefficients[:k] @ columns[:k]
+    left = left - np.linalg.lstsq(columns[k:].T, left, rcond=None)[0] @ columns[k:]
+    return half.time.size * math.log(max(float(left @ left) / max(own.cost, 1e-300), 1.0))
 
 
 def _response(estimate: Estimate, frequency: float) -> tuple[complex, FloatArray]:
