@@ -25,7 +25,7 @@ _MOST_TRIALS = 12
 _MOST_LOST = 5
 # Least rise at the end of a search that did not settle, as a share of the quantile.
 _FAR_ENOUGH = 0.5
-_CLOSE = 0.02
+_CLOSE = 0.05
 _SETTLED = 1e-2
 _FAR = 8.0
 # Largest logarithm of a gain: products with a larger one overflow.
