@@ -135,7 +135,8 @@ class SampledResponses(Responses):
         x, y = np.ascontiguousarray(inverse.real), np.ascontiguousarray(inverse.imag)
         loops = own[:, None, :] / inverse
         # A loop that begins left of -1 has a real pole there, which moves with the phase.
-        at_rest = self._at_rest[of] & (loops[..., 0].real < -1.0)
+        # The inverse of its loop hardly changes from there to the grid, the loop itself may.
+        at_rest = self._at_rest[of] & (base[..., 0] + inverse[..., 0].real > 0.0)
         begun = np.where(at_rest, np.sign(loops[..., 0].imag), 0.0)
         count = self._poles[of] + _gained(loops) + begun
         with np.errstate(invalid="ignore"):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from relay_autotune.loop.laws import LAWS, law_named
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design, tune
+from relay_autotune.tuning.frontier import Bounds
+from relay_autotune.tuning.sampled_search import SampledResponses
 
 PROCESSES = {
     "fopdt": TransferFunction.fopdt(0.9, 2.0, 0.8),
@@ -149,3 +152,17 @@ def test_our_own_law_by_its_name_is_near_the_continuous_design():
 def test_every_law_can_be_asked_for():
     for name in LAWS:
         assert asked(name, 0.1).runs is LAWS[name]
+
+
+def test_a_pole_that_is_unstable_below_the_grid_leaves_gains():
+    """Seen from the grid it is an integrator; its loop begins far left of -1."""
+    law, period, kp = law_named("simple_pid"), 0.2, 2.0
+    model = TransferFunction(-2148.0, (), (-22540.0, 0.82), 0, 0.79)
+    grid = np.geomspace(0.01, 0.99 * math.pi / period, 3000)
+    responses = SampledResponses(law, period, (model,), grid, 1.0)
+    none = np.zeros(1)
+    highs, _ = responses.largest_ki(Bounds(1.8), np.array([kp]), none, none)
+    ki = float(highs[0, 0])
+    # The backward integral takes half a sample from the proportional gain.
+    gains = Controller(kp - 0.5 * period * ki, (kp - 0.5 * period * ki) / ki)
+    assert SampledLoop(law.at(gains, period), model).ms() == pytest.approx(1.8, rel=1e-3)
