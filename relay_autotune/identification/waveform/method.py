@@ -128,7 +128,9 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
     """Fit by least squares, or in the colour of the noise where that is not white."""
-    clear = not held and known.loss == LOSSES[0] and is_clearly_coloured(problem, sign)
+    # The choice among all structures takes longest on such data; one alone is soon fitted.
+    free = not held and known.loss == LOSSES[0] and not known.structure
+    clear = free and is_clearly_coloured(problem, sign)
     if clear:
         coloured = in_colour(problem, scale, known, sign, held=held)
         if coloured is not None and _responds(coloured.problem, coloured.state, _SEARCHED):
