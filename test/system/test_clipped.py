@@ -17,8 +17,8 @@ from relay_autotune_msgs.msg import RelayExperiment
     ("amplitude", "known"),
     [
         (100.0, {"initial_command": 2.5}),
-        (20.0, {"baseline": 3.0}),
-        (20.0, {"initial_command": 0.5}),
+        pytest.param(20.0, {"baseline": 3.0}, marks=pytest.mark.nightly),
+        pytest.param(20.0, {"initial_command": 0.5}, marks=pytest.mark.nightly),
         (20.0, {"baseline": 0.0}),
     ],
 )
