@@ -114,7 +114,7 @@ def test_bounds_hold_on_the_models_around_it_too():
 def test_noise_in_the_command_is_limited_as_far_as_the_law_has_a_filter():
     model, period = PROCESSES["fopdt"], 0.02
     noisy = {"noise_std": 0.02, "amplitude": 1.0, "controller": "pid"}
-    for law in ("klipper_heater", "esphome_pid", "simple_pid"):
+    for law in ("klipper_heater", "simple_pid"):
         gains = tune(model, options=asked(law, period, **noisy))
         assert gains.noise_gain * 0.02 < 0.1 * 1.1
         assert (gains.tf > 0.0) is (law != "simple_pid")

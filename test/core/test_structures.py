@@ -123,6 +123,11 @@ PROCESSES = {
     "unstable_fopdt": TransferFunction.unstable_fopdt(1.0, 1.0, 0.3),
     "unstable_sopdt": TransferFunction.unstable_sopdt(1.0, 2.0, 0.2, 0.2),
 }
+# The others differ from one of these in the number of lags, or by a zero.
+BY_DAY = {"fopdt", "sopdt", "sopdt, underdamped", "three_lags", "ipdt", "unstable_fopdt"}
+ONE_OF_EACH_KIND = [
+    pytest.param(name, marks=[] if name in BY_DAY else [pytest.mark.nightly]) for name in PROCESSES
+]
 
 
 def _record(model: TransferFunction, noise: float = 0.0, seed: int = 0) -> Record:
@@ -154,7 +159,7 @@ def test_without_noise_the_true_structure_is_found_exactly(name):
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("name", PROCESSES)
+@pytest.mark.parametrize("name", ONE_OF_EACH_KIND)
 def test_in_noise_the_choice_gives_the_ultimate_point(name, seed):
     model = PROCESSES[name]
     truth = ultimate_point(model)
