@@ -24,7 +24,7 @@ from markdown import table, three
 from numpy.typing import NDArray
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification.judgement.validation import integrated_error, validate
+from relay_autotune.identification.judgement.assessment import integrated_error, validate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.thyagarajan2003 import (

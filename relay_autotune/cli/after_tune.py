@@ -147,7 +147,7 @@ def _asked(client: TuneClient, first: _Written, against: str) -> tuple[_Written,
 def _designed(client: TuneClient, law: str, against: str) -> _Written:
     """Design gains for the law of a program, from the record of the tune, and show them."""
     # Imported here, because it loads slowly.
-    from relay_autotune.cli.tune_report import analysed_as_there, defaults
+    from relay_autotune.cli.report import analysed_as_there, defaults
 
     record = client.record(PATIENCE)
     interval = f"{record.mean_interval:.3g}"

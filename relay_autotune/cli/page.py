@@ -72,7 +72,7 @@ def show(
     :raises SelectionError: if the address cannot be used.
     """
     # Imported here, because it loads slowly and must not delay a tune.
-    from relay_autotune.cli.design_arguments import export_target
+    from relay_autotune.cli.analysis_arguments import export_target
     from relay_autotune.cli.export import exported, exports_of
     from relay_autotune.tuning.task import DesignOptions
     from relay_autotune.web.address import address_of

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import may_be_recording
-from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
+from relay_autotune.cli.analysis_arguments import add_analysis, add_export, export_target, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
-from relay_autotune.cli.design_arguments import add_export, export_target
 from relay_autotune.cli.export import write
 from relay_autotune.cli.layout import width
 from relay_autotune.cli.page import add_web, check_web, show

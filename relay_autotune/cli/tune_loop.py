@@ -412,7 +412,7 @@ def _afterwards(
     result = client.result
     with Working("asking identifier_node for its parameters"):
         # Imported here, because it loads slowly and must not delay a tune.
-        from relay_autotune.cli.tune_report import defaults, flags_of, report_of_tune
+        from relay_autotune.cli.report import defaults, flags_of, report_of_tune
 
         values = None if options.record_only else client.identifier_values(PATIENCE)
     flags = flags_of(values) if values is not None else ""

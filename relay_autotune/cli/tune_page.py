@@ -21,7 +21,7 @@ from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, wor
 from relay_autotune.cli.export import Target, exported, exports_of
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.layout import WIDEST
-from relay_autotune.cli.tune_report import analysed_as_there, defaults, flags_of
+from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.tune_view import (
     STATES,
     Paint,

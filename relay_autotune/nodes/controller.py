@@ -35,8 +35,7 @@ from relay_autotune.nodes.controller_parameters import (
     range_from,
     rate_from,
 )
-from relay_autotune.nodes.gains_journal import GainsJournal
-from relay_autotune.nodes.gains_keeper import GainsKeeper
+from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.own_gains import OwnGains, controller_of, said, set_of

@@ -19,7 +19,7 @@ import pytest
 import yaml
 from made_experiments import record_of
 
-from relay_autotune.cli import proof, tune_loop, tune_report
+from relay_autotune.cli import proof, report, tune_loop
 from relay_autotune.cli.after_tune import hand_over, left, left_its_limits, prefix, repeated
 from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.cli.export import EXPORTS
@@ -278,7 +278,7 @@ def shown(
         return SimpleNamespace(best_gains=gains, verdict=Verdict.TRUSTED, judgement=judgement)
 
     # The whole analysis takes seconds.
-    monkeypatch.setattr(tune_report, "analysed_as_there", analysed)
+    monkeypatch.setattr(report, "analysed_as_there", analysed)
 
     def show(passed: bool | None, against: str, *answers: str, command_type: str = FLOAT64) -> str:
         typed.extend(answers)

@@ -18,8 +18,11 @@ from relay_autotune.cli.table import table
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.messages import fill_transfer_function
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.assessment import assess, fit_of_model
-from relay_autotune.identification.judgement.validation import integrated_error
+from relay_autotune.identification.judgement.assessment import (
+    assess,
+    fit_of_model,
+    integrated_error,
+)
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Validation

@@ -12,7 +12,7 @@ import pytest
 
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification, Rival, identified
-from relay_autotune.identification.waveform.averaging import averaged_point
+from relay_autotune.identification.waveform.findings import averaged_point
 from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
 from relay_autotune.process.simulation import simulate_relay

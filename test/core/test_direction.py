@@ -11,7 +11,7 @@ from virtual_tune import tuned
 
 from relay_autotune.analysis import analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters
-from relay_autotune.identification.judgement.direction import other_direction
+from relay_autotune.identification.judgement.evidence import other_direction
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction

@@ -16,10 +16,9 @@ from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import followed_share, lost_effect
-from relay_autotune.identification.judgement.evidence import Evidence, Loop
+from relay_autotune.identification.judgement.evidence import Evidence, Loop, visible_error
 from relay_autotune.identification.judgement.refits import halves, plain_models
 from relay_autotune.identification.judgement.table import CHECKS
-from relay_autotune.identification.judgement.visible import visible_error
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.waveform.theta import theta_of

@@ -14,8 +14,11 @@ from virtual_tune import tuned
 
 from relay_autotune.analysis import model_so_far
 from relay_autotune.experiment.experiment import ExperimentParameters
-from relay_autotune.identification.judgement.disturbance import with_its_load
-from relay_autotune.identification.judgement.load import LoadStep, identify_with_load
+from relay_autotune.identification.judgement.disturbance import (
+    LoadStep,
+    identify_with_load,
+    with_its_load,
+)
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named

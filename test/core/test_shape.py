@@ -14,16 +14,14 @@ from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.envelope import (
+from relay_autotune.identification.shown.fold import fold
+from relay_autotune.identification.shown.shape import (
     Envelope,
+    Shape,
     curvature_time,
     envelope,
     growth_time,
     normalised_growth,
-)
-from relay_autotune.identification.shown.fold import fold
-from relay_autotune.identification.shown.shape import (
-    Shape,
     read_shape,
     shape_of_curve,
     shape_of_half_cycle,

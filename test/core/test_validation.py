@@ -13,7 +13,7 @@ from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.judgement.validation import integrated_error, validate
+from relay_autotune.identification.judgement.assessment import integrated_error, validate
 from relay_autotune.identification.shown.fold import fold
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction

@@ -15,7 +15,7 @@ from random import Random
 import pytest
 
 from relay_autotune.control.gains_history import GainSet, GainsHistory, Work
-from relay_autotune.nodes.gains_journal import GainsJournal, JournalError
+from relay_autotune.nodes.gains_keeper import GainsJournal, JournalError
 
 GIVEN = GainSet.of({"kc": 0.1 + 0.2, "ti": 1e-9, "b": 1.0})
 OTHER = GainSet.of({"kc": -1e12, "ti": 2.0, "b": 0.0})
@@ -27,7 +27,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from relay_autotune.control.gains_history import GainSet, GainsHistory
-from relay_autotune.nodes.gains_journal import GainsJournal
+from relay_autotune.nodes.gains_keeper import GainsJournal
 journal = GainsJournal(Path(sys.argv[1]), "/c", 0, "y")
 print("ready", flush=True)
 for k in range(10**9):

@@ -36,8 +36,13 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
 )
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, relay_test
-from relay_autotune.identification.shown.envelope import curvature_time, envelope
-from relay_autotune.identification.shown.shape import Reading, Shape, read_shape
+from relay_autotune.identification.shown.shape import (
+    Reading,
+    Shape,
+    curvature_time,
+    envelope,
+    read_shape,
+)
 from relay_autotune.identification.shown.symmetric_cycle import require_unbiased, skew_warning
 from relay_autotune.process.model_parameters import DEAD_TIME, GAIN, TIME_CONSTANT, Parameter
 from relay_autotune.process.structures import FOPDT, IPDT, LAG_N, UNSTABLE_FOPDT, Structure
