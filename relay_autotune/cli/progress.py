@@ -13,6 +13,9 @@ from contextlib import ExitStack, suppress
 from relay_autotune.cli.layout import width
 from relay_autotune.text import TOLD_EVERY, duration
 
+# Time after which a terminal is first told what is being done [s]: several short works in a row
+# must not be silent together.
+_SOON = 0.3
 # Time before the first share of a work is shown, and between two of them [s].
 _PATIENCE = 1.0
 _INTERVAL = 0.2
@@ -123,6 +126,8 @@ class Working:
 
     def _tell(self) -> None:
         began, line = time.monotonic(), StatusLine()
-        while not self._over.wait(TOLD_EVERY):
+        wait = min(_SOON, TOLD_EVERY) if line.in_place else TOLD_EVERY
+        while not self._over.wait(wait):
+            wait = TOLD_EVERY
             line(f"{self._what}, {duration(time.monotonic() - began)}{self._stage}")
         line.clear()
