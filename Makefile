@@ -25,15 +25,12 @@ demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
 # the running nodes first, by themselves, since a busy machine makes them late; then two at a time
-test: lint
-	@status=0; $(MAKE) --no-print-directory CHECKED=setup test-system || status=$$?; \
-	$(MAKE) --no-print-directory --jobs=2 --keep-going --output-sync=target CHECKED=setup \
-		test-core test-rest test-oldest || status=$$?; exit $$status
+test: setup
+	@status=0; $(MAKE) --no-print-directory test-system || status=$$?; \
+	$(MAKE) --no-print-directory --jobs=2 --keep-going --output-sync=target \
+		test-core test-rest test-oldest lint || status=$$?; exit $$status
 
-# what has been linted already is not linted again
-CHECKED = lint
-
-test-core: $(CHECKED)
+test-core: setup
 	@$(ENTER) && python3 -m pytest -q test/core
 
 # A machine that is busy with something else can miss the deadline of a running node: what failed
@@ -42,11 +39,11 @@ ONCE_MORE = || { echo "$@: what failed runs once more, by itself"; \
 	python3 -m pytest -q --last-failed --last-failed-no-failures=none
 
 # running nodes, over real DDS; most of the time they wait, so two files at a time
-test-system: $(CHECKED)
+test-system: setup
 	@$(ENTER) && { python3 -m pytest -q --numprocesses=2 --dist=loadfile test/system \
 		$(ONCE_MORE) test/system; }; }
 
-test-rest: $(CHECKED)
+test-rest: setup
 	@$(ENTER) && { python3 -m pytest -q --ignore=test/core --ignore=test/system \
 		$(ONCE_MORE) --ignore=test/core --ignore=test/system; }; }
 
