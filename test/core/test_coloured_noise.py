@@ -183,6 +183,7 @@ def test_a_process_that_visibly_rested_needs_no_past():
     assert nuisances_of(best.problem)[1:] == (False, False)
 
 
+@pytest.mark.long
 def test_a_step_that_came_just_before_the_record_leaves_no_endless_dead_time():
     """Gain and dead time cannot be told apart; draws of 1e9 s took the gains for ever."""
     time = 0.02 * np.arange(170.0)

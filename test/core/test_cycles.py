@@ -281,6 +281,7 @@ def test_commands_that_are_no_relay(command):
     assert cycles_of(record) == ()
 
 
+@pytest.mark.long
 @given(
     command=st.lists(st.sampled_from([0.0, 1.0, 2.0, 5.0]), min_size=1, max_size=60),
     steps=st.lists(st.sampled_from([0.0, 0.1, 7.0]), min_size=60, max_size=60),

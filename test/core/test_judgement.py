@@ -188,6 +188,7 @@ def of_checks(record, found, gains, **more):
     return {f.name: f for f in judge(CHECKS, evidence)}
 
 
+@pytest.mark.long
 def test_each_half_of_a_record_tells_its_own_process():
     other = TransferFunction.fopdt(6.0, 10.0, 6.0)
     record = joined(PROCESS, other)
@@ -373,6 +374,7 @@ def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     assert clipped.result is not Result.PASSED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("share", "result"), [(0.3, Result.PASSED), (0.7, Result.DOUBTFUL)])
 def test_a_model_of_less_than_half_of_the_record_is_doubtful(record, gains, share, result):
     found = fitted_as(PROCESS, record)

@@ -34,6 +34,7 @@ def asked(law, period, **more):
     return DesignOptions(law=law, sample_period=period, **more)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "process", "period", "kind"),
     [
@@ -86,6 +87,7 @@ def test_no_other_gains_within_the_bounds_have_a_clearly_smaller_error(law):
     assert tried > 10
 
 
+@pytest.mark.long
 def test_a_named_law_matters_at_a_slow_rate():
     """The same gains on another law than theirs miss the bound by far."""
     model, period = PROCESSES["fopdt"], 0.8
@@ -140,6 +142,7 @@ def test_what_a_law_cannot_do_is_said():
         tune(model, options=DesignOptions(law="simple_pid"))
 
 
+@pytest.mark.long
 def test_our_own_law_by_its_name_is_near_the_continuous_design():
     model = PROCESSES["fopdt"]
     options = asked("controller_node", 0.05, controller="pid")

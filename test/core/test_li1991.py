@@ -156,6 +156,7 @@ def test_one_record_is_refused_with_what_to_do():
         identify_jointly(records, "chang")
 
 
+@pytest.mark.long
 def test_records_that_do_not_belong_together_are_refused():
     process = TransferFunction.fopdt(2.0, 3.0, 1.0)
     first = _records(process, 0.0, 0.0)[0]

@@ -178,6 +178,7 @@ def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
     assert f"{found.gain_ratio:.2f} times the model's" in found.reason
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("factor", "step"), [(0.64, Step(load=0.4)), (1.5, Step(setpoint=0.5))])
 def test_what_is_close_to_its_limit_passes_narrowly_with_the_limit(factor, step):
     other = replace(PROCESS, gain=factor * PROCESS.gain)

@@ -100,6 +100,7 @@ def test_an_infeasible_bound_is_relaxed_with_a_warning():
     assert analyse_loop(controller, model).ms <= 1.16 * 1.53
 
 
+@pytest.mark.long
 def test_pid_has_to_be_worth_its_derivative():
     model = TransferFunction.fopdt(1.0, 1.0, 0.5)
     quiet = DesignOptions(noise_std=1e-4, amplitude=1.0, sample_period=0.02)

@@ -208,6 +208,7 @@ def test_steady_peaks_do_not_grow():
     assert math.isnan(growth_time(Envelope(time[:5], np.ones(5))))
 
 
+@pytest.mark.long
 def test_growth_of_the_examples_start_up():
     record = ideal_record(TransferFunction.lag_n(1.0, 2.0, 2, 0.01), cycles=30, samples=60_000)
     growth = shape_of_record(record).growth

@@ -183,6 +183,7 @@ def test_the_true_structure_given_its_errors_are_those_stated(name):
         assert np.abs(pulls).max() < 5.0
 
 
+@pytest.mark.long
 def test_rivals_are_told_with_their_support():
     found = identify_waveform(_record(PROCESSES["lag_n, order 8"], 0.1))
     assert any(r.model.structure == "lag_n" for r in found.rivals)

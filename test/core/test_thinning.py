@@ -47,6 +47,7 @@ def test_a_record_that_is_short_enough_is_left_alone():
     assert thinned(record) is record
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("samples", [LEFT_ALONE + 1, 150_000])
 @pytest.mark.parametrize("shape", ["sine", "noise", "steps", "step", "ramp"])
 def test_what_is_analysed_is_bounded_however_long_and_whatever_the_command(shape, samples):
@@ -61,6 +62,7 @@ def test_what_is_analysed_is_bounded_however_long_and_whatever_the_command(shape
     assert short.duration > 0.99 * 1000.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["sine", "noise", "steps", "step"])
 def test_the_model_is_that_of_all_samples_within_its_interval(shape):
     rng = np.random.default_rng(2)
@@ -148,6 +150,7 @@ def test_cycles_begin_where_they_began():
     np.testing.assert_allclose(begun, t[list(starts)], atol=0.02)
 
 
+@pytest.mark.long
 def test_an_analysis_says_so_and_designs_for_single_samples():
     rng = np.random.default_rng(9)
     t = np.linspace(0.0, 1000.0, 30_000)
@@ -159,6 +162,7 @@ def test_an_analysis_says_so_and_designs_for_single_samples():
     assert found.added_delay == pytest.approx(0.5 * 0.0333)
 
 
+@pytest.mark.long
 def test_what_a_first_order_leaves_of_means_is_not_taken_for_jitter():
     # It leaves a thousandth of the range, which means of three samples do not hide.
     rng = np.random.default_rng(2)

@@ -69,6 +69,7 @@ def _identified(noise: float):
     return identify_waveform(run.record(noise_std=noise, rng=np.random.default_rng(0)))
 
 
+@pytest.mark.long
 def test_the_ensemble_has_the_spread_of_the_uncertainty():
     found = _identified(0.1)
     models = ensemble(found, 2000, rng=np.random.default_rng(1))
@@ -84,6 +85,7 @@ def test_the_ensemble_has_the_spread_of_the_uncertainty():
     assert models == again
 
 
+@pytest.mark.long
 def test_gains_carry_the_robustness_of_the_uncertain_model():
     sharp, vague = _identified(0.001), _identified(0.15)
     for found in (sharp, vague):
@@ -97,6 +99,7 @@ def test_gains_carry_the_robustness_of_the_uncertain_model():
             assert gains.ms_95 > 1.02 * gains.ms
 
 
+@pytest.mark.long
 def test_gains_for_a_model_that_is_hardly_known_are_refused():
     found = _identified(0.05)
     wild = tuple(TransferFunction.fopdt(1.65, 20.0, d) for d in np.linspace(5.0, 60.0, 50))

@@ -82,6 +82,7 @@ def _pair(w0: float, zeta: float) -> tuple[complex, complex]:
     return (zeta + root) / w0, (zeta - root) / w0
 
 
+@pytest.mark.long
 @given(
     tau=st.floats(0.05, 50.0),
     order=st.integers(1, 6),
@@ -111,6 +112,7 @@ def _away_from_zero(least: float, most: float) -> st.SearchStrategy[float]:
     return st.floats(least, most) | st.floats(-most, -least)
 
 
+@pytest.mark.long
 @given(
     zeros=st.lists(_away_from_zero(0.2, 3.0), max_size=1),
     constants=st.lists(_away_from_zero(0.2, 5.0), min_size=2, max_size=3),

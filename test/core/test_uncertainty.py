@@ -87,6 +87,7 @@ def test_what_has_no_covariance_has_no_interval():
     assert math.isnan(answer.low)
 
 
+@pytest.mark.long
 def test_a_profile_ends_where_the_sum_of_squares_has_risen_by_the_quantile():
     rng = np.random.default_rng(3)
     u = PiecewiseConstant(np.array([1.0, 9.0, 16.0]), np.array([1.0, -1.0, 1.0]), 0.0)
@@ -134,6 +135,7 @@ def test_a_determined_model_needs_no_combinations():
     assert found.advice == ()
 
 
+@pytest.mark.long
 def test_rivals_carry_what_an_ensemble_draws_from_and_widen_the_ultimate_point():
     model = TransferFunction.lag_n(1.0, 6.0, 8, 0.6)
     relay = RelaySettings(0.0, 0.0, 1.0)
@@ -172,6 +174,7 @@ def test_a_robust_loss_withstands_outliers_that_squares_do_not(loss):
     assert any(loss in w for w in robust.warnings)
 
 
+@pytest.mark.long
 def test_a_robust_loss_loses_five_percent_on_normal_noise():
     record = _record((1.65, 20.0, 10.0), 0.1)
     plain = identify(record, "waveform", GIVEN)

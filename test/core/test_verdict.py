@@ -69,6 +69,7 @@ def test_rows_have_names_of_their_own_and_a_limit():
     assert all(min(c.doubtful, c.failed) < math.inf for c in CHECKS)
 
 
+@pytest.mark.long
 def test_a_running_experiment_is_not_judged():
     assert model_so_far(completed().record).verdict is Verdict.UNKNOWN
 

@@ -221,6 +221,7 @@ def test_the_error_of_the_steady_state_is_one_of_the_gain():
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
 
 
+@pytest.mark.long
 def test_noise_that_makes_a_lag_look_like_an_integrator_leaves_the_ultimate_point():
     # The amplitude is 0.1 % below that of an integrator, and the noise of the peaks is larger.
     model, relay = TransferFunction.fopdt(1.0, 1.0, 0.1), RelaySettings(0.0, 0.0, 1.0, 0.0, 0.0)

@@ -34,6 +34,7 @@ def _run(gain: float, tau: float, dead: float, bias: float = 0.0, samples: int =
     return simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, samples))
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=25)
 @given(
     gain=st.floats(0.1, 10.0) | st.floats(-10.0, -0.1),
@@ -117,6 +118,7 @@ def test_the_intervals_cover_the_truth():
     assert min(inside) > 0.873
 
 
+@pytest.mark.long
 def test_a_relay_that_sees_the_noise_at_its_samples():
     model = TransferFunction.fopdt(1.65, 20.0, 10.0)
     relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.3)
@@ -137,12 +139,14 @@ def _staircase(seed: int = 0) -> tuple[np.ndarray, np.ndarray, Record]:
     return time, y, Record(time, y, u(time), held_input=u)
 
 
+@pytest.mark.long
 def test_any_held_input_and_irregular_samples_will_do():
     _, _, record = _staircase()
     found = identify_waveform(record)
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-9)
 
 
+@pytest.mark.long
 def test_a_step_test():
     time = np.linspace(0.0, 60.0, 300)
     u = PiecewiseConstant(np.array([5.0]), np.array([2.0]), 0.0)
@@ -151,6 +155,7 @@ def test_a_step_test():
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-9)
 
 
+@pytest.mark.long
 def test_a_drift_is_estimated_and_said():
     time, y, record = _staircase()
     rng = np.random.default_rng(1)
@@ -160,6 +165,7 @@ def test_a_drift_is_estimated_and_said():
     assert any("drift" in w for w in found.warnings)
 
 
+@pytest.mark.long
 def test_a_start_away_from_rest_is_estimated():
     time, y, record = _staircase()
     moving = y + 3.0 * np.exp(-(time - time[0]) / 6.0)
@@ -183,6 +189,7 @@ def test_a_record_cut_out_of_an_oscillation(start):
     assert found.values == pytest.approx([1.65, 20.0, 10.0], rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_second_input_shows_in_the_residual_and_is_said():
     time, y, record = _staircase()
     other = PiecewiseConstant(np.array([40.0, 130.0]), np.array([1.0, 0.0]), 0.0)
@@ -201,6 +208,7 @@ def test_a_gain_that_the_data_do_not_tell_is_named():
     assert abs(found.ultimate_gain_std / found.ultimate_gain) < 0.05
 
 
+@pytest.mark.long
 def test_whether_a_slow_process_integrates_is_said_to_be_open():
     found = identify_waveform(_noisy(_run(1.0, 1.0, 0.02), 0.2, 3))
     assert found.structure == "ipdt"
@@ -302,6 +310,7 @@ def test_clean_records_have_no_outliers():
         assert not any("left out" in w for w in found.warnings)
 
 
+@pytest.mark.long
 def test_a_record_that_begins_in_a_movement_and_ends_as_its_command_does():
     # What is left once the movement is over holds no change of the command that a sample follows,
     # so that the model is that of the whole record.
