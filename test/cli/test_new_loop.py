@@ -28,6 +28,7 @@ from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.controller_parameters import PARAMETERS
 from relay_autotune.nodes.live_types import FLOAT64
+from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict
@@ -376,3 +377,16 @@ def test_after_the_process_was_driven_away_the_same_command_is_not_offered_again
     ((name, told),) = repeated(result, given, parser, None, outside)
     assert name == next_step
     assert ("1040" in told) == (next_step == "run it again")
+
+
+@pytest.mark.parametrize(
+    ("other", "passes"),
+    [("/t/tune_loop", True), ("/pid", False), ("/pid and /t/tune_loop", False)],
+)
+def test_a_publisher_of_its_own_that_has_ended_is_no_reason_to_give_up(other, passes):
+    reason = f"/u is also published by {other}: two of them would fight for the actuator"
+    client: Any = SimpleNamespace(
+        succeeded=False, result=Tune.Result(reason=reason),
+        _node=SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop"),
+    )  # fmt: skip
+    assert TuneClient.not_ready_yet.fget(client) is passes
