@@ -14,17 +14,22 @@ import pytest
 
 from relay_autotune.cli import apply_gains
 from relay_autotune.cli.apply_gains import beside, found_lines, verdict_lines
+from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import TuningError
+from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune.web.live import APPLY, VERIFY, Wish
 from relay_autotune_msgs.action import Verify
-from relay_autotune_msgs.msg import Verification
+from relay_autotune_msgs.msg import PidGains, Verification
 
 MODEL = TransferFunction.fopdt(1.65, 1.0, 0.5)
 GAINS = design(DesignTask(model=MODEL, options=DesignOptions()), "imc")
+MESSAGE = PidGains()
+fill_gains(MESSAGE, GAINS, experiment_id="x")
 
 
 def step(**values: Any) -> Any:
@@ -122,6 +127,21 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     assert "a step of the set-point by 2 y" in told.out
     assert "from -1.5 to 2 y" in told.err
     assert not asked and not answers
+
+
+def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> None:
+    changed: list[Any] = []
+    controller: Any = SimpleNamespace(
+        in_force=lambda: Controller(0.1, 3.0), allowed_steps=lambda gains: StepRange(-1.5, 2.0),
+        put_in_force=changed.append, prove=lambda *words: changed.append(words),
+    )  # fmt: skip
+    live: Any = SimpleNamespace(tell=lambda **told: None, show=lambda *shown: None)
+    page = GainsPage(Any, live, Any, 0, lambda: False)  # type: ignore[arg-type]
+    page._message = lambda wish: (MESSAGE, 1.0)  # type: ignore[method-assign]
+    for what in (VERIFY, APPLY):
+        with pytest.raises(TuningError, match=r"is -1.6 y, expected from -1.5 to 2 y"):
+            page._do(Wish(what, step=-1.6), controller)
+    assert not changed
 
 
 def test_a_command_line_that_does_not_fit_ends_with_two() -> None:
