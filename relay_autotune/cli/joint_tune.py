@@ -37,7 +37,9 @@ _FLOATS = "std_msgs/msg/Float64MultiArray"
 _PROOF = 0.05
 # Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
 _OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
-_OF_TOPICS = ("command", "command_field", "command_period", "verify", "step")
+_OF_TOPICS = (
+    "command", "command_field", "command_period", "verify", "step", "law", "sample_period",
+)  # fmt: skip
 
 
 def add_joint(parser: argparse.ArgumentParser) -> None:

@@ -93,6 +93,8 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(own)
     if options.amplitude < 0.0 or options.wait < 0.0:
         parser.error("--amplitude and --wait are at least 0")
+    if options.sample_period is not None and options.sample_period <= 0.0:
+        parser.error(f"--sample-period is {options.sample_period:g}, expected more than 0 s")
     if options.web and (options.dry_run or options.json or options.report or options.export):
         parser.error(
             "--web has check, result, report and exports on its page: leave out --dry-run, "

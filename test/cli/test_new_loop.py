@@ -23,6 +23,7 @@ from relay_autotune.cli import proof, report, tune_loop
 from relay_autotune.cli.after_tune import hand_over, left, left_its_limits, prefix, repeated
 from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.cli.export import EXPORTS
+from relay_autotune.cli.joint_tune import is_of_joint
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
@@ -108,6 +109,15 @@ def test_the_law_of_another_program_is_designed_for() -> None:
     given.law, given.sample_period = "simple_pid", 0.1
     words = nodes_for(Looker(), given)._nodes["identifier_node"]
     assert {"law:=simple_pid", "sample_period:=0.1"} < set(words)
+
+
+def test_a_law_that_cannot_be_designed_for_is_refused_at_once() -> None:
+    for words in (["--sample-period", "0"], ["--law", "simplepid"]):
+        with pytest.raises(SystemExit):
+            tune_loop.main(words)
+    words = ["--controller", "wheel_controller", "--joint", "left_wheel", "--law", "px4_rate"]
+    with pytest.raises(SelectionError, match="--law is for a loop of two topics"):
+        is_of_joint(tune_loop._parser().parse_args(words))
 
 
 def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -> None:
