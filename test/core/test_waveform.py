@@ -17,6 +17,7 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.plausibility import latest_dead_time
 from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
@@ -324,3 +325,32 @@ def test_a_record_that_begins_in_a_movement_and_ends_as_its_command_does():
     found = identify_waveform(Record(time=time, measurement=measurement, command=command))
     assert len(found.fitted) == 400
     assert found.fit.residual_rms < 0.1
+
+
+@given(
+    dead_time=st.floats(0.0, 60.0),
+    tau=st.floats(1.0, 100.0),
+    drift=st.floats(-0.02, 0.02),
+    seed=st.integers(0, 100),
+)
+@settings(max_examples=60, deadline=None)
+def test_neither_noise_nor_drift_counts_as_a_first_response(dead_time, tau, drift, seed):
+    time = np.arange(0.0, 400.0)
+    step = PiecewiseConstant(np.array([100.0]), np.ones(1), 0.0)
+    y = response(TransferFunction.fopdt(1.0, tau, dead_time), time, step)
+    y += drift * time + 0.02 * np.random.default_rng(seed).standard_normal(time.size)
+    assert latest_dead_time(time, y, step, 1) >= 2.0 * dead_time
+
+
+def test_a_dead_time_that_hides_the_first_response_is_no_explanation():
+    """Steps of one length, unequal in their effect, look like each other one step later."""
+    time = np.arange(0.0, 4900.0, 4.0)
+    edges = 700.0 * np.arange(1.0, 7.0)
+    effects = np.cumsum([2.0, 7.0, 0.5, 10.0, 8.0, 2.0])
+    felt = PiecewiseConstant(edges, effects, 0.0)
+    process = TransferFunction.fopdt(1.0, 40.0, 6.0)
+    noise = 0.1 * np.random.default_rng(3).standard_normal(time.size)
+    command = PiecewiseConstant(edges, np.arange(1.0, 7.0), 0.0)(time)
+    found = identify_waveform(Record(time, response(process, time, felt) + noise, command))
+    assert found.model.dead_time < 20.0
+    assert 20.0 < sum(abs(t) for t in found.model.time_constants) < 80.0

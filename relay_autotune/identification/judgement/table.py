@@ -20,6 +20,7 @@ from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Eviden
 from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.identification.result import NOT_AT_REST
+from relay_autotune.identification.waveform.plausibility import latest_dead_time
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.text import digits, process_text
@@ -57,6 +58,15 @@ def _open_dead_time(evidence: Evidence) -> Measured | None:
     if math.isnan(high):
         return None
     return Measured(float(high) / evidence.record.duration)
+
+
+def _first_response(evidence: Evidence) -> Measured | None:
+    record, model = evidence.record, evidence.found.model
+    # In a relay test a load may come before the response, and the cycles show the dead time.
+    if record.settings is not None:
+        return None
+    latest = latest_dead_time(record.time, record.measurement, record.drive(), model.process_sign)
+    return Measured(model.dead_time / latest) if math.isfinite(latest) else None
 
 
 def _resolution(evidence: Evidence) -> Measured | None:
@@ -234,6 +244,19 @@ MODEL_CHECKS = (
         sentence="the record fits a dead time of any length, so that no gain is known to be safe",
         remedy="record a relay test, or a step that stands clear of the noise",
         measure=_open_dead_time,
+    ),
+    Check(
+        name="first_response",
+        title="First response",
+        what="dead time of the model over twice the time from the first change of the command to "
+        "the first visible response",
+        unit="",
+        doubtful=1.0,
+        failed=3.0,
+        sentence="the measurement moves before the model does: its dead time is {value} times the "
+        "longest that the first visible response allows",
+        remedy="use the method waveform, or name the dead time",
+        measure=_first_response,
     ),
     Check(
         name="resolution",

@@ -28,6 +28,7 @@ from relay_autotune.identification.waveform.starts import (
     changes_within,
     coarse,
     go_on,
+    latest_of,
     least_promised,
     refine_all,
     refine_best,
@@ -166,6 +167,9 @@ class Ground:
         shortest, _ = time_scales(self.problem)
         time = self.problem.time
         if is_unseen(model, shortest, float(time[-1] - time[0])):
+            return None
+        # In a relay test a load may come before the response, and the cycles show the dead time.
+        if not self.sign and model.dead_time > latest_of(self.problem, model.process_sign):
             return None
         criterion = information_criterion(
             state.cost, problem.time.size, state.parameters, self.floor

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.waveform.plausibility import latest_dead_time
 from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
@@ -92,6 +93,18 @@ def time_scales(problem: Problem) -> tuple[float, float]:
             rest = min(1.1 * float(np.max(np.diff(inside))), rest)
         scales.append((shortest, rest))
     return min(s for s, _ in scales), min(longest for _, longest in scales)
+
+
+def latest_of(problem: Problem, sign: int) -> float:
+    """Return the longest dead time that the experiments of a problem allow together [s].
+
+    :param problem: the problem.
+    :param sign: of the process.
+    """
+    return min(
+        latest_dead_time(problem.time[part], problem.y[part], u, sign)
+        for part, u in zip(problem.experiments, problem.inputs, strict=True)
+    )
 
 
 def coarse(problem: Problem) -> Problem:
@@ -183,6 +196,17 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
     dead_times = longest * np.array(_SHARES)
     costs = np.array([_costs(few, tau, dead_times, sign) for tau in taus])
+    latest = (math.inf, math.inf) if sign else tuple(latest_of(problem, s) for s in (-1, 1))
+    if min(latest) < math.inf:
+        # The first response tells which dead times a gain of either sign may have.
+        costs = np.minimum(
+            *(
+                np.where(
+                    dead_times <= end, [_costs(few, tau, dead_times, s) for tau in taus], math.inf
+                )
+                for s, end in zip((-1, 1), latest, strict=True)
+            )
+        )
     best: list[FloatArray] = []
     for flat in np.argsort(costs, axis=None, kind="stable"):
         i, j = np.unravel_index(flat, costs.shape)
