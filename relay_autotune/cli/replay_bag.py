@@ -107,7 +107,10 @@ def replay(
         return _failed(job, said, why, NOTHING_FOUND), ()
     status = status_of(analyses)
     if status == NOTHING_FOUND:
-        said += [f"{job.name}: nothing identified: {a.reason}" for a in analyses]
+        # A model that a check contradicts is shown, with the reason why there are no gains.
+        said += [
+            f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}" for a in analyses
+        ]
     return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
 
 
