@@ -1,11 +1,13 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-r"""The three forms of a PID controller, and the exact conversions between them.
+r"""The three forms of a PID controller, and the exact conversions to the series form and back.
 
 All computations use the ISA form; the others are the parallel and the series form:
 
     kc (1 + 1/(ti s) + td s),    p + i/s + d s,    kc (1 + 1/(ti s)) (1 + td s).
+
+The gains of the parallel form are those of :class:`~relay_autotune.loop.gains.Controller`.
 
 Only the numbers differ: the filter on the measurement, of time constant tf, is the same factor in
 all three. Luyben (2003, eq 11) writes the filter of the series form as ``1/(alpha td s + 1)``,
@@ -26,42 +28,6 @@ from relay_autotune.process.transfer_function import TransferFunction
 FORMS = ("isa", "parallel", "series")
 
 _ROUNDING = 1e-12
-
-
-@dataclass(frozen=True)
-class ParallelForm:
-    """Gains of the parallel form, ``p + i/s + d s``.
-
-    :param p: proportional gain [u/y].
-    :param i: integral gain [u/(y s)]; 0: no integral action.
-    :param d: derivative gain [u s/y]; 0: no derivative action.
-    :param tf: time constant of the filter on the measurement [s].
-    """
-
-    p: float
-    i: float
-    d: float = 0.0
-    tf: float = 0.0
-
-    def isa(self, b: float = 1.0) -> Controller:
-        """Return the same controller in ISA form.
-
-        :param b: weight of the set-point.
-        :raises TuningError: if there is no proportional gain, or the gains differ in sign: the
-            ISA form has positive times only.
-        """
-        if self.p == 0.0 or not all(math.isfinite(g) for g in (self.p, self.i, self.d)):
-            raise TuningError(
-                "the ISA form needs a proportional gain other than zero and finite gains, found "
-                f"p = {self.p:g}, i = {self.i:g}, d = {self.d:g}"
-            )
-        if self.i * self.p < 0.0 or self.d * self.p < 0.0:
-            raise TuningError(
-                "the ISA form needs gains of one sign, since its times are positive; found "
-                f"p = {self.p:g}, i = {self.i:g}, d = {self.d:g}"
-            )
-        ti = self.p / self.i if self.i != 0.0 else 0.0
-        return Controller(self.p, ti, self.d / self.p, self.tf, b)
 
 
 @dataclass(frozen=True)
@@ -101,11 +67,6 @@ class SeriesForm:
         if self.ti == 0.0:
             return TransferFunction(self.kc, (self.td,), lag)
         return TransferFunction(self.kc / self.ti, (self.ti, self.td), lag, 1)
-
-
-def parallel_form(controller: Controller) -> ParallelForm:
-    """Return a controller in parallel form: ``p = kc``, ``i = kc/ti``, ``d = kc td``."""
-    return ParallelForm(controller.p, controller.i, controller.d, controller.tf)
 
 
 def series_form(controller: Controller) -> SeriesForm:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.tuning.forms import ParallelForm, SeriesForm, parallel_form, series_form
+from relay_autotune.tuning.forms import SeriesForm, series_form
 
 S = 1j * np.geomspace(1e-3, 1e3, 25)
 
@@ -35,13 +35,10 @@ def test_series_there_and_back(kc, ti, td, alpha):
 
 
 @given(kc=sizes | st.floats(-1e3, -1e-3), ti=sizes, td=sizes, tf=sizes)
-def test_parallel_there_and_back(kc, ti, td, tf):
+def test_the_gains_of_the_parallel_form(kc, ti, td, tf):
     isa = Controller(kc, ti, td, tf)
-    parallel = parallel_form(isa)
-    law = parallel.p + parallel.i / S + parallel.d * S
+    law = isa.p + isa.i / S + isa.d * S
     np.testing.assert_allclose(isa.transfer_function()(S), law * filtered(tf), rtol=1e-6)
-    back = parallel.isa()
-    assert vars(back) == pytest.approx(vars(isa), rel=1e-12)
 
 
 def test_eq_11_as_luyben_wrote_it():
@@ -56,8 +53,7 @@ def test_actions_that_are_not_there_stay_away():
     assert series_form(Controller(2.0, 4.0)) == SeriesForm(2.0, 4.0, 0.0, 0.0)
     assert series_form(Controller(2.0, 0.0, 0.5, 0.05)) == SeriesForm(2.0, 0.0, 0.5, 0.1)
     assert SeriesForm(2.0, 0.0, 0.5).isa() == Controller(2.0, 0.0, 0.5, 0.05)
-    assert ParallelForm(2.0, 0.0).isa() == Controller(2.0, 0.0)
-    assert parallel_form(Controller(2.0, 0.0)) == ParallelForm(2.0, 0.0)
+    assert Controller(2.0, 0.0).i == 0.0
 
 
 def test_double_zeros_still_have_a_series_form():
@@ -75,17 +71,3 @@ def test_double_zeros_still_have_a_series_form():
 def test_no_series_form(gains, message):
     with pytest.raises(TuningError, match=message):
         series_form(gains)
-
-
-@pytest.mark.parametrize(
-    ("gains", "message"),
-    [
-        (ParallelForm(0.0, 1.0), "proportional gain"),
-        (ParallelForm(1.0, -1.0), "one sign"),
-        (ParallelForm(1.0, 1.0, -1.0), "one sign"),
-        (ParallelForm(float("nan"), 1.0), "finite"),
-    ],
-)
-def test_no_isa_form(gains, message):
-    with pytest.raises(TuningError, match=message):
-        gains.isa()
