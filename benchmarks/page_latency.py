@@ -162,7 +162,8 @@ def main() -> int:
     if options.quick:
         options.moves, options.seconds, options.minutes = 4, 2.0, 0.5
     rows: list[tuple[str, np.ndarray]] = []
-    with tempfile.TemporaryDirectory() as folder, Chromium(Path(folder)) as browser:
+    profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    with profile as folder, Chromium(Path(folder)) as browser:
         for ahead in (False, True):
             subject = subject_of(analysed())
             first = replace(subject.first, controller="pid", ms=1.2)

@@ -131,7 +131,8 @@ async def read(url: str, count: int) -> None:
 @contextlib.contextmanager
 def drawn_by(url: str, count: int, before: Sequence[str] = ()) -> Iterator[int]:
     """Let windows of a browser draw what comes."""
-    with tempfile.TemporaryDirectory() as folder, Chromium(Path(folder), before) as browser:
+    profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    with profile as folder, Chromium(Path(folder), before) as browser:
         for _ in range(count):
             browser.tab(url).wait("document.body.dataset.phase === 'idle'")
         yield browser.pid
