@@ -253,6 +253,9 @@ def test_a_response_that_turns_only_after_the_record_is_unseen():
     )
     assert is_unseen(model, 1.0, 390.0)
     assert not is_unseen(model, 1.0, 420.0)
+    # A command that never stays so long on one side does not show it either.
+    assert is_unseen(model, 1.0, 4000.0, pushed=390.0)
+    assert not is_unseen(model, 1.0, 4000.0, pushed=420.0)
     inverse = TransferFunction(2.0, dead_time=1.0, zeros=(-3.0,), time_constants=(10.0, 4.0))
     assert not is_unseen(inverse, 0.1, 100.0)
 

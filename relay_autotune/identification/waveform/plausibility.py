@@ -29,18 +29,22 @@ _RESTING, _RESTS = 15, (1.0, 0.5, 0.25)
 _BELIEVED = 2.0
 
 
-def is_unseen(model: TransferFunction, interval: float, length: float) -> bool:
+def is_unseen(
+    model: TransferFunction, interval: float, length: float, pushed: float = math.inf
+) -> bool:
     """Return whether a fit owes its small residual to what happens between the samples.
 
     It rings faster than the samples show: noise alone leads to such a resonance, of any height,
     and it would limit every gain. Or its whole response falls between two samples, or comes from
     an unreasonable zero: so a controller responds, where command and measurement were swapped. Or
-    its response turns into the direction of its gain only after the record's end: what the record
-    shows is the other direction, and the rest is a drift.
+    its response turns into the direction of its gain later than any push of the command lasted:
+    what the record shows is the other direction, and the rest is a drift.
 
     :param model: the fit.
     :param interval: between samples [s].
     :param length: of the record [s].
+    :param pushed: longest time for which the command acted in one direction [s]; the record's
+        length where it is longer.
     """
     swing = _SAMPLES_A_SWING * interval / (2.0 * math.pi)
     if any(c.imag != 0.0 and abs(c) < swing for c in model.time_constants):
@@ -53,7 +57,21 @@ def is_unseen(model: TransferFunction, interval: float, length: float) -> bool:
     if not (model.is_stable or model.integrators) or all(zero.real >= 0.0 for zero in model.zeros):
         return False
     step = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
-    return float(response(model, np.array([length]), step)[0]) * model.process_sign <= 0.0
+    return (
+        float(response(model, np.array([min(pushed, length)]), step)[0]) * model.process_sign
+        <= 0.0
+    )
+
+
+def longest_push(time: FloatArray, u: Input) -> float:
+    """Return the longest time for which a command stayed on one side of its mean [s].
+
+    :param time: of the samples [s], shape (n,).
+    :param u: the command.
+    """
+    level = u(time)
+    turns = np.flatnonzero(np.diff(level > level.mean())) + 1
+    return float(np.diff(time[np.concatenate(([0], turns, [time.size - 1]))]).max())
 
 
 def latest_dead_time(time: FloatArray, y: FloatArray, u: Input, sign: int) -> float:

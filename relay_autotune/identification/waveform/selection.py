@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.plausibility import is_unseen
+from relay_autotune.identification.waveform.plausibility import is_unseen, longest_push
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
     Problem,
@@ -151,6 +151,14 @@ class Ground:
         return begin(problem, self.starts.unstable(problem))
 
     @cached_property
+    def pushed(self) -> float:
+        """Longest time for which the command acted in one direction [s]; infinite for a relay."""
+        if self.sign:
+            return math.inf
+        parts = zip(self.problem.experiments, self.problem.inputs, strict=True)
+        return max(longest_push(self.problem.time[part], u) for part, u in parts)
+
+    @cached_property
     def rested(self) -> bool:
         """Whether the samples show that the process was at rest before."""
         return needs_no_past(self.problem, self.sign)
@@ -166,7 +174,7 @@ class Ground:
             return None
         shortest, _ = time_scales(self.problem)
         time = self.problem.time
-        if is_unseen(model, shortest, float(time[-1] - time[0])):
+        if is_unseen(model, shortest, float(time[-1] - time[0]), self.pushed):
             return None
         # In a relay test a load may come before the response, and the cycles show the dead time.
         if not self.sign and model.dead_time > latest_of(self.problem, model.process_sign):
