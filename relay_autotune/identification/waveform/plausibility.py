@@ -68,7 +68,10 @@ def longest_push(time: FloatArray, u: Input) -> float:
 
     :param time: of the samples [s], shape (n,).
     :param u: the command.
+    :return: infinite for ramps, whose response turns gradually.
     """
+    if not isinstance(u, PiecewiseConstant):
+        return math.inf
     level = u(time)
     turns = np.flatnonzero(np.diff(level > level.mean())) + 1
     return float(np.diff(time[np.concatenate(([0], turns, [time.size - 1]))]).max())
