@@ -30,6 +30,7 @@ from relay_autotune.identification.waveform.selection import (
     begins_at_rest,
     needs_no_past,
     nuisances_of,
+    of_shown_direction,
 )
 from relay_autotune.identification.waveform.separable import Problem, Trial, refine
 from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
@@ -221,7 +222,8 @@ def _compared(
     once = _in_its_own(simulated, asked)
     slow = slow_colour(1.0 - _SLOWEST / problem.time.size)
     ends = [_converged(once, asked), _converged(_in(slow, simulated, asked), asked)]
-    return _ordered(min(ends, key=_joint))
+    chosen = min(ends, key=_joint)
+    return _ordered(chosen if sign or names else of_shown_direction(chosen))
 
 
 def _of_all(ground: Ground, problem: Problem) -> Ground:

@@ -41,6 +41,7 @@ from relay_autotune.identification.waveform.selection import (
     choose,
     fit_all,
     fit_one,
+    of_shown_direction,
 )
 from relay_autotune.identification.waveform.separable import (
     Problem,
@@ -171,7 +172,7 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
     part = problem.thinned(_MOST_FOR_CHOICE)
     ground = Ground.of(part, part.time.size * NEGLIGIBLE**2, sign)
     candidates = _candidates(ground, known)
-    rest = candidates
+    rest = candidates if sign or known.structure else of_shown_direction(candidates)
     while rest:
         picked = choose(rest)
         chosen = ground.with_nuisances(picked)

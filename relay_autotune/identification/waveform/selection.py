@@ -494,6 +494,33 @@ def _is_driven(problem: Problem) -> bool:
     )
 
 
+def of_shown_direction(found: list[Candidate]) -> list[Candidate]:
+    """Leave out the candidates whose gain has another sign than what explains nearly all.
+
+    A zero and an integrator beside a drift follow a slow disturbance between a few steps, with a
+    gain of either sign. Where a FOPDT explains nearly all, its direction is that of the process.
+
+    :param found: in any order.
+    """
+    plain = next((c for c in found if c.structure == FOPDT), None)
+    if plain is None or _unexplained(plain) > _NEARLY_ALL:
+        return found
+    return [c for c in found if c.model.process_sign == plain.model.process_sign]
+
+
+def _unexplained(candidate: Candidate) -> float:
+    """Return the share of the sum of squares beside drift and the like that a model leaves."""
+    problem, own = candidate.problem, len(candidate.structure.powers)
+    columns, _ = problem.columns(candidate.state.theta)
+    both, beside = (
+        problem.y - np.linalg.lstsq(rows.T, problem.y, rcond=None)[0] @ rows
+        for rows in (columns, columns[own:])
+    )
+    return float(both @ both) / max(float(beside @ beside), 1e-300)
+
+
+# Largest share that a model leaves unexplained which shows the direction of the process.
+_NEARLY_ALL = 0.1
 _INDIFFERENT = 2.0
 # Largest rms residual of an exact structure, and of one that is good enough, as shares of the
 # measurement's range.
