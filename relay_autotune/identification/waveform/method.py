@@ -47,6 +47,7 @@ from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
     information_criterion,
+    left_of,
     problem_of,
     refine,
 )
@@ -349,7 +350,7 @@ def _responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
     nuisance = state.columns[len(problem.structure.powers) :]
     y = problem.seen(problem.y)
-    left = y - np.linalg.lstsq(nuisance.T, y, rcond=None)[0] @ nuisance
+    left = left_of(y, nuisance)
     without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
     return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
 

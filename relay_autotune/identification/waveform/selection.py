@@ -20,6 +20,7 @@ from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
     information_criterion,
+    left_of,
     refine,
 )
 from relay_autotune.identification.waveform.starts import (
@@ -28,7 +29,7 @@ from relay_autotune.identification.waveform.starts import (
     changes_within,
     coarse,
     go_on,
-    latest_of,
+    latest_dead_times,
     least_promised,
     refine_all,
     refine_best,
@@ -151,6 +152,11 @@ class Ground:
         return begin(problem, self.starts.unstable(problem))
 
     @cached_property
+    def latest(self) -> tuple[float, float]:
+        """Longest dead time of a gain below zero, and of one above [s]."""
+        return latest_dead_times(self.problem, self.sign)
+
+    @cached_property
     def pushed(self) -> float:
         """Longest time for which the command acted in one direction [s]; infinite for a relay."""
         if self.sign:
@@ -170,14 +176,11 @@ class Ground:
         if model is None and structure == THREE_LAGS:
             problem = replace(problem, structure=LAG_COMPLEX)
             model = LAG_COMPLEX.model_at(state.theta, state.coefficients)
-        if model is None or (self.sign and model.process_sign != self.sign):
+        if model is None or model.dead_time > self.latest[model.process_sign > 0]:
             return None
         shortest, _ = time_scales(self.problem)
         time = self.problem.time
         if is_unseen(model, shortest, float(time[-1] - time[0]), self.pushed):
-            return None
-        # In a relay test a load may come before the response, and the cycles show the dead time.
-        if not self.sign and model.dead_time > latest_of(self.problem, model.process_sign):
             return None
         criterion = information_criterion(
             state.cost, problem.time.size, state.parameters, self.floor
@@ -512,11 +515,8 @@ def _unexplained(candidate: Candidate) -> float:
     """Return the share of the sum of squares beside drift and the like that a model leaves."""
     problem, own = candidate.problem, len(candidate.structure.powers)
     columns, _ = problem.columns(candidate.state.theta)
-    both, beside = (
-        problem.y - np.linalg.lstsq(rows.T, problem.y, rcond=None)[0] @ rows
-        for rows in (columns, columns[own:])
-    )
-    return float(both @ both) / max(float(beside @ beside), 1e-300)
+    left, response = (left_of(problem.y, rows) for rows in (columns, columns[own:]))
+    return float(left @ left) / max(float(response @ response), 1e-300)
 
 
 # Largest share that a model leaves unexplained which shows the direction of the process.

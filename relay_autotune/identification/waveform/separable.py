@@ -257,6 +257,15 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
     return Trial(theta, coefficients, residual, cost, q, derivative, columns)
 
 
+def left_of(y: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return what the best combination of some rows leaves of a measurement, shape (n,).
+
+    :param y: shape (n,).
+    :param rows: such as offset and drift, shape (k, n).
+    """
+    return np.asarray(y - np.linalg.lstsq(rows.T, y, rcond=None)[0] @ rows)
+
+
 def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
     """Solve ``r c = right`` for an upper triangle r of a few columns, each of length one.
 

@@ -95,16 +95,24 @@ def time_scales(problem: Problem) -> tuple[float, float]:
     return min(s for s, _ in scales), min(longest for _, longest in scales)
 
 
-def latest_of(problem: Problem, sign: int) -> float:
-    """Return the longest dead time that the experiments of a problem allow together [s].
+def latest_dead_times(problem: Problem, sign: int) -> tuple[float, float]:
+    """Return the longest dead time of a gain below zero, and of one above [s].
+
+    In a relay test a load may come before the response, and the cycles show the dead time: there
+    only the direction is known.
 
     :param problem: the problem.
-    :param sign: of the process.
+    :param sign: the direction in which a relay worked, 1 or -1; 0: not known.
+    :return: minus infinity for the direction that the relay rules out.
     """
-    return min(
-        latest_dead_time(problem.time[part], problem.y[part], u, sign)
-        for part, u in zip(problem.experiments, problem.inputs, strict=True)
+    if sign:
+        return (-math.inf, math.inf) if sign > 0 else (math.inf, -math.inf)
+    parts = list(zip(problem.experiments, problem.inputs, strict=True))
+    below, above = (
+        min(latest_dead_time(problem.time[part], problem.y[part], u, s) for part, u in parts)
+        for s in (-1, 1)
     )
+    return below, above
 
 
 def coarse(problem: Problem) -> Problem:
@@ -195,18 +203,8 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     few = coarse(problem)
     taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
     dead_times = longest * np.array(_SHARES)
-    costs = np.array([_costs(few, tau, dead_times, sign) for tau in taus])
-    latest = (math.inf, math.inf) if sign else tuple(latest_of(problem, s) for s in (-1, 1))
-    if min(latest) < math.inf:
-        # The first response tells which dead times a gain of either sign may have.
-        costs = np.minimum(
-            *(
-                np.where(
-                    dead_times <= end, [_costs(few, tau, dead_times, s) for tau in taus], math.inf
-                )
-                for s, end in zip((-1, 1), latest, strict=True)
-            )
-        )
+    latest = latest_dead_times(problem, sign)
+    costs = np.array([_costs(few, tau, dead_times, latest) for tau in taus])
     best: list[FloatArray] = []
     for flat in np.argsort(costs, axis=None, kind="stable"):
         i, j = np.unravel_index(flat, costs.shape)
@@ -222,11 +220,13 @@ def _apart(a: FloatArray, b: FloatArray) -> bool:
     return abs(a[0] - b[0]) > 0.5 or abs(math.log(a[1] / b[1])) > 0.5
 
 
-def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> FloatArray:
+def _costs(
+    problem: Problem, tau: float, dead_times: FloatArray, latest: tuple[float, float]
+) -> FloatArray:
     """Return the sums of squares that a lag and an offset leave, for each dead time.
 
     Half a period later, a limit cycle of the other sign looks much the same: a lag of the wrong
-    sign counts as no explanation.
+    sign counts as no explanation, as does one that begins after the first response.
     """
     theta = np.array((math.log(tau), 0.0))
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
@@ -247,7 +247,8 @@ def _costs(problem: Problem, tau: float, dead_times: FloatArray, sign: int) -> F
         along += np.einsum("dn,dn->d", table, y)
         total += np.einsum("dn,dn->d", y, y)
     power[power == 0.0] = 1.0
-    return np.asarray(total - np.where(sign * along < 0.0, 0.0, along**2 / power))
+    refused = dead_times > np.where(along < 0.0, *latest)
+    return np.asarray(total - np.where(refused, 0.0, along**2 / power))
 
 
 def _table(
