@@ -6,12 +6,35 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import itertools
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
 
 from relay_autotune.cli.arguments import DONE, finite, guarded
 from relay_autotune.cli.layout import labelled, width
+from relay_autotune.errors import ParameterError, SelectionError, look_up
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods.atv import atv_from_numbers
+from relay_autotune.identification.methods.chang import chang_from_numbers
+from relay_autotune.identification.methods.li import li_from_numbers
+from relay_autotune.identification.methods.luyben import identify_step_numbers
+from relay_autotune.identification.methods.thyagarajan_method import identify_numbers
+from relay_autotune.identification.methods.wang import (
+    FopdtCycle,
+    fopdt_from_biased,
+    fopdt_with_gain,
+)
+from relay_autotune.identification.result import Identification, identified
+from relay_autotune.identification.shown.shape import Shape
+from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.process.structures import FOPDT
 
 PROGRAM = "identify"
 
@@ -23,6 +46,279 @@ Examples:
   identify --method wang_biased --period-high 15.4 --period-low 20.4 \\
            --peak-max 0.5 --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
 """
+
+ANY, POSITIVE, NOT_NEGATIVE, NOT_ZERO = "", "> 0", ">= 0", "not 0"
+
+
+@dataclass(frozen=True)
+class ChartNumber:
+    """A number that the command line may give.
+
+    :param unit: its unit.
+    :param meaning: what it is, for the help.
+    :param range: one of ``ANY``, ``POSITIVE``, ``NOT_NEGATIVE``, ``NOT_ZERO``.
+    """
+
+    unit: str
+    meaning: str
+    range: str = ANY
+
+
+NUMBERS: dict[str, ChartNumber] = {
+    "period": ChartNumber("s", "period of the limit cycle", POSITIVE),
+    "period_high": ChartNumber("s", "time that the command stays high", POSITIVE),
+    "period_low": ChartNumber("s", "time that the command stays low", POSITIVE),
+    "amplitude": ChartNumber("y", "half of peak to peak of the measurement", POSITIVE),
+    "peak_max": ChartNumber("y", "highest measurement, from its steady state"),
+    "peak_min": ChartNumber("y", "lowest measurement, from its steady state"),
+    "relay": ChartNumber("u", "amplitude of the relay, half the distance of its levels", POSITIVE),
+    "bias": ChartNumber("u", "middle of the relay's levels, from the steady state"),
+    "hysteresis": ChartNumber(
+        "y", "half width of the switching band, 0 if not given", NOT_NEGATIVE
+    ),
+    "gain": ChartNumber("y/u", "static gain of the process", NOT_ZERO),
+    "dead_time": ChartNumber("s", "dead time of the process", NOT_NEGATIVE),
+    "extra_delay": ChartNumber("s", "dead time added to the relay, in the second test", POSITIVE),
+    "period_2": ChartNumber("s", "period in the second test", POSITIVE),
+    "amplitude_2": ChartNumber("y", "half of peak to peak in the second test", POSITIVE),
+    "relay_2": ChartNumber("u", "amplitude of the relay in the second test, if another", POSITIVE),
+    "mean_measurement": ChartNumber("y", "mean over whole cycles, from the steady state"),
+    "mean_command": ChartNumber("u", "mean over whole cycles, from the steady state"),
+    "time_to_peak": ChartNumber("s", "from a switch to the peak after it", POSITIVE),
+    "rise": ChartNumber(
+        "s", "from the steady state to the peak, if not the time from the switch", POSITIVE
+    ),
+    "time_half": ChartNumber("s", "from the steady state to half of the peak", POSITIVE),
+    "step": ChartNumber("u", "height of a step of the command", NOT_ZERO),
+    "t1": ChartNumber("s", "from the end of the dead time to the extremum", POSITIVE),
+    "t2": ChartNumber("s", "from the end of the dead time to the return", POSITIVE),
+    "extremum": ChartNumber(
+        "y", "minimum or maximum after a step, from the steady state", NOT_ZERO
+    ),
+}
+
+
+# Each method is a function of the numbers that it takes, by their names in NUMBERS; those without
+# a default it needs. One that takes `known` can be given a structure and an order.
+
+
+def _of_cycle(
+    from_numbers: Callable[[SymmetricCycle, Known], Identification],
+) -> Callable[..., Identification]:
+    """Return the function of the numbers for a method that takes the cycle of one test."""
+
+    def identify(
+        known: Known,
+        *,
+        period: float,
+        amplitude: float,
+        relay: float,
+        dead_time: float,
+        gain: float = math.nan,
+        hysteresis: float = 0.0,
+    ) -> Identification:
+        cycle = SymmetricCycle(period, amplitude, relay, hysteresis, dead_time)
+        return from_numbers(cycle, replace(known, gain=gain, dead_time=dead_time))
+
+    return identify
+
+
+def _li(
+    known: Known,
+    *,
+    period: float,
+    amplitude: float,
+    relay: float,
+    period_2: float,
+    amplitude_2: float,
+    extra_delay: float,
+    dead_time: float = math.nan,
+    hysteresis: float = 0.0,
+    relay_2: float = math.nan,
+) -> Identification:
+    second_relay = relay if math.isnan(relay_2) else relay_2
+    first = SymmetricCycle(period, amplitude, relay, hysteresis, 0.0)
+    second = SymmetricCycle(period_2, amplitude_2, second_relay, hysteresis, extra_delay)
+    return li_from_numbers((first, second), replace(known, dead_time=dead_time))
+
+
+def _thyagarajan(
+    known: Known,
+    *,
+    period: float,
+    amplitude: float,
+    relay: float,
+    time_to_peak: float = math.nan,
+    time_half: float = math.nan,
+    rise: float = math.nan,
+    hysteresis: float = 0.0,
+    dead_time: float = math.nan,
+) -> Identification:
+    shape = Shape(
+        half_period=0.5 * period,
+        amplitude=amplitude,
+        level=hysteresis,
+        time_to_peak=time_to_peak,
+        rise=time_to_peak if math.isnan(rise) else rise,
+        rise_half=time_half,
+        sharpness=math.nan,
+        plateau=math.nan,
+    )
+    lags = known.order > 1 or known.structure == "lag_n"
+    if all(map(math.isnan, (time_half, time_to_peak, dead_time))) and not lags:
+        raise SelectionError(
+            "thyagarajan also needs --time-to-peak for a curve with sharp edges, with --time-half "
+            "for one that is almost rectangular, or --structure lag_n: with --order 2 for one "
+            "that took many cycles to grow, with --order 5 for one that did not"
+        )
+    if not math.isnan(time_half) and math.isnan(shape.rise):
+        raise SelectionError("--time-half also needs --time-to-peak")
+    # The time to half of the peak is used only for almost rectangular curves.
+    category = "1a" if math.isnan(time_half) else "1b"
+    return identify_numbers(shape, relay, replace(known, dead_time=dead_time), category)
+
+
+def _wang_biased(
+    *,
+    period_high: float,
+    period_low: float,
+    peak_max: float,
+    peak_min: float,
+    relay: float,
+    bias: float,
+    hysteresis: float = 0.0,
+    gain: float = math.nan,
+    mean_measurement: float = math.nan,
+    mean_command: float = math.nan,
+) -> Identification:
+    """Apply eqs 6 to 11 of Wang, Hang and Zou (1997)."""
+    if math.isnan(gain):
+        if math.isnan(mean_measurement) or math.isnan(mean_command):
+            raise SelectionError(
+                "wang_biased also needs --gain, or --mean-measurement and --mean-command"
+            )
+        if mean_command == 0.0:
+            raise SelectionError(
+                "--mean-command must not be 0: the gain is the ratio of the means (eq 6)"
+            )
+        gain = mean_measurement / mean_command
+    # With the sign of the command inverted, a reverse-acting process has a positive gain.
+    sign = -1 if gain < 0.0 else 1
+    high, low = (period_high, period_low)[::sign]
+    cycle = FopdtCycle(high, low, peak_max, peak_min)
+    k, tau, dead_time = fopdt_from_biased(cycle, abs(gain), relay, sign * bias, hysteresis)
+    return _fopdt("wang_biased", sign * k, tau, dead_time)
+
+
+def _wang_unbiased(
+    *, period: float, amplitude: float, relay: float, gain: float, hysteresis: float = 0.0
+) -> Identification:
+    """Apply eqs 21 and 22 of Wang, Hang and Zou (1997)."""
+    k, tau, dead_time = fopdt_with_gain(abs(gain), period, amplitude, relay, hysteresis)
+    return _fopdt("wang_unbiased", math.copysign(k, gain), tau, dead_time)
+
+
+def _fopdt(method: str, gain: float, time_constant: float, dead_time: float) -> Identification:
+    return identified(method, Estimate.of(FOPDT, np.array((gain, time_constant, dead_time))))
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A method with the numbers that it takes.
+
+    :param summary: what it does, for the help.
+    :param identify: returns a model.
+    """
+
+    summary: str
+    identify: Callable[..., Identification]
+
+    @cached_property
+    def _numbers(self) -> dict[str, inspect.Parameter]:
+        found = inspect.signature(self.identify).parameters
+        return {name: each for name, each in found.items() if name != "known"}
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """Names of the numbers that it can use, first those that it needs."""
+        return tuple(self._numbers)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Names of the numbers that it needs."""
+        found = self._numbers.items()
+        return tuple(name for name, each in found if each.default is inspect.Parameter.empty)
+
+    @property
+    def takes_structure(self) -> bool:
+        """Whether it can be given a structure and an order."""
+        return "known" in inspect.signature(self.identify).parameters
+
+
+CHART_METHODS: dict[str, Chart] = {
+    "wang_biased": Chart("FOPDT from a biased relay (Wang, Hang and Zou 1997)", _wang_biased),
+    "wang_unbiased": Chart(
+        "FOPDT from an unbiased relay (Wang, Hang and Zou 1997)", _wang_unbiased
+    ),
+    "chang": Chart(
+        "lags, exactly in time, from an unbiased relay (Chang, Shen and Yu 1992)",
+        _of_cycle(chang_from_numbers),
+    ),
+    "atv": Chart(
+        "lags by the describing function, from an unbiased relay (Luyben 1987)",
+        _of_cycle(atv_from_numbers),
+    ),
+    "li": Chart(
+        "lags with their gain from two tests, one with a dead time added (Li et al. 1991)", _li
+    ),
+    "thyagarajan": Chart(
+        "structure by the shape, from an unbiased relay (Thyagarajan and Yu 2003)", _thyagarajan
+    ),
+    "luyben_step": Chart(
+        "integrator with inverse response, from a step (Luyben 2003)", identify_step_numbers
+    ),
+    "wang": Chart("the same as wang_biased", _wang_biased),
+}
+
+
+def option(name: str) -> str:
+    """Return the command-line option of a number."""
+    return "--" + name.replace("_", "-")
+
+
+def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> Identification:
+    """Identify a model from numbers.
+
+    :param method: one of ``CHART_METHODS``.
+    :param numbers: those that were given, by name.
+    :param known: structure and order, where they are known.
+    :raises SelectionError: if the method is unknown, or a number is missing, out of its range, or
+        not used by the method.
+    :raises IdentificationError: if no model has these numbers.
+    """
+    chart = look_up(CHART_METHODS, method, "method", SelectionError)
+    if lacking := [option(n) for n in chart.required if n not in numbers]:
+        raise SelectionError(f"{method} also needs {', '.join(lacking)}")
+    if unused := [option(n) for n in numbers if n not in chart.takes]:
+        takes = ", ".join(map(option, chart.takes))
+        raise SelectionError(f"{method} does not use {', '.join(unused)}; it takes {takes}")
+    if (known.structure or known.order) and not chart.takes_structure:
+        raise SelectionError(f"{method} does not use --structure and --order")
+    for name, value in numbers.items():
+        _require_range(name, value)
+    return chart.identify(*([known] if chart.takes_structure else []), **numbers)
+
+
+def _require_range(name: str, value: float) -> None:
+    wanted = NUMBERS[name].range
+    good = {
+        ANY: True,
+        POSITIVE: value > 0.0,
+        NOT_NEGATIVE: value >= 0.0,
+        NOT_ZERO: value != 0.0,
+    }[wanted]
+    if not good or not math.isfinite(value):
+        raise SelectionError(f"{option(name)} must be finite and {wanted}, found {value:g}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,26 +345,16 @@ def _joined(arguments: list[str]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from relay_autotune.cli.chart import CHART_METHODS, NUMBERS, option
-
-    methods = "\n".join(
-        line
-        for name, chart in CHART_METHODS.items()
-        for label, text in (
-            (name, chart.summary),
-            (
-                "",
-                "   ".join(
-                    [*map(option, chart.required), *(f"[{option(n)}]" for n in chart.optional)]
-                ),
-            ),
-        )
-        for line in labelled(label, text, width(), indent=17)
-    )
+    methods: list[str] = []
+    for name, chart in CHART_METHODS.items():
+        needed = chart.required
+        numbers = [option(n) if n in needed else f"[{option(n)}]" for n in chart.takes]
+        methods += labelled(name, chart.summary, width(), indent=17)
+        methods += labelled("", "   ".join(numbers), width(), indent=17)
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description="Identify a process from the numbers of a limit cycle, without a record.",
-        epilog=f"methods and their numbers:\n{methods}\n\n{_EPILOG}",
+        epilog="\n".join(["methods and their numbers:", *methods, "", _EPILOG]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--method", required=True, metavar="NAME", help="how to identify")
@@ -86,12 +372,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from relay_autotune.cli.chart import NUMBERS, identify_chart
     from relay_autotune.cli.table import identification_lines
-    from relay_autotune.errors import ParameterError, SelectionError
     from relay_autotune.exchange.document import to_json
     from relay_autotune.exchange.fields import to_document
-    from relay_autotune.identification.known import Known
 
     numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
     try:

@@ -14,7 +14,7 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.cli import identify
-from relay_autotune.cli.chart import CHART_METHODS, NUMBERS, option
+from relay_autotune.cli.identify import CHART_METHODS, NUMBERS, option
 from relay_autotune.identification.methods import METHODS
 
 EXAMPLE = "--period 33.271862630047444 --amplitude 0.025968976458966186 --relay 0.04"
@@ -153,8 +153,8 @@ def test_the_help_names_every_method_and_number():
 
 def test_every_number_is_known_and_used():
     for chart in CHART_METHODS.values():
-        assert set(chart.required + chart.optional) <= NUMBERS.keys()
-    used = {n for chart in CHART_METHODS.values() for n in chart.required + chart.optional}
+        assert set(chart.takes) <= NUMBERS.keys()
+    used = {n for chart in CHART_METHODS.values() for n in chart.takes}
     assert used == NUMBERS.keys()
 
 
