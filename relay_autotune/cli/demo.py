@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 import os
 import shutil
-import signal
-import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
+from relay_autotune.cli.new_loop import ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.models import model_fields
@@ -29,6 +30,9 @@ from relay_autotune.quantities import NORMAL_95
 from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import case_of
 from relay_autotune.text import digits, process_text
+
+if TYPE_CHECKING:
+    from relay_autotune.nodes.loop_client import LoopClient
 
 TRUTH = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PERIOD = 0.1
@@ -41,17 +45,11 @@ SPEED = 40.0
 PAGE_TITLE = "Relay test of a simulated process"
 
 _DEADLINE = 50.0
+_LOOK_EVERY = 0.1
 
 
 class DemoError(RelayAutotuneError):
     """The demo could not continue."""
-
-
-@dataclass(frozen=True)
-class _Started:
-    name: str
-    process: subprocess.Popen[bytes]
-    log: Path
 
 
 def main() -> int:
@@ -67,8 +65,6 @@ def main() -> int:
         # The logs are only needed after an error.
         for left in (output / "records", output / "log"):
             shutil.rmtree(left, ignore_errors=True)
-        for log in output.glob("*.log"):
-            log.unlink()
         return _finish(output, seen)
     except (RelayAutotuneError, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
@@ -79,12 +75,12 @@ def main() -> int:
 
 
 def _run(output: Path, domain: int) -> tuple[Path, Any]:
-    environment = os.environ | {
+    # The nodes have the same environment.
+    os.environ |= {
         "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(output / "log"),
     }
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     plant = {
         "mode": "lockstep",
         "sample_period": PERIOD,
@@ -109,84 +105,70 @@ def _run(output: Path, domain: int) -> tuple[Path, Any]:
     print(f"  {process_text(TRUTH)}, noise {NOISE_STD} y, sampled every {PERIOD} s, in lockstep")
     print(f"  at {SPEED:g} times real time")
     print("Three processes in a ROS domain of their own:")
-    started: list[_Started] = []
-    try:
+    with OwnNodes() as nodes:
         for name, parameters in (
             ("plant_node", plant),
             ("relay_node", relay),
             ("identifier_node", {}),
         ):
-            started.append(_start(name, parameters, environment, output))
-            print(f"  {name}, process {started[-1].process.pid}")
-        return _watch(started, output, domain)
-    finally:
-        _end(started)
+            process = nodes.start(name, ros_arguments("", values=parameters))
+            print(f"  {name}, process {process}", flush=True)
+        return _watch(nodes, output)
 
 
-def _start(
-    name: str, parameters: dict[str, Any], environment: dict[str, str], output: Path
-) -> _Started:
-    executable = shutil.which(name)
-    if executable is None:
-        raise DemoError(f"{name} is not on the PATH: run `. ./env.sh`, or `make demo`")
-    arguments = [part for key, value in parameters.items() for part in ("-p", f"{key}:={value}")]
-    log = output / f"{name}.log"
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [executable, "--ros-args", *arguments],
-            env=environment,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    return _Started(name, process, log)
-
-
-def _end(started: list[_Started]) -> None:
-    for each in started:
-        if each.process.poll() is None:
-            each.process.send_signal(signal.SIGINT)
-    for each in started:
-        try:
-            each.process.wait(6.0)
-        except subprocess.TimeoutExpired:
-            each.process.kill()
-            each.process.wait()
-
-
-def _watch(started: list[_Started], output: Path, domain: int) -> tuple[Path, Any]:
+def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
     # ROS is looked for only when the demo runs, so that its errors are one line.
-    from relay_autotune.cli.onlooker import Onlooker
+    from relay_autotune.nodes.loop_client import LoopClient
+    from relay_autotune_msgs.srv import StartTune
 
     deadline = time.monotonic() + _DEADLINE
+    with LoopClient("onlooker", "", "relay_node") as client:
 
-    def alive() -> None:
-        for each in started:
-            if each.process.poll() is not None:
-                raise DemoError(f"{each.name} ended by itself; its log is {each.log}")
-        if time.monotonic() > deadline:
-            raise DemoError(f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}")
+        def wait(condition: Callable[[], object]) -> None:
+            while not client.wait(lambda: bool(condition()), _LOOK_EVERY):
+                nodes.require_alive()
+                if time.monotonic() > deadline:
+                    raise DemoError(
+                        f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}"
+                    )
 
-    with Onlooker(domain, alive) as onlooker:
-        answer = onlooker.start_tune()
+        seen = _Seen(client)
+        start = f"{client.name}/start_tune"
+        while not (answer := client.call(StartTune, start, StartTune.Request())).accepted:
+            # The nodes may not have discovered each other yet.
+            wait(lambda: True)
+            client.rest(_LOOK_EVERY)
         print("One service call, relay_node/start_tune:")
-        print(f"  accepted: experiment {answer.experiment_id}")
-        _show_cycles(onlooker)
-        onlooker.wait(lambda: onlooker.gains)
-        bag = output / "records" / answer.experiment_id
-        relay_log = next(each.log for each in started if each.name == "relay_node")
-        onlooker.wait(lambda: "is closed" in relay_log.read_text(errors="replace"))
-        return bag, onlooker.gains[-1]
+        print(f"  accepted: experiment {answer.experiment_id}", flush=True)
+        _show_cycles(seen, wait)
+        wait(lambda: seen.gains)
+        wait(lambda: "is closed" in nodes.log())
+        return output / "records" / answer.experiment_id, seen.gains[-1]
 
 
-def _show_cycles(onlooker: Any) -> None:
+class _Seen:
+    """What a tune publishes.
+
+    :param client: of the relay_node.
+    """
+
+    def __init__(self, client: LoopClient) -> None:
+        from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
+
+        self.cycles: list[Any] = client.hearing(RelayCycle, "relay_cycle")
+        self.experiments: list[Any] = client.hearing(RelayExperiment, "relay_experiment")
+        self.models: list[Any] = client.hearing(TransferFunction, "transfer_function")
+        self.gains: list[Any] = client.hearing(PidGains, "pi_gains")
+
+
+def _show_cycles(seen: _Seen, wait: Callable[[Callable[[], object]], None]) -> None:
     print("  cycle   period s   high s   low s   peaks y           K_u so far")
     shown: list[Any] = []
-    while not onlooker.experiments or len(shown) < len(onlooker.cycles):
-        onlooker.wait(lambda: onlooker.experiments or len(onlooker.cycles) > len(shown))
-        for cycle in onlooker.cycles[len(shown) :]:
-            _wait_for_fit(onlooker, cycle)
-            fits = [m for m in onlooker.models if not m.final]
+    while not seen.experiments or len(shown) < len(seen.cycles):
+        wait(lambda: seen.experiments or len(seen.cycles) > len(shown))
+        for cycle in seen.cycles[len(shown) :]:
+            wait(partial(_is_fitted, seen, cycle))
+            fits = [m for m in seen.models if not m.final]
             so_far = f"{fits[-1].ultimate_gain:.3f}" if fits else ""
             if fits and math.isfinite(fits[-1].ultimate_gain_std):
                 so_far += f" ± {NORMAL_95 * fits[-1].ultimate_gain_std:.3f}"
@@ -197,20 +179,17 @@ def _show_cycles(onlooker: Any) -> None:
                 f"{so_far}{settled}"
             )
             shown.append(cycle)
-    end = onlooker.experiments[-1]
+    end = seen.experiments[-1]
     print(f"  {end.reason}")
 
 
-def _wait_for_fit(onlooker: Any, cycle: Any) -> None:
-    """Wait for a model that knows a cycle, or for the next cycle, or the end."""
-    begin = _seconds(cycle.header.stamp)
-    end = begin + cycle.time[-1]
-    onlooker.wait(
-        lambda: (
-            onlooker.experiments
-            or onlooker.cycles[-1].index > cycle.index
-            or any(_seconds(m.header.stamp) >= end - PERIOD for m in onlooker.models)
-        )
+def _is_fitted(seen: _Seen, cycle: Any) -> bool:
+    """Tell whether a model knows a cycle, or the next cycle or the end has come."""
+    end = _seconds(cycle.header.stamp) + cycle.time[-1]
+    return (
+        bool(seen.experiments)
+        or seen.cycles[-1].index > cycle.index
+        or any(_seconds(m.header.stamp) >= end - PERIOD for m in seen.models)
     )
 
 

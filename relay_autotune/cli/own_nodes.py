@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import LoopError
@@ -30,10 +32,10 @@ class OwnNodes:
     `relay_node` sends the safe command.
 
     :param nodes: the arguments for ROS of each node, by the name of its executable, in the order
-        in which they end.
+        in which they end; more of them can be started later.
     """
 
-    def __init__(self, nodes: Mapping[str, Sequence[str]]) -> None:
+    def __init__(self, nodes: Mapping[str, Sequence[str]] = MappingProxyType({})) -> None:
         self._nodes = nodes
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  it is closed at the end of the block
@@ -43,8 +45,8 @@ class OwnNodes:
             self.start(name, arguments)
         return self
 
-    def start(self, name: str, arguments: Sequence[str]) -> None:
-        """Start one node more.
+    def start(self, name: str, arguments: Sequence[str]) -> int:
+        """Start one node more, and return the id of its process.
 
         :param name: of its executable.
         :param arguments: its arguments for ROS.
@@ -60,6 +62,13 @@ class OwnNodes:
             start_new_session=True,
             preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
         )
+        return self._running[name].pid
+
+    def log(self) -> str:
+        """Return what the nodes have logged."""
+        file = self._log.fileno()
+        # A plain read would move the place at which the nodes write.
+        return os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace")
 
     def arguments(self, name: str) -> Sequence[str]:
         """Return the arguments for ROS with which a node was started.
@@ -84,8 +93,7 @@ class OwnNodes:
         """
         for name, process in self._running.items():
             if process.poll() is not None:
-                self._log.seek(0)
-                lines = self._log.read().decode(errors="replace").strip().splitlines()
+                lines = self.log().strip().splitlines()
                 raise LoopError(f"{name} has ended: {lines[-1] if lines else 'without a word'}")
 
     def __exit__(self, *_: object) -> None:

@@ -35,6 +35,8 @@ from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
 _LISTEN = 1.0
 # How long a node may take to answer [s].
 ANSWER_WITHIN = 10.0
+# Messages of a latched topic from before the subscription that are taken.
+_MOST_HEARD = 100
 # Interval in which a message is published until it has arrived [s].
 _AGAIN = 0.2
 
@@ -103,6 +105,18 @@ class LoopClient:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def hearing(self, kind: Any, topic: str) -> list[Any]:
+        """Return a list that gets all messages of a latched topic, until this client ends.
+
+        :param kind: the message class.
+        :param topic: its unresolved name.
+        """
+        came: list[Any] = []
+        self._node.create_subscription(
+            kind, self._resolved(topic), came.append, quality.latched(_MOST_HEARD)
+        )
+        return came
 
     def latched(
         self, kind: Any, topic: str, wanted: Callable[[Any], bool], patience: float

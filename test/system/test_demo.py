@@ -48,23 +48,3 @@ def test_the_demo_tunes_and_leaves_bag_result_and_picture(tmp_path: Path) -> Non
     assert len(read_experiments(output / "bag").experiments) == 1
     assert (output / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert (output / "report.html").read_text().startswith("<!DOCTYPE html>")
-
-
-def test_a_demo_without_executables_says_so(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "relay_autotune.cli.demo"],
-        cwd=tmp_path,
-        env={**_environment(), "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 1
-    assert done.stderr.startswith("demo: plant_node is not on the PATH")
-    assert len(done.stderr.splitlines()) == 1
-
-
-def _environment() -> dict[str, str]:
-    import os
-
-    return dict(os.environ)
