@@ -31,7 +31,8 @@ import numpy as np
 from made_recordings import seeds
 from markdown import table, three
 
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import RelayAutotuneError
 
 COUNT, QUICK_COUNT = 20_000, 60

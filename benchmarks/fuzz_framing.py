@@ -28,7 +28,8 @@ import zstandard
 from fuzz_bags import Trial, run
 from made_recordings import seeds
 
-from relay_autotune.bag.reader import Recording, Selection, read_experiments
+from relay_autotune.bag.reader import Recording, read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import RelayAutotuneError
 
 T = TypeVar("T")

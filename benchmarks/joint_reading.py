@@ -26,8 +26,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from relay_autotune.bag.definitions import find_definition
-from relay_autotune.bag.foreign import Choice, named_pair
 from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.pairing import named_pair
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.topics import Topics
 
 JOINTS = tuple(f"arm_joint_{k}" for k in range(7))
@@ -86,7 +87,7 @@ def of(names: Sequence[str], truth: float) -> Callable[[Topics], None]:
 
 def found(topics: Topics) -> None:
     """Find measurement and command of one joint."""
-    named_pair(topics, Choice(JOINTS[3], "/joint_states:velocity", order=JOINTS))
+    named_pair(topics, Selection("/joint_states:velocity", joint=JOINTS[3], joint_order=JOINTS))
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.bag.signals import TIME_UNITS, Signal
+from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
 from relay_autotune.errors import BagError, SelectionError
@@ -67,25 +67,6 @@ _JUMP, _MOVING = 0.05, 0.2
 
 
 @dataclass(frozen=True)
-class Columns:
-    """Which columns of a text are wanted, and what it does not say of its times.
-
-    :param measurement: name of the column of the measurement, with or without its unit; None:
-        found, if there are two columns beside the time.
-    :param command: name of the column of the command; None: found.
-    :param time: name of the column of the time; None: the first that is named so, else the first.
-    :param time_unit: unit of the time, one of :data:`TIME_UNITS`; None: as the file says, else s.
-    :param period: time from row to row [s] of a file without times; None: it has them.
-    """
-
-    measurement: str | None = None
-    command: str | None = None
-    time: str | None = None
-    time_unit: str | None = None
-    period: float | None = None
-
-
-@dataclass(frozen=True)
 class Log:
     """The columns read from a file.
 
@@ -101,7 +82,7 @@ class Log:
     notes: tuple[str, ...] = ()
 
 
-def read_csv(path: Path, wanted: Columns | None = None) -> tuple[Log, ...]:
+def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     """Return measurement and command of each recording in a text with columns.
 
     Times are rounded to a nanosecond, as those of a bag are, so that a file and the bag made
@@ -110,11 +91,10 @@ def read_csv(path: Path, wanted: Columns | None = None) -> tuple[Log, ...]:
 
     :param path: the file; the line above its numbers names the columns, else they are called 1,
         2, 3.
-    :param wanted: the columns; default: all are found.
+    :param wanted: the columns, and what the file does not say of its times.
     :raises SelectionError: if a column is not named, or not there.
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
-    wanted = wanted or Columns()
     try:
         with open_regular(path) as file:
             table = TextTable(path, file)
@@ -288,7 +268,7 @@ def _longest_gap(time_ns: IntArray) -> int:
     return int(np.diff(time_ns).max()) if time_ns.size > 1 else 0
 
 
-def _choose(path: Path, names: Sequence[str], wanted: Columns) -> tuple[int | None, list[int]]:
+def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | None, list[int]]:
     """Return the places of the time, None without one, and of measurement and command."""
     given = (wanted.measurement, wanted.command)
     pair = [_named(path, names, name) for name in given if name is not None]

@@ -12,14 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from relay_autotune.bag.pairing import (
-    Choice,
     Pair,
     characterise,
     has_joints,
     named_pair,
     plausible_pairs,
 )
-from relay_autotune.bag.signals import Signal, join, preceded
+from relay_autotune.bag.signals import Selection, Signal, join, preceded
 from relay_autotune.bag.topics import Topics, split_name
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.excitation import find_experiments
@@ -32,33 +31,19 @@ _FEWEST_SAMPLES = 12
 _CLOCK_DIFFERENCE_NS = 100_000_000
 
 
-def experiments_of_pair(
-    topics: Topics,
-    measurement: str | None,
-    command: str | None,
-    *,
-    joint: str = "",
-    joint_order: tuple[str, ...] = (),
-    whole: bool = False,
-    before: float | None = None,
-) -> tuple[list[Record], list[str]]:
+def experiments_of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
     """Return the experiments in two topics, and notes about them.
 
     :param topics: the bag.
-    :param measurement: ``TOPIC[:FIELD]`` of the measurement; None: found.
-    :param command: that of the command; None: found.
-    :param joint: name of the joint that both are of; empty: none is named.
-    :param joint_order: the joints in the order of commands that do not name them.
-    :param whole: whether they are one experiment, whatever they look like.
-    :param before: command that held before the recording; None: its first one.
+    :param wanted: the topics, as far as they are named, or the joint that they are of; a part
+        that is named is one experiment, whatever it looks like.
     :raises SelectionError: if the names do not fit, or more than one pair does.
     :raises BagError: if nothing stands out of the noise.
     """
     first: list[str] = []
-    if joint:
-        measurement, command, why = named_pair(
-            topics, Choice(joint, measurement, command, joint_order)
-        )
+    measurement, command = wanted.measurement, wanted.command
+    if wanted.joint:
+        measurement, command, why = named_pair(topics, wanted)
         flags = " ".join(
             f"--{role} {shlex.quote(name)}"
             for role, name in (("measurement", measurement), ("command", command))
@@ -81,7 +66,8 @@ def experiments_of_pair(
             f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
             f"they are aligned by the recorder's clock"
         )
-    records, found = take_apart(join(signals[0], preceded(signals[1], before)), whole=whole)
+    record = join(signals[0], preceded(signals[1], wanted.command_before))
+    records, found = take_apart(record, whole=wanted.is_part)
     return records, [*notes, *found]
 
 

@@ -27,7 +27,7 @@ from relay_autotune.bag.field_path import (
     written,
 )
 from relay_autotune.bag.schema import numeric_paths
-from relay_autotune.bag.signals import Signal
+from relay_autotune.bag.signals import Selection, Signal
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import FieldError, SelectionError
 from relay_autotune.text import visible
@@ -176,23 +176,6 @@ _LISTED = 20
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Where measurement and command of a joint are.
-
-    :param joint: its name.
-    :param measurement: ``TOPIC[:FIELD]`` of the measurement as the user gave it, with or without
-        the element; None: found.
-    :param command: likewise of the command.
-    :param order: the joints in the order of commands that do not name them; (): not known.
-    """
-
-    joint: str
-    measurement: str | None = None
-    command: str | None = None
-    order: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class _Candidate:
     topic: str
     path: str
@@ -220,18 +203,18 @@ def has_joints(topics: Topics) -> bool:
     return any(kind.rpartition("/")[2] in _STATES for kind in topics.types().values())
 
 
-def named_pair(topics: Topics, choice: Choice) -> tuple[str, str, str]:
+def named_pair(topics: Topics, wanted: Selection) -> tuple[str, str, str]:
     """Return ``TOPIC:FIELD`` of a joint's measurement and command, and the reason.
 
     :param topics: the bag.
-    :param choice: the joint, and what the user chose.
+    :param wanted: the joint, and what the user chose.
     :raises SelectionError: if they are not there, or not the only ones.
     """
-    found, joints = _candidates(topics, choice)
+    found, joints = _candidates(topics, wanted)
     if not any(c.steps or not c.path for c in found):
-        raise _nowhere(topics, choice.joint, joints)
-    measured = _of_role(found, "measurement", choice.measurement)
-    commanded = _of_role(found, "command", choice.command)
+        raise _nowhere(topics, wanted.joint, joints)
+    measured = _of_role(found, "measurement", wanted.measurement)
+    commanded = _of_role(found, "command", wanted.command)
     read = {c.name for c in (*measured, *commanded) if c.role != "named"}
     signals = topics.signals(read)
     still = {
@@ -245,31 +228,33 @@ def named_pair(topics: Topics, choice: Choice) -> tuple[str, str, str]:
     if len(measured) > 1 and len(commanded) == 1:
         measured = _of_quantity(measured, commanded[0])
     if len(measured) != 1 or len(commanded) != 1:
-        raise _unclear(topics, choice, measured, commanded)
+        raise _unclear(topics, wanted, measured, commanded)
     (y,), (u,) = measured, commanded
-    why = f"both name {choice.joint}" if u.steps else f"{y.name} names {choice.joint}"
-    if u.path and not u.steps and not choice.order and choice.command is None:
-        _require_most_moved(topics, choice.joint, y, u, joints)
+    why = f"both name {wanted.joint}" if u.steps else f"{y.name} names {wanted.joint}"
+    if u.path and not u.steps and not wanted.joint_order and wanted.command is None:
+        _require_most_moved(topics, wanted.joint, y, u, joints)
         why += f", which moves most, and {u.path} alone changes"
-    elif choice.order and not u.steps:
+    elif wanted.joint_order and not u.steps:
         why += f", and --joint-order puts it at {u.path}"
     return y.name, u.name, why
 
 
-def _candidates(topics: Topics, choice: Choice) -> tuple[list[_Candidate], dict[str, list[str]]]:
+def _candidates(
+    topics: Topics, wanted: Selection
+) -> tuple[list[_Candidate], dict[str, list[str]]]:
     """Return what may belong to a joint, and the joints that each topic names."""
     found: list[_Candidate] = []
     joints: dict[str, list[str]] = {}
     for topic, kind in topics.types().items():
         if kind in _ARRAYS:
-            found += _elements(topics, topic, choice)
+            found += _elements(topics, topic, wanted)
         elif _NAMING.search(topics.definition_of(topic)):
-            for candidate, names in _by_name(topics, topic, choice.joint):
+            for candidate, names in _by_name(topics, topic, wanted.joint):
                 joints.setdefault(topic, []).extend(n for n in names if n not in joints[topic])
-                if choice.joint in names:
+                if wanted.joint in names:
                     found.append(candidate)
     for topic in topics.single_numbers():
-        if choice.joint in topic:
+        if wanted.joint in topic:
             found.append(_Candidate(topic, "", role_by_name(topic) or ""))
     return found, joints
 
@@ -335,17 +320,17 @@ def _role(topic: str, steps: Sequence[Step]) -> str:
     return "measurement" if role == "measurement" else "command"
 
 
-def _elements(topics: Topics, topic: str, choice: Choice) -> list[_Candidate]:
+def _elements(topics: Topics, topic: str, wanted: Selection) -> list[_Candidate]:
     """Return the elements of an array of commands that may be the joint's."""
     role = role_by_name(topic)
     first = topics.first_messages(topic, 1)
     if not first or role in ("set-point", "measurement"):
         return []
     count = len(first[0].data)
-    if choice.order:
-        if choice.joint not in choice.order or count != len(choice.order):
+    if wanted.joint_order:
+        if wanted.joint not in wanted.joint_order or count != len(wanted.joint_order):
             return []
-        places: Iterable[int] = (choice.order.index(choice.joint),)
+        places: Iterable[int] = (wanted.joint_order.index(wanted.joint),)
     else:
         places = range(count)
     return [_Candidate(topic, f"data[{k}]", "command") for k in places]
@@ -425,9 +410,9 @@ def _nowhere(topics: Topics, joint: str, joints: dict[str, list[str]]) -> Select
 
 
 def _unclear(
-    topics: Topics, choice: Choice, measured: list[_Candidate], commanded: list[_Candidate]
+    topics: Topics, wanted: Selection, measured: list[_Candidate], commanded: list[_Candidate]
 ) -> SelectionError:
-    said = f"{topics.path}: of {choice.joint}"
+    said = f"{topics.path}: of {wanted.joint}"
     for role, found in (("measurement", measured), ("command", commanded)):
         if not found:
             return SelectionError(

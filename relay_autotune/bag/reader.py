@@ -17,9 +17,8 @@ import numpy as np
 
 from relay_autotune.arrays import IntArray
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
-from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.mcap_file import McapFile
-from relay_autotune.bag.signals import CLOCKS, join, preceded, window
+from relay_autotune.bag.signals import Selection, join, preceded, window
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, RecordError, RelayAutotuneError, SelectionError
@@ -52,41 +51,6 @@ class Recording:
     path: Path
     experiments: tuple[Record, ...]
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The part of a recording that is wanted.
-
-    :param measurement: topic or column of the measurement; None: found.
-    :param command: topic or column of the command; None: found.
-    :param time: column of the time in a text; None: found.
-    :param start: beginning of the part to use [s from the first sample]; None: all.
-    :param end: end of the part to use [s from the first sample]; None: all.
-    :param clock: which time of a message counts, one of ``CLOCKS``.
-    :param joint: name of the joint that measurement and command are of; empty: none is named.
-    :param joint_order: the joints in the order of commands that do not name them.
-    :param largest_chunk: size of a chunk, or a message outside of chunks, beyond which it is left
-        out [bytes].
-    """
-
-    measurement: str | None = None
-    command: str | None = None
-    time: str | None = None
-    start: float | None = None
-    end: float | None = None
-    clock: str = CLOCKS[0]
-    largest_chunk: int = LARGEST_CHUNK
-    joint: str = ""
-    joint_order: tuple[str, ...] = ()
-    time_unit: str | None = None
-    period: float | None = None
-    command_before: float | None = None
-
-    @property
-    def is_part(self) -> bool:
-        """Whether a part of the recording is named."""
-        return self.start is not None or self.end is not None
 
 
 def read_experiments(
@@ -225,28 +189,17 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
     # Our own recordings need neither the search for a pair nor that for experiments.
     from relay_autotune.bag.foreign import experiments_of_pair
 
-    return experiments_of_pair(
-        topics,
-        wanted.measurement,
-        wanted.command,
-        joint=wanted.joint,
-        joint_order=wanted.joint_order,
-        whole=wanted.is_part,
-        before=wanted.command_before,
-    )
+    return experiments_of_pair(topics, wanted)
 
 
 def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
-    from relay_autotune.bag.csv_file import Columns, read_csv
+    from relay_autotune.bag.csv_file import read_csv
     from relay_autotune.bag.foreign import take_apart
 
-    columns = Columns(
-        wanted.measurement, wanted.command, wanted.time, wanted.time_unit, wanted.period
-    )
     records: list[Record] = []
     notes: list[str] = []
     faults: list[BagError] = []
-    for log in read_csv(path, columns):
+    for log in read_csv(path, wanted):
         notes += log.notes
         try:
             command = preceded(log.command, wanted.command_before)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.bag.limits import LARGEST_VALUE
+from relay_autotune.bag.limits import LARGEST_CHUNK, LARGEST_VALUE
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.exchange.messages import start_seconds
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -55,6 +55,45 @@ class Column(Generic[T]):
 CLOCKS = ("publish", "log", "header")
 # Units of the times in a file of text.
 TIME_UNITS = ("s", "ms", "us", "min", "h")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of a recording is wanted, and what it does not say of itself.
+
+    :param measurement: topic or column of the measurement; None: found.
+    :param command: topic or column of the command; None: found.
+    :param time: column of the time in a text; None: the first that is named so, else the first.
+    :param start: beginning of the part to use [s from the first sample]; None: all.
+    :param end: end of the part to use [s from the first sample]; None: all.
+    :param clock: which time of a message counts, one of ``CLOCKS``.
+    :param largest_chunk: size of a chunk, or a message outside of chunks, beyond which it is left
+        out [bytes].
+    :param joint: name of the joint that measurement and command are of; empty: none is named.
+        The topics may then leave out the element.
+    :param joint_order: the joints in the order of commands that do not name them; (): not known.
+    :param time_unit: unit of the time in a text, one of ``TIME_UNITS``; None: as it says, else s.
+    :param period: time from row to row of a text without times [s]; None: it has them.
+    :param command_before: the command before the recording begins [u]; None: the first one.
+    """
+
+    measurement: str | None = None
+    command: str | None = None
+    time: str | None = None
+    start: float | None = None
+    end: float | None = None
+    clock: str = CLOCKS[0]
+    largest_chunk: int = LARGEST_CHUNK
+    joint: str = ""
+    joint_order: tuple[str, ...] = ()
+    time_unit: str | None = None
+    period: float | None = None
+    command_before: float | None = None
+
+    @property
+    def is_part(self) -> bool:
+        """Whether a part of the recording is named."""
+        return self.start is not None or self.end is not None
 
 
 @dataclass(frozen=True)

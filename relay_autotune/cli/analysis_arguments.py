@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relay_autotune.bag.limits import LARGEST_CHUNK
-from relay_autotune.bag.reader import Selection
-from relay_autotune.bag.signals import CLOCKS, TIME_UNITS
+from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
 from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import RelayAutotuneError, SelectionError

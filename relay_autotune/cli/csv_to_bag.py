@@ -11,7 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from relay_autotune.bag.csv_file import Columns, read_csv
+from relay_autotune.bag.csv_file import read_csv
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli.analysis_arguments import add_times
 from relay_autotune.cli.arguments import DONE, finite, guarded, say
@@ -62,8 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    wanted = Columns(
-        options.measurement, options.command, options.time, options.time_unit, options.period
+    wanted = Selection(
+        options.measurement,
+        options.command,
+        options.time,
+        time_unit=options.time_unit,
+        period=options.period,
     )
     log, *others = read_csv(options.csv, wanted)
     if others:

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.text import visible

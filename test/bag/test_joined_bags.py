@@ -10,7 +10,8 @@ import pytest
 import zstandard
 from made_bags import write_pair
 
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import SelectionError
 
 ALL = Selection("/measurement", "/command", start=0.0)

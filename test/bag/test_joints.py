@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from robot_bags import Robot, write_robot
 
-from relay_autotune.bag.reader import Recording, Selection, read_experiments
+from relay_autotune.bag.reader import Recording, read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import SelectionError
 
 JOINTS = ["left_wheel", "right_wheel", "arm"]

@@ -27,7 +27,8 @@ from mcap.writer import CompressionType, Writer
 
 from relay_autotune.bag.cdr import DEFAULTS
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.record import Outcome, Record

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import encode_float64
 from relay_autotune.errors import BagError
 

@@ -15,7 +15,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.mcap_file import McapFile
-from relay_autotune.bag.reader import Selection, interrupted_experiment, read_experiments
+from relay_autotune.bag.reader import interrupted_experiment, read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.topics import Topics
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.tuning import design

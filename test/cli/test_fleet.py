@@ -21,7 +21,7 @@ import pytest
 from fleet_work import die_of_bag_3, die_once, mark, wait_for_ever
 from made_bags import REPOSITORY
 
-from relay_autotune.bag.reader import Selection
+from relay_autotune.bag.signals import Selection
 from relay_autotune.cli import fleet, replay
 from relay_autotune.cli.fleet import in_processes, on_cluster
 from relay_autotune.cli.replay_bag import Job

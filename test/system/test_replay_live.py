@@ -19,7 +19,8 @@ from ros_domain import free_domain
 from std_msgs.msg import Float64
 
 from relay_autotune.analysis import Analysis, analyse
-from relay_autotune.bag.reader import Selection, read_experiments
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import Selection
 from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
