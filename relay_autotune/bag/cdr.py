@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.definitions import CYCLE, EXPERIMENT
+from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, first_line, message_type
 from relay_autotune.bag.field_path import Element, Step, reading, written
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
 from relay_autotune.bag.locate import Content, every_byte
@@ -32,8 +32,6 @@ from relay_autotune.bag.schema import (
     Struct,
     Text,
     Type,
-    first_line,
-    message_type,
 )
 from relay_autotune.errors import BagError, FieldError
 from relay_autotune.text import visible

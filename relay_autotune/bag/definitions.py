@@ -1,7 +1,12 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names, definitions and type hashes of messages, as the installed packages have them."""
+"""Definitions of message types: those of the installed packages, and what one in a bag means.
+
+In the encoding ``ros2msg`` each line is a field, ``TYPE NAME [DEFAULT]``, a constant,
+``TYPE NAME=VALUE``, or a comment. The types that the first one depends on follow, each after a
+line of 80 ``=`` and ``MSG: NAME``. The other encoding is IDL.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +15,23 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from relay_autotune.bag.ros2msg import PRIMITIVE
+from relay_autotune.bag.idl import types_from_idl
+from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
+from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.schema import (
+    Fields,
+    Repeated,
+    Struct,
+    Text,
+    Type,
+    number_named,
+)
 from relay_autotune.errors import BagError
+from relay_autotune.text import visible
 
 # Types in the recordings of relay_node.
 EXPERIMENT = "relay_autotune_msgs/msg/RelayExperiment"
@@ -25,7 +41,34 @@ FLOAT64 = "std_msgs/msg/Float64"
 # The metadata record of the file that names the loop's topics.
 EXPERIMENT_METADATA = "relay_autotune"
 
-SEPARATOR = "=" * 80
+# Before each type of a definition but the first, and before each file of one in IDL.
+_SEPARATOR = "=" * 80
+_HEADING = re.compile(rf"^{_SEPARATOR}\nMSG: ([\w/]+)[ \t]*\n", re.MULTILINE)
+_IDL_HEADING = re.compile(rf"^{_SEPARATOR}\nIDL: .*\n", re.MULTILINE)
+# The files that one in IDL includes are all there; the parser knows no directives.
+_IDL_DIRECTIVE = re.compile(r"^\s*#.*$", re.MULTILINE)
+
+_LINE = re.compile(
+    r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[((?:<=)?\d+)?(\]))?[ \t]+([A-Za-z]\w*)(?:[ \t]*(=|#)|[ \t]|$)"
+)
+_PRIMITIVE = re.compile(r"bool|byte|char|float(32|64)|u?int(8|16|32|64)")
+
+# Names of their own, from the time of ROS 1.
+_SHORT = {
+    "time": "builtin_interfaces/msg/Time",
+    "duration": "builtin_interfaces/msg/Duration",
+    "Header": "std_msgs/msg/Header",
+}
+_STAMP = (("sec", number_named("int32")), ("nanosec", number_named("uint32")))
+_TIME = Struct("builtin_interfaces/msg/Time", _STAMP)
+# Types that a definition may leave out.
+_KNOWN = {
+    "builtin_interfaces/msg/Time": _TIME,
+    "builtin_interfaces/msg/Duration": Struct("builtin_interfaces/msg/Duration", _STAMP),
+    "std_msgs/msg/Header": Struct("std_msgs/msg/Header", (("stamp", _TIME), ("frame_id", Text()))),
+}
+# A structure without fields takes a byte.
+_NO_FIELDS: Fields = (("structure_needs_at_least_one_member", number_named("uint8")),)
 
 # Known without any installed package, so that a CSV becomes a bag on a machine without ROS.
 _BUILT_IN = {
@@ -34,8 +77,6 @@ _BUILT_IN = {
         "RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a",
     )
 }
-
-_FIELD = re.compile(r"\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?:<=)?\d*\])?\s+[A-Za-z]\w*")
 
 
 @dataclass(frozen=True)
@@ -73,7 +114,7 @@ def find_definition(type_name: str, prefixes: Sequence[Path] | None = None) -> D
             texts[name] = _message_text(name, where)
             wanted.extend(_dependencies(name, texts[name]))
     parts = [texts.pop(type_name)]
-    parts.extend(f"{SEPARATOR}\nMSG: {name}\n{text}" for name, text in texts.items())
+    parts.extend(f"{_SEPARATOR}\nMSG: {name}\n{text}" for name, text in texts.items())
     return Definition("\n".join(parts), _type_hash(type_name, where))
 
 
@@ -102,22 +143,12 @@ def _message_text(type_name: str, prefixes: Sequence[Path]) -> str:
 
 
 def _dependencies(type_name: str, text: str) -> list[str]:
-    package = type_name.split("/", 1)[0]
-    found: list[str] = []
-    for line in text.splitlines():
-        match = _FIELD.match(line.split("#", 1)[0])
-        if match is None or PRIMITIVE.fullmatch(match.group(1)):
-            continue
-        name = match.group(1)
-        if name == "Header":
-            name = "std_msgs/msg/Header"
-        elif "/" not in name:
-            name = f"{package}/msg/{name}"
-        elif name.count("/") == 1:
-            name = name.replace("/", "/msg/")
-        if name not in found:
-            found.append(name)
-    return found
+    try:
+        fields = _fields(text, type_name)
+    except ValueError as error:
+        raise BagError(f"the definition of {type_name} makes no sense: {error}") from None
+    items = (kind.item if isinstance(kind, Repeated) else kind for _, kind in fields)
+    return [item.name for item in items if isinstance(item, Struct)]
 
 
 def _type_hash(type_name: str, prefixes: Sequence[Path]) -> str:
@@ -126,3 +157,138 @@ def _type_hash(type_name: str, prefixes: Sequence[Path]) -> str:
             hashes = json.loads(text)["type_hashes"]
             return next(str(h["hash_string"]) for h in hashes if h["type_name"] == type_name)
     return _BUILT_IN.get(type_name, ("", ""))[1]
+
+
+def message_type(channel: Channel) -> Struct:
+    """Return the type of a channel's messages.
+
+    :raises BagError: if its definition is missing or makes no sense.
+    """
+    if channel.encoding != "cdr":
+        raise BagError(
+            f"the messages of {channel.topic} are encoded as {channel.encoding!r}; expected 'cdr'"
+        )
+    if len(channel.definition) > LARGEST_DEFINITION:
+        raise _senseless(channel, f"it has {len(channel.definition)} bytes")
+    try:
+        text = channel.definition.decode("utf-8").replace("\r\n", "\n")
+    except UnicodeDecodeError:
+        raise _senseless(channel, "it is not UTF-8") from None
+    types = _parsed(channel, text)
+    try:
+        return _Tree(types).struct(channel.type, 0)
+    except ValueError as error:
+        raise _senseless(channel, str(error)) from None
+
+
+def _parsed(channel: Channel, text: str) -> Mapping[str, Fields]:
+    if not text.strip():
+        raise _senseless(channel, "it is empty")
+    try:
+        if channel.schema_encoding == "ros2msg":
+            return types_from_ros2msg(text, channel.type)
+        if channel.schema_encoding in ("ros2idl", "omgidl"):
+            return types_from_idl(_IDL_DIRECTIVE.sub("", _IDL_HEADING.sub("", text)))
+    except ValueError as error:
+        raise _senseless(channel, first_line(error)) from None
+    raise _senseless(
+        channel, f"it is in {channel.schema_encoding!r}; expected 'ros2msg' or 'ros2idl'"
+    )
+
+
+def _senseless(channel: Channel, why: str) -> BagError:
+    return BagError(
+        f"the definition of {channel.type or 'the messages'} in the recording, of "
+        f"{channel.topic}, makes no sense: {why}"
+    )
+
+
+def first_line(error: Exception) -> str:
+    """Return what an error says, in one line."""
+    lines = str(error).strip().splitlines()
+    return visible(" ".join(lines[:2])[:120]) if lines else type(error).__name__
+
+
+def types_from_ros2msg(text: str, type_name: str) -> dict[str, Fields]:
+    """Return the fields of each type in a definition in ``ros2msg``, by its name.
+
+    :param text: the definition.
+    :param type_name: of the first type.
+    :raises ValueError: if a line makes no sense.
+    """
+    first, *others = _HEADING.split(text)
+    found = {type_name: _fields(first, type_name)}
+    for name, lines in zip(others[::2], others[1::2], strict=True):
+        full = _full(name, type_name)
+        found[full] = _fields(lines, full)
+    return found
+
+
+def _fields(text: str, owner: str) -> Fields:
+    fields: list[tuple[str, Type]] = []
+    for number, raw in enumerate(text.splitlines(), start=1):
+        line = raw.strip()
+        if not line or line[0] == "#":
+            continue
+        match = _LINE.match(line)
+        if match is None:
+            raise ValueError(f"line {number} of {owner}, {line[:60]!r}, is not a field")
+        word, count, array, name, behind = match.groups()
+        if behind == "=":
+            continue
+        kind: Type
+        if word in ("string", "wstring"):
+            kind = Text(wide=word == "wstring")
+        else:
+            primitive = _PRIMITIVE.fullmatch(word)
+            kind = number_named(word) if primitive else Struct(_full(word, owner))
+        if array:
+            kind = Repeated(kind, int(count) if count and count[0] != "<" else None)
+        fields.append((name, kind))
+    return tuple(fields)
+
+
+def _full(name: str, owner: str) -> str:
+    """Return package/msg/Type of a name within the definition of another type."""
+    if name in _SHORT:
+        return _SHORT[name]
+    if "/" not in name:
+        return f"{owner.rpartition('/')[0]}/{name}"
+    return name.replace("/", "/msg/") if name.count("/") == 1 else name
+
+
+class _Tree:
+    """Puts the types of a definition in the place of their names, within limits."""
+
+    def __init__(self, types: Mapping[str, Fields]) -> None:
+        self._types = types
+        self._fields = 0
+        self._done: dict[str, Struct] = {}
+
+    def struct(self, name: str, depth: int) -> Struct:
+        if name in self._done:
+            return self._done[name]
+        if depth > DEEPEST_TYPE:
+            raise ValueError(f"{name} lies {depth} types deep, or holds itself")
+        if name not in self._types:
+            if name in _KNOWN:
+                return _KNOWN[name]
+            raise ValueError(f"{name} is missing")
+        fields = self._types[name] or _NO_FIELDS
+        self._fields += len(fields)
+        if self._fields > MOST_FIELDS:
+            raise ValueError(f"it has more than {MOST_FIELDS} fields")
+        found = Struct(name, tuple((n, self._resolved(kind, depth + 1)) for n, kind in fields))
+        self._done[name] = found
+        return found
+
+    def _resolved(self, kind: Type, depth: int) -> Type:
+        if isinstance(kind, Struct):
+            return self.struct(kind.name, depth)
+        if isinstance(kind, Repeated):
+            if depth > DEEPEST_TYPE:
+                raise ValueError(f"an array lies {depth} types deep")
+            if kind.count is not None and not 0 < kind.count < 2**32:
+                raise ValueError(f"an array of {kind.count} elements")
+            return Repeated(self._resolved(kind.item, depth + 1), kind.count)
+        return kind

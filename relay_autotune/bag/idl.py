@@ -10,10 +10,10 @@ other constants are passed over. It takes time in proportion to the text, whatev
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections.abc import Mapping
 
 from relay_autotune.bag.limits import DEEPEST_TYPE
-from relay_autotune.bag.ros2msg import Fields
+from relay_autotune.bag.schema import Fields, Repeated, Struct, Text, Type, number_named
 
 _TOKEN = re.compile(
     r"""\s+ | //[^\n]* | /\*.*?\*/                                  # nothing
@@ -29,13 +29,9 @@ _NUMBERS = {
 }  # fmt: skip
 _CLOSING = {"(": ")", "{": "}", "[": "]"}
 
-Kind = tuple[int, Any]
 
-
-def types_from_idl(text: str) -> dict[str, tuple[list[Any], Fields]]:
-    """Return constants, which are left out, and fields of each type, by its name.
-
-    They have the form that `types_from_ros2msg` gives them.
+def types_from_idl(text: str) -> dict[str, Fields]:
+    """Return the fields of each type, by its name.
 
     :param text: one or several IDL files, without directives.
     :raises ValueError: if it makes no sense.
@@ -57,11 +53,11 @@ class _Parser:
                 self._tokens.append(match.group())
             at = match.end()
         self._at = 0
-        self._found: dict[str, tuple[list[Any], Fields]] = {}
-        self._named: dict[str, Kind] = {}
+        self._found: dict[str, Fields] = {}
+        self._named: dict[str, Type] = {}
         self._sizes: dict[str, int] = {}
 
-    def types(self) -> dict[str, tuple[list[Any], Fields]]:
+    def types(self) -> dict[str, Fields]:
         """Return what is defined."""
         while self._at < len(self._tokens):
             self._definition(())
@@ -121,7 +117,7 @@ class _Parser:
             name = "/".join((*scope, self._word()))
             self._named[name] = self._array(kind, scope)
         elif what == "enum":
-            self._named["/".join((*scope, self._word()))] = (1, ("uint32", 0))
+            self._named["/".join((*scope, self._word()))] = number_named("uint32")
             self._pass_over("{")
         elif what == "const":
             self._constant(scope)
@@ -132,7 +128,7 @@ class _Parser:
     def _struct(self, scope: tuple[str, ...]) -> None:
         name = "/".join((*scope, self._word()))
         self._take("{")
-        fields: Fields = []
+        fields: list[tuple[str, Type]] = []
         while True:
             self._annotations()
             if self._peek() == "}":
@@ -146,7 +142,7 @@ class _Parser:
                 self._take()
             self._take(";")
         self._take("}")
-        self._found[name] = ([], fields)
+        self._found[name] = tuple(fields)
 
     def _constant(self, scope: tuple[str, ...]) -> None:
         self._type(scope, 0)
@@ -158,7 +154,7 @@ class _Parser:
         while self._peek() != ";":
             self._take()
 
-    def _array(self, kind: Kind, scope: tuple[str, ...]) -> Kind:
+    def _array(self, kind: Type, scope: tuple[str, ...]) -> Type:
         """Return the type with the sizes that follow a name."""
         counts = []
         while self._peek() == "[":
@@ -168,7 +164,7 @@ class _Parser:
             if len(counts) > DEEPEST_TYPE:
                 raise ValueError(f"an array of more than {DEEPEST_TYPE} dimensions")
         for count in reversed(counts):
-            kind = (3, (kind, count))
+            kind = Repeated(kind, count)
         return kind
 
     def _count(self, scope: tuple[str, ...]) -> int:
@@ -191,7 +187,7 @@ class _Parser:
             parts.append(self._word())
         return "/".join(parts)
 
-    def _resolved(self, name: str, scope: tuple[str, ...], known: dict[str, Any]) -> str:
+    def _resolved(self, name: str, scope: tuple[str, ...], known: Mapping[str, object]) -> str:
         """Return the full name of what is known by a name from a scope on outwards."""
         for depth in range(len(scope), -1, -1):
             full = "/".join((*scope[:depth], name))
@@ -199,26 +195,26 @@ class _Parser:
                 return full
         return name
 
-    def _type(self, scope: tuple[str, ...], depth: int) -> Kind:
+    def _type(self, scope: tuple[str, ...], depth: int) -> Type:
         if depth > DEEPEST_TYPE:
             raise ValueError(f"sequences more than {DEEPEST_TYPE} deep")
         word = self._peek()
         if word == "sequence":
             self._take()
             self._take("<")
-            item, bound = self._type(scope, depth + 1), 0
+            item = self._type(scope, depth + 1)
             if self._peek() == ",":
                 self._take()
-                bound = self._count(scope)
+                self._count(scope)
             self._take(">")
-            return (4, (item, bound))
+            return Repeated(item, None)
         if word in ("string", "wstring"):
             self._take()
             if self._peek() == "<":
                 self._take()
                 self._count(scope)
                 self._take(">")
-            return (1, (word, 0))
+            return Text(wide=word == "wstring")
         if word in ("unsigned", "long"):
             words = [self._take()]
             while self._peek() in ("long", "short") and len(words) < 3:
@@ -226,14 +222,14 @@ class _Parser:
             word = " ".join(words)
             if word not in _NUMBERS:
                 raise ValueError(f"{word!r} is not a type")
-            return (1, (_NUMBERS[word], 0))
+            return number_named(_NUMBERS[word])
         if word in _NUMBERS:
-            return (1, (_NUMBERS[self._take()], 0))
+            return number_named(_NUMBERS[self._take()])
         name = self._scoped()
         full = self._resolved(name, scope, self._named)
         if full in self._named:
             return self._named[full]
-        return (2, self._resolved(name, scope, self._found))
+        return Struct(self._resolved(name, scope, self._found))
 
 
 def _size(digits: str) -> int:

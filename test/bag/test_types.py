@@ -15,11 +15,14 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from relay_autotune.bag.cdr import decode_messages
-from relay_autotune.bag.definitions import installed_prefixes
+from relay_autotune.bag.definitions import (
+    installed_prefixes,
+    message_type,
+    types_from_ros2msg,
+)
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.ros2msg import types_from_ros2msg
-from relay_autotune.bag.schema import message_type, numeric_paths
+from relay_autotune.bag.schema import Number, Repeated, Text, numeric_paths
 from relay_autotune.bag.topics import Topics, named_field, only_field
 from relay_autotune.errors import BagError, SelectionError
 
@@ -355,21 +358,31 @@ def test_fields_of_the_installed_definitions():
         name = f"{path.parts[-3]}/msg/{path.stem}"
         ours = types_from_ros2msg(path.read_text(), name)
         expected = get_types_from_msg(path.read_text(), name)
-        assert {k: named(fields) for k, (_, fields) in ours.items()} == {
-            k: named(fields) for k, (_, fields) in expected.items()
+        assert {
+            k: [(name, told(kind)) for name, kind in fields] for k, fields in ours.items()
+        } == {
+            k: [(name, told_by_rosbags(kind)) for name, kind in fields]
+            for k, (_, fields) in expected.items()
         }
 
 
-def named(fields):
-    return [(name, numbered(kind)) for name, kind in fields]
+def told(kind):
+    """Return a type of ours with numbers and names alone."""
+    if isinstance(kind, Number):
+        return kind.name
+    if isinstance(kind, Text):
+        return "wstring" if kind.wide else "string"
+    return (told(kind.item), kind.count) if isinstance(kind, Repeated) else ("of", kind.name)
 
 
-def numbered(kind):
-    """Return the type of a field with numbers and names alone."""
+def told_by_rosbags(kind):
+    """Return a type of rosbags in the same form; the bound of a sequence does not matter."""
     number, what = int(kind[0]), kind[1]
     if number == 1:
         return "byte" if what[0] == "octet" else what[0]
-    return (number, what) if number == 2 else (number, numbered(what[0]), what[1])
+    if number == 2:
+        return ("of", what)
+    return (told_by_rosbags(what[0]), what[1] if number == 3 else None)
 
 
 @pytest.mark.parametrize(
@@ -392,6 +405,13 @@ def channel(type_name, text, schema_encoding="ros2msg", encoding="cdr"):
 SEPARATOR = "=" * 80
 DEEP = "".join(f"{SEPARATOR}\nMSG: x/A{k}\nx/A{k + 1} a\nx/A{k + 1} b\n" for k in range(1, 200))
 
+# Each name stands for a sequence of the one before.
+NESTED = (
+    "typedef double t0;"
+    + "".join(f"typedef sequence<t{k}> t{k + 1};" for k in range(3000))
+    + "module x { module msg { struct A { t3000 a; }; }; };"
+)
+
 
 @pytest.mark.parametrize(
     ("text", "encoding", "sentence"),
@@ -404,6 +424,7 @@ DEEP = "".join(f"{SEPARATOR}\nMSG: x/A{k}\nx/A{k + 1} a\nx/A{k + 1} b\n" for k i
         ("float64[0] a\n", "ros2msg", "makes no sense"),
         ("float64[99999999999999999999] a\n", "ros2msg", "makes no sense"),
         ("struct {", "ros2idl", "makes no sense"),
+        (NESTED, "ros2idl", "an array lies 41 types deep"),
         ("message A {}", "protobuf", "it is in 'protobuf'; expected 'ros2msg' or 'ros2idl'"),
         ("x" * 2_000_000, "ros2msg", "it has 2000000 bytes"),
         ("float64 a\n" * 5_001, "ros2msg", "more than 5000 fields"),

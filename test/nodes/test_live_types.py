@@ -14,9 +14,8 @@ from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Byte
 
-from relay_autotune.bag.definitions import find_definition
+from relay_autotune.bag.definitions import find_definition, message_type
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.schema import message_type
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import remote_loop
 from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
