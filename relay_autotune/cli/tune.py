@@ -265,9 +265,8 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
 
 def _to_shape(task: DesignTask, rule: str, gains: Sequence[Gains]) -> tuple[Case, Shaping]:
     """Return a model that was given as a page shows it, and what the design of gains takes."""
-    from relay_autotune.identification.result import FitReport
     from relay_autotune.record.record import Outcome
-    from relay_autotune.report.case import Case, ModelCase
+    from relay_autotune.report.case import Case, given_model
     from relay_autotune.shaping import Shaping
     from relay_autotune.text import process_text
 
@@ -278,7 +277,7 @@ def _to_shape(task: DesignTask, rule: str, gains: Sequence[Gains]) -> tuple[Case
         duration=0.0,
         outcome=Outcome.UNKNOWN,
         reason="",
-        models=(ModelCase("given", task.model, (), (), FitReport()),),
+        models=(given_model(task.model),),
         selected=0,
         gains=tuple(gains),
         recommended=0 if gains and gains[0].rule == rule else None,

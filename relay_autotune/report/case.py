@@ -11,23 +11,23 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from relay_autotune.analysis import Analysis
-from relay_autotune.arrays import FloatArray
 from relay_autotune.bag.source import open_regular
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.exchange.document import judgement_of_fields
 from relay_autotune.exchange.fields import number, of_document
 from relay_autotune.exchange.models import model_of_fields
-from relay_autotune.identification.combinations import Combination
-from relay_autotune.identification.result import FitReport, Identification, Rival, Validation
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import Identification
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
@@ -65,40 +65,16 @@ class EstimatedQuantity:
 
 @dataclass(frozen=True)
 class ModelCase:
-    """A model as the report shows it.
+    """A model with its quantities as the report shows them.
 
-    :param method: by which it was identified.
-    :param model: the transfer function.
+    :param found: what a method found.
     :param estimates: its parameters.
     :param ultimate: K_u and w_u, empty where the model has none.
-    :param fit: quality of the fit.
-    :param warnings: sentences that the user must read.
-    :param rivals: other structures that the data do not rule out.
-    :param fitted: the model's measurement at the samples [y]; empty: not known.
-    :param validation: how its limit cycle differs from the record's; None: not compared.
-    :param integrated_error: distance from the selected model [rad/s]; NaN: it is that model, or
-        not known.
-    :param combinations: determined combinations, if some parameters are not determined.
-    :param advice: tests that would determine these parameters, each a sentence.
     """
 
-    method: str
-    model: TransferFunction
-    estimates: tuple[EstimatedQuantity, ...]
-    ultimate: tuple[EstimatedQuantity, ...]
-    fit: FitReport
-    warnings: tuple[str, ...] = ()
-    rivals: tuple[Rival, ...] = ()
-    fitted: FloatArray = field(default_factory=lambda: np.empty(0))
-    validation: Validation | None = None
-    integrated_error: float = math.nan
-    combinations: tuple[Combination, ...] = ()
-    advice: tuple[str, ...] = ()
-
-    @property
-    def undetermined(self) -> tuple[str, ...]:
-        """Titles of the parameters that the data do not determine."""
-        return tuple(e.title for e in self.estimates if not e.determined)
+    found: Identification
+    estimates: tuple[EstimatedQuantity, ...] = ()
+    ultimate: tuple[EstimatedQuantity, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -122,7 +98,6 @@ class Case:
     :param settings: of the relay; None: no relay, or not known.
     :param cycles: the whole cycles; empty where there are no samples.
     :param models_around: models within the uncertainty of the selected one.
-    :param points: of the frequency response, by Fourier integrals over the cycles.
     :param added_delay: dead time that the controller's loop adds to the process [s].
     :param judgement: what the checks found, and the verdict.
     :param present: the gains that are in the controller now; None: not known.
@@ -146,7 +121,6 @@ class Case:
     settings: RelaySettings | None = None
     cycles: tuple[Cycle, ...] = ()
     models_around: tuple[TransferFunction, ...] = ()
-    points: tuple[FrequencyPoint, ...] = ()
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
     present: Controller | None = None
@@ -156,6 +130,11 @@ class Case:
     def model(self) -> ModelCase | None:
         """The selected model."""
         return None if self.selected is None else self.models[self.selected]
+
+    @property
+    def points(self) -> tuple[FrequencyPoint, ...]:
+        """Points of the frequency response, by Fourier integrals over the cycles."""
+        return next((m.found.points for m in self.models if m.found.points), ())
 
     @property
     def best_gains(self) -> Gains | None:
@@ -200,7 +179,6 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         models_around=around(analysis.model),
         added_delay=analysis.added_delay,
         judgement=analysis.judgement,
-        points=measured_points(analysis.models),
     )
 
 
@@ -220,14 +198,6 @@ def around(model: Identification | None) -> tuple[TransferFunction, ...]:
     return () if model is None else ensemble(model, rng=np.random.default_rng(0))
 
 
-def measured_points(models: Sequence[Identification]) -> tuple[FrequencyPoint, ...]:
-    """Return the points of the frequency response that a method measured.
-
-    :param models: what each method found.
-    """
-    return next((m.points for m in models if m.points), ())
-
-
 def model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
     """Return a model as the report shows it.
 
@@ -243,26 +213,16 @@ def model_case(found: Identification, truth: TransferFunction | None) -> ModelCa
         )
         for i, (p, value) in enumerate(zip(structure.parameters, found.values, strict=True))
     )  # fmt: skip
-    return ModelCase(
-        method=found.method,
-        model=found.model,
-        estimates=estimates,
-        ultimate=ultimate_estimates(
-            found.ultimate_gain,
-            found.ultimate_gain_std,
-            found.ultimate_frequency,
-            found.ultimate_frequency_std,
-            truth,
-        ),
-        fit=found.fit,
-        warnings=found.warnings,
-        rivals=found.rivals,
-        fitted=found.fitted,
-        validation=found.validation,
-        integrated_error=found.integrated_error,
-        combinations=found.combinations,
-        advice=found.advice,
-    )
+    return ModelCase(found, estimates, _ultimate(found, truth))
+
+
+def given_model(model: TransferFunction) -> ModelCase:
+    """Return a model of which nothing was measured.
+
+    :param model: the transfer function.
+    """
+    nothing = np.empty(0)
+    return ModelCase(Identification("given", Estimate.of_model(model), nothing, nothing))
 
 
 def true_value(parameter: str, model: TransferFunction, truth: TransferFunction | None) -> float:
@@ -286,39 +246,27 @@ def _kind(model: TransferFunction) -> tuple[int, int, int, bool]:
     return len(model.time_constants), len(model.zeros), model.integrators, model.grows
 
 
-def ultimate_estimates(
-    gain: float,
-    gain_std: float,
-    frequency: float,
-    frequency_std: float,
-    truth: TransferFunction | None = None,
+def _ultimate(
+    found: Identification, truth: TransferFunction | None
 ) -> tuple[EstimatedQuantity, ...]:
-    """Return K_u and w_u with their intervals; nothing where the model has none.
-
-    :param gain: K_u [u/y].
-    :param gain_std: its standard deviation.
-    :param frequency: w_u [rad/s].
-    :param frequency_std: its standard deviation.
-    :param truth: the true process, if it was simulated.
-    """
-    from relay_autotune.process.ultimate import ultimate_point
-
-    if not math.isfinite(gain):
+    """Return K_u and w_u with their intervals; nothing where the model has none."""
+    if not math.isfinite(found.ultimate_gain):
         return ()
     true = ultimate_point(truth) if truth is not None else None
+    gain, frequency = (math.nan, math.nan) if true is None else (true.gain, true.frequency)
     rows = (
-        ("ultimate_gain", gain, gain_std, math.nan if true is None else true.gain, "u/y"),
+        ("ultimate_gain", found.ultimate_gain, found.ultimate_gain_std, "u/y", gain),
         (
             "ultimate_frequency",
-            frequency,
-            frequency_std,
-            math.nan if true is None else true.frequency,
+            found.ultimate_frequency,
+            found.ultimate_frequency_std,
             "rad/s",
+            frequency,
         ),
     )
     return tuple(
         EstimatedQuantity(n, v, v - NORMAL_95 * std, v + NORMAL_95 * std, unit, truth=t)
-        for n, v, std, t, unit in rows
+        for n, v, std, unit, t in rows
     )
 
 
@@ -418,7 +366,6 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         settings=None if e["relay"] is None else of_document(RelaySettings, e["relay"]),
         models_around=around(None if selected is None else models[selected]),
         added_delay=number(e.get("added_delay", 0.0)),
-        points=measured_points(models),
         judgement=judgement_of_fields(e),
     )
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Record, RelaySettings
-from relay_autotune.report.case import Case, ModelCase
+from relay_autotune.report.case import Case
 from relay_autotune.report.style import (
     BLUE,
     GREEN,
@@ -157,7 +158,7 @@ def draw_fit(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     assert case.record is not None
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.3))
-    record, model = case.record, case.model
+    record, model = case.record, case.model.found
     _samples(above, record)
     above.plot(
         *thinned(record.time, model.fitted), color=VERMILLION, lw=1.7, ls=(0, (4, 1.2)),
@@ -171,7 +172,7 @@ def draw_fit(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     finish(figure)
 
 
-def _residual(axes: Axes, record: Record, model: ModelCase) -> None:
+def _residual(axes: Axes, record: Record, model: Identification) -> None:
     noise = model.fit.noise_std
     if np.isfinite(noise) and noise > 0.0:
         axes.axhspan(
@@ -209,8 +210,8 @@ def draw_phase_plane(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     axes.plot(y[time <= start], rate[time <= start], color=MUTED, lw=0.9, label="on the way")
     label = f"limit cycle, {len(steady)} cycle{'s' if len(steady) > 1 else ''}"
     axes.plot(y[inside], rate[inside], color=BLUE, lw=1.3, label=label)
-    if case.model is not None and case.model.fitted.size == len(record):
-        time, fitted, slope = rate_of(record, case.model.fitted, cycle.period)
+    if case.model is not None and case.model.found.fitted.size == len(record):
+        time, fitted, slope = rate_of(record, case.model.found.fitted, cycle.period)
         last = (time >= end - cycle.period) & (time <= end)
         axes.plot(
             fitted[last], slope[last], color=VERMILLION, lw=1.7, ls=(0, (4, 1.5)), label="model"

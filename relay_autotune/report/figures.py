@@ -97,8 +97,8 @@ def _without_fit(case: Case) -> str:
         return _NO_SAMPLES
     if case.model is None:
         return _NO_MODEL
-    if case.model.fitted.size != len(case.record):
-        return f"the method {case.model.method} does not fit the samples themselves"
+    if case.model.found.fitted.size != len(case.record):
+        return f"the method {case.model.found.method} does not fit the samples themselves"
     return ""
 
 
@@ -131,7 +131,7 @@ def _without_intervals(case: Case) -> str:
     if case.model is None:
         return _NO_MODEL
     known = any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate))
-    return "" if known else f"the method {case.model.method} gives no uncertainty"
+    return "" if known else f"the method {case.model.found.method} gives no uncertainty"
 
 
 PLATES = (

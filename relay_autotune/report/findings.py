@@ -175,7 +175,7 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
     if case.model is None:
         return None
     try:
-        return analyse_loop(present, in_loop(case, case.model.model))
+        return analyse_loop(present, in_loop(case, case.model.found.model))
     except TuningError:
         return None
 
@@ -241,7 +241,7 @@ def warnings_of(case: Case) -> tuple[str, ...]:
     """
     doubtful = case.judgement.verdict is Verdict.DOUBTFUL
     found = [f.said for f in case.judgement.findings if f.sentence] if doubtful else []
-    found += case.model.warnings if case.model is not None else ()
+    found += case.model.found.warnings if case.model is not None else ()
     if case.best_gains is not None:
         found += case.best_gains.warnings
     disturbed = [c.index + 1 for c in case.cycles if c.disturbed]
@@ -313,8 +313,8 @@ def doubts_of(case: Case) -> tuple[str, ...]:
                 f"The {estimate.title} is between {digits(estimate.low)} and "
                 f"{digits(estimate.high)} {estimate.unit}: more than 20 % to either side."
             )
-    if model.rivals:
-        share = 100.0 * sum(r.support for r in model.rivals)
+    if model.found.rivals:
+        share = 100.0 * sum(r.support for r in model.found.rivals)
         found.append(
             f"Other structures hold {digits(share, 2)} % of the support; they are listed below."
         )

@@ -53,11 +53,11 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     """
     from matplotlib.patches import PathPatch
 
-    gains, found = case.best_gains, case.model
+    gains = case.best_gains
     assert gains is not None
-    assert found is not None
+    assert case.model is not None
     axes = figure.subplots()
-    loop = gains.loop(in_loop(case, found.model))
+    loop = gains.loop(in_loop(case, case.model.found.model))
     w = loop_frequencies(loop)
     turn = np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
     near_point = -1.0 + turn / gains.ms
@@ -173,7 +173,7 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
 
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True)
-    model = case.model.model
+    model = case.model.found.model
     w = _bode_frequencies(case)
     if case.models_around:
         _band(above, w, np.array([np.abs(m(1j * w)) for m in case.models_around]))
@@ -226,7 +226,7 @@ def _bode_frequencies(case: Case) -> FloatArray:
     elif case.limit_cycle is not None:
         middle = 2.0 * math.pi / case.limit_cycle.period
     else:
-        constants = [abs(c) for c in case.model.model.time_constants] or [1.0]
+        constants = [abs(c) for c in case.model.found.model.time_constants] or [1.0]
         middle = 1.0 / max(constants)
     return np.geomspace(0.02 * middle, 8.0 * middle, 400)
 
@@ -303,16 +303,16 @@ def _groups(case: Case) -> list[tuple[str, list[_Row]]]:
         if case.model.ultimate:
             centre = case.model.ultimate[k].value
             models = [m for m in _each_method(case) if m.ultimate]
-            found.append((title, [_Row(m.method, m.ultimate[k], centre) for m in models]))
+            found.append((title, [_Row(m.found.method, m.ultimate[k], centre) for m in models]))
     return found
 
 
 def _each_method(case: Case) -> list[ModelCase]:
     """Return one model of each method, the selected one first."""
     assert case.model is not None
-    found = {case.model.method: case.model}
+    found = {case.model.found.method: case.model}
     for model in case.models:
-        found.setdefault(model.method, model)
+        found.setdefault(model.found.method, model)
     return list(found.values())
 
 

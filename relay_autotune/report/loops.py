@@ -39,7 +39,7 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     assert case.best_gains is not None
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
-    model = in_loop(case, case.model.model)
+    model = in_loop(case, case.model.found.model)
     half = step_duration(case.best_gains, model)
     run = simulated(case.best_gains, model, half)
     for other in case.models_around[:: max(1, len(case.models_around) // _SHOWN)]:
@@ -80,7 +80,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     """
     assert case.best_gains is not None
     assert case.model is not None
-    model = in_loop(case, case.model.model)
+    model = in_loop(case, case.model.found.model)
     half = step_duration(case.best_gains, model)
     best = simulated(case.best_gains, model, half)
     others = distinct_gains(case)[1:]

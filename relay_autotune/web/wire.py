@@ -83,8 +83,8 @@ def of_subject(subject: Subject) -> dict[str, Any]:
         "verdict": _verdict(case),
         "checks": _checks(case),
         "reason": visible(case.reason),
-        "process": "" if model is None else process_text(model.model),
-        "structure": "" if model is None else model.model.structure,
+        "process": "" if model is None else process_text(model.found.model),
+        "structure": "" if model is None else model.found.structure,
         "estimates": []
         if model is None
         else [_estimate(e) for e in (*model.estimates, *model.ultimate)],
@@ -124,7 +124,7 @@ def of_running(
     if record is not None:
         few = slice(None, None, math.ceil(len(record) / _MOST_SIMULATED))
         time = record.time[few]
-        moved = response(model.model, time, record.input())
+        moved = response(model.found.model, time, record.input())
         rest = float(np.mean(record.measurement[few] - moved))
         found["data"] = [curve(record.time, record.measurement), curve(time, rest + moved)]
     return found
@@ -264,6 +264,6 @@ def _record(case: Case) -> dict[str, Any] | None:
         "model": None,
     }
     model = case.model
-    if model is not None and model.fitted.size == len(record):
-        found["model"] = curve(record.time, model.fitted)
+    if model is not None and model.found.fitted.size == len(record):
+        found["model"] = curve(record.time, model.found.fitted)
     return found

@@ -195,7 +195,7 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
         for name in ("kc", "ti", "td", "tf", "b", "ms", "ms_95", "gain_margin", "iae_load"):
             assert getattr(ours, name) == getattr(theirs, name)
     assert case.recommended == direct.recommended == 0
-    assert case.model.model == direct.model.model
+    assert case.model.found.model == direct.model.found.model
     for ours, theirs in zip(case.model.estimates, direct.model.estimates, strict=True):
         assert (ours.name, ours.unit, ours.low) == (theirs.name, theirs.unit, theirs.low)
         assert ours.value == theirs.value
@@ -333,7 +333,7 @@ def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypat
     weak = Controller(0.5 * case.best_gains.kc, case.best_gains.ti)
     rows = {row.name: row for row in beside_present(replace(case, present=weak))}
     assert float(rows["kc [u/y]"].present) == pytest.approx(weak.kc, rel=1e-3)
-    expected = analyse_loop(weak, in_loop(case, case.model.model))
+    expected = analyse_loop(weak, in_loop(case, case.model.found.model))
     assert float(rows["Ms"].present) == pytest.approx(expected.ms, rel=1e-2)
     assert float(rows["Ms"].new) == pytest.approx(case.best_gains.ms, rel=1e-2)
     assert "Beside the present gains" in read(page([replace(case, present=weak)])).text

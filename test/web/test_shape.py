@@ -19,12 +19,11 @@ from relay_autotune.analysis import analyse
 from relay_autotune.cli import page, replay
 from relay_autotune.cli.arguments import as_typed
 from relay_autotune.errors import TuningError
-from relay_autotune.identification.result import FitReport
 from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
-from relay_autotune.report.case import Case, ModelCase
+from relay_autotune.report.case import Case, given_model
 from relay_autotune.report.loops import shown_load
 from relay_autotune.shaping import Shaping
 from relay_autotune.tuning import Designed, DesignOptions, designed, judged, task_of_model
@@ -62,10 +61,7 @@ def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
 
 
 def given(model: TransferFunction) -> Subject:
-    case = Case(
-        "a model", "", 0.0, 0.0, Outcome.UNKNOWN, "",
-        (ModelCase("given", model, (), (), FitReport()),), 0,
-    )  # fmt: skip
+    case = Case("a model", "", 0.0, 0.0, Outcome.UNKNOWN, "", (given_model(model),), 0)
     return Subject(case, Shaping(task_of_model(model)), Asked(), lambda _: "tune")
 
 
