@@ -13,9 +13,16 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
+from relay_autotune.identification.known import NOTHING
 from relay_autotune.identification.waveform.colour import colour_of, slow_colour
+from relay_autotune.identification.waveform.coloured import in_colour
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.identification.waveform.selection import Ground, fit_all, nuisances_of
+from relay_autotune.identification.waveform.selection import (
+    Ground,
+    fit_all,
+    nuisances_of,
+    support,
+)
 from relay_autotune.identification.waveform.separable import problem_of
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
@@ -109,6 +116,21 @@ def test_correlated_noise_beside_a_relay_test(pole):
         found = identify_waveform(relay_test(noise, np.zeros(1400)))
         deviations.append((found.ultimate_gain - true.gain) / found.ultimate_gain_std)
     assert max(abs(d) for d in deviations) < 3.5
+
+
+@pytest.mark.long
+def test_in_a_colour_structures_are_weighted_by_akaikes_criterion():
+    rng = np.random.default_rng(5)
+    record = relay_test(0.09 * correlated(0.9, 1400, rng), np.zeros(1400))
+    problem = problem_of([(record.time, record.measurement, record.drive())], FOPDT)
+    fit = in_colour(problem, 1.0, NOTHING, 1, held=False)
+    assert fit is not None
+    stable = [c for c in fit.candidates if c.model.is_stable]
+    n = stable[0].problem.time.size
+    criteria = [n * math.log(c.state.cost) + 2 * c.state.parameters for c in stable]
+    likely = np.exp(-0.5 * (np.array(criteria) - min(criteria)))
+    assert support(stable) == pytest.approx(likely / likely.sum(), abs=1e-3)
+    assert max(support(stable)[1:]) > 0.1  # a richer structure counts beside the chosen FOPDT
 
 
 @pytest.mark.long

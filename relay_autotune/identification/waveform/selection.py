@@ -114,6 +114,14 @@ class Candidate:
         """The structure."""
         return self.problem.structure
 
+    @property
+    def lenience(self) -> float:
+        """What Schwarz's penalty exceeds Akaike's by, where the noise has a colour."""
+        if self.problem.colour is None:
+            return 0.0
+        n = max(self.problem.time.size, 3)
+        return self.state.parameters * (math.log(n) - 2.0)
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -563,11 +571,15 @@ def _good_enough(candidates: list[Candidate]) -> Candidate | None:
 
 
 def support(candidates: list[Candidate]) -> list[float]:
-    """Return the weight of each candidate, from its criterion; their sum is 1.
+    """Return the weight of each candidate, ``exp(-criterion/2)``; their sum is 1.
+
+    White noise leaves nothing that another structure would explain, and the criterion is that of
+    the choice. In a colour, some of the residual may be what no structure explains: Akaike's
+    penalty, 2 for each parameter, stands in the place of Schwarz's, so that richer structures
+    count (Burnham and Anderson 2002).
 
     :param candidates: in any order.
     """
-    best = min(c.criterion for c in candidates)
-    weights = [math.exp(-0.5 * min(c.criterion - best, 1400.0)) for c in candidates]
-    total = sum(weights)
-    return [w / total for w in weights]
+    criteria = np.array([c.criterion - c.lenience for c in candidates])
+    weights = np.exp(-0.5 * np.minimum(criteria - criteria.min(), 1400.0))
+    return [float(w) for w in weights / weights.sum()]
