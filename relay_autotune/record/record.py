@@ -239,15 +239,6 @@ class PiecewiseLinear:
     slopes: FloatArray
     initial: float
 
-    def __post_init__(self) -> None:
-        if self.times.ndim != 1 or self.times.shape != self.slopes.shape:
-            raise RecordError(
-                f"a piecewise-linear signal needs times and slopes of one shape (m,), "
-                f"found {self.times.shape} and {self.slopes.shape}"
-            )
-        if self.times.size > 1 and not bool(np.all(np.diff(self.times) > 0.0)):
-            raise RecordError("the instants of a piecewise-linear signal must increase strictly")
-
     @classmethod
     def from_samples(cls, times: FloatArray, values: FloatArray) -> PiecewiseLinear:
         """Connect all samples of a continuous signal.
@@ -414,9 +405,10 @@ class Record:
         return float(self.time[-1] - self.time[0])
 
     @property
+    @asked_once
     def interval(self) -> float:
         """Median time between samples [s]."""
-        return _interval(self)
+        return float(np.median(np.diff(self.time)))
 
     @property
     def mean_interval(self) -> float:
@@ -424,9 +416,10 @@ class Record:
         return self.duration / max(len(self) - 1, 1)
 
     @property
+    @asked_once
     def noise(self) -> float:
         """The noise measured before the test, or else estimated from second differences [y]."""
-        return self.noise_std if math.isfinite(self.noise_std) else _roughness(self)
+        return self.noise_std if math.isfinite(self.noise_std) else roughness(self.measurement)
 
     def part(self, low: int, high: int) -> Record:
         """Return some of the samples; the command's history is kept.
@@ -467,9 +460,12 @@ class Record:
         """
         if self.held_input is not None:
             return self.held_input
+        return PiecewiseConstant.from_samples(self._sent(), self.command)
+
+    def _sent(self) -> FloatArray:
+        """Return when each command reached the process, on the clock of the samples [s]."""
         offset = float(np.min(self.receive_time - self.time))
-        sent = np.maximum.accumulate(self.command_time - offset)
-        return PiecewiseConstant.from_samples(sent, self.command)
+        return np.maximum.accumulate(self.command_time - offset)
 
     def drive(self) -> Input:
         """Return the input of the process: :meth:`input`, or straight lines between its points.
@@ -479,19 +475,7 @@ class Record:
         """
         if not self.continuous_command:
             return self.input()
-        if self.held_input is not None:
-            held = self.held_input
+        held = self.held_input
+        if held is not None:
             return PiecewiseLinear.from_samples(held.times, held.values)
-        offset = float(np.min(self.receive_time - self.time))
-        sent = np.maximum.accumulate(self.command_time - offset)
-        return PiecewiseLinear.from_samples(sent, self.command)
-
-
-@asked_once
-def _interval(record: Record) -> float:
-    return float(np.median(np.diff(record.time)))
-
-
-@asked_once
-def _roughness(record: Record) -> float:
-    return roughness(record.measurement)
+        return PiecewiseLinear.from_samples(self._sent(), self.command)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -149,20 +150,16 @@ def _averaged(record: Record, begins: IntArray, before: Unthinned, *, often: boo
     # Noise that is not white loses less in a mean.
     left = roughness(mean) / max(roughness(record.measurement), np.finfo(float).tiny)
     left = min(max(left, math.sqrt(begins.size / len(record))), 1.0)
-    return Record(
+    return replace(
+        record,
         time=time,
         measurement=mean,
         command=command,
-        settings=record.settings,
+        receive_time=time,
+        command_time=time,
         noise_std=left * record.noise_std,
         cycle_start=_same_cycles(record, begins),
-        outcome=record.outcome,
-        reason=record.reason,
-        experiment_id=record.experiment_id,
-        start=record.start,
-        lost_samples=record.lost_samples,
         held_input=held,
-        continuous_command=record.continuous_command,
         unthinned=before,
     )
 
