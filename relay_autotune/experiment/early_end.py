@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.quantities import NORMAL_95, told
+
+if TYPE_CHECKING:
+    from relay_autotune.experiment.experiment import RelayExperiment
 
 ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)
@@ -24,29 +27,6 @@ _LEAST_SWITCHES = 2
 # assumes that the interval narrows with the cube of that time at most.
 _LEAST_GROWTH, _MOST_GROWTH = 1.02, 1.15
 _STEEPNESS = 3.0
-
-
-class Running(Protocol):
-    """The part of a running experiment that is needed here.
-
-    :class:`~relay_autotune.experiment.experiment.RelayExperiment` has it.
-    """
-
-    @property
-    def elapsed(self) -> float:
-        """Time from the first sample to the last [s]."""
-
-    @property
-    def kicked_at(self) -> float:
-        """Time of the kick from the first sample on [s]; NaN before."""
-
-    @property
-    def switches(self) -> int:
-        """Number of switches of the relay so far."""
-
-    @property
-    def cycle_count(self) -> int:
-        """Number of whole cycles so far."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +89,7 @@ class EarlyEnd:
         self._waits = False
         self._growth = _MOST_GROWTH
 
-    def is_due(self, running: Running) -> bool:
+    def is_due(self, running: RelayExperiment) -> bool:
         """Return True if it is time for the next look.
 
         Looks begin after the first half cycle. Between switches, the next one comes when the last
@@ -124,7 +104,7 @@ class EarlyEnd:
             return since >= _LEAST_GROWTH * self._last
         return not self._waits and since >= self._growth * self._last
 
-    def look(self, running: Running) -> None:
+    def look(self, running: RelayExperiment) -> None:
         """Note a look now.
 
         :param running: the experiment.
@@ -133,7 +113,7 @@ class EarlyEnd:
         self._last = running.elapsed - running.kicked_at
         self._waits = True
 
-    def judge(self, running: Running, found: FitProgress) -> str:
+    def judge(self, running: RelayExperiment, found: FitProgress) -> str:
         """Take the answer to a look; return why the experiment may end, "" if it may not.
 
         :param running: the experiment.
