@@ -17,6 +17,7 @@ from collections.abc import Callable
 from functools import partial
 
 from relay_autotune import threads  # noqa: F401  before numpy
+from relay_autotune.process.structures import UNSTABLE_FOPDT
 
 # isort: split
 import numpy as np
@@ -89,7 +90,7 @@ def fopdt_of(shape: Shape, level: float = 0.0) -> TransferFunction:
     try:
         return TransferFunction.fopdt(*fopdt(*numbers))
     except RelayAutotuneError:
-        return TransferFunction.unstable_fopdt(*unstable_fopdt(*numbers))
+        return UNSTABLE_FOPDT.build(unstable_fopdt(*numbers))
 
 
 def flat_of(shape: Shape, level: float | None = None) -> TransferFunction:

@@ -111,87 +111,50 @@ PAIR = (NATURAL_FREQUENCY, DAMPING)
 
 @dataclass(frozen=True)
 class Lag:
-    """``(1 + tau s)^n`` with the parameter log tau.
+    """``(1 + tau s)^n``, or an unstable one, ``(tau s - 1)^n``, with the parameter log tau.
 
     :param multiplicity: n.
     :param parameters: tau.
+    :param unstable: whether its pole lies in the right half plane.
     """
 
     multiplicity: int = 1
     parameters: tuple[Parameter] = (TIME_CONSTANT,)
-    unstable = False
+    unstable: bool = False
+
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.unstable else 1.0
 
     def polynomial(self, theta: FloatArray) -> Polynomial:
-        """Return ``1 + tau s``, lowest power first.
+        """Return ``1 + tau s`` or ``tau s - 1``, lowest power first.
 
         :param theta: (log tau,).
         """
-        return np.array((1.0, math.exp(theta[0])))
+        return np.array((self._sign, math.exp(theta[0])))
 
     def derivatives(self, theta: FloatArray) -> list[Polynomial]:
         """Return the derivative of :meth:`polynomial` by log tau."""
         return [np.array((0.0, math.exp(theta[0])))]
 
     def constants(self, theta: FloatArray) -> list[complex]:
-        """Return the time constants of one power of the factor [s]."""
-        return [complex(math.exp(theta[0]))]
+        """Return T in ``1 + T s`` of one power of the factor [s]: tau, or -tau."""
+        return [complex(self._sign * math.exp(theta[0]))]
 
     def values(self, theta: FloatArray) -> tuple[float, ...]:
         """Return the parameters that theta stands for: tau [s]."""
         return (math.exp(theta[0]),)
 
     def poles(self, values: Sequence[float]) -> tuple[complex, ...]:
-        """Return the time constants of all powers for a value of tau [s].
+        """Return T of all powers for a value of tau [s].
 
         :raises ModelError: unless it is positive.
         """
-        return (positive(values[0]),) * self.multiplicity
+        return (self._sign * positive(values[0]),) * self.multiplicity
 
     def values_of(self, constants: Sequence[complex]) -> tuple[float, ...]:
-        """Return tau [s] of the time constants that :meth:`poles` returns."""
-        return (constants[0].real,)
-
-
-@dataclass(frozen=True)
-class UnstableLag:
-    """``tau s - 1`` with the parameter log tau.
-
-    :param parameters: tau.
-    """
-
-    parameters: tuple[Parameter] = (TIME_CONSTANT,)
-    multiplicity = 1
-    unstable = True
-
-    def polynomial(self, theta: FloatArray) -> Polynomial:
-        """Return ``tau s - 1``, lowest power first.
-
-        :param theta: (log tau,).
-        """
-        return np.array((-1.0, math.exp(theta[0])))
-
-    def derivatives(self, theta: FloatArray) -> list[Polynomial]:
-        """Return the derivative of :meth:`polynomial` by log tau."""
-        return [np.array((0.0, math.exp(theta[0])))]
-
-    def constants(self, theta: FloatArray) -> list[complex]:
-        """Return the time constant in ``1 + T s`` [s], which is -tau."""
-        return [complex(-math.exp(theta[0]))]
-
-    def values(self, theta: FloatArray) -> tuple[float, ...]:
-        """Return the parameters that theta stands for: tau [s]."""
-        return (math.exp(theta[0]),)
-
-    def poles(self, values: Sequence[float]) -> tuple[complex, ...]:
-        """Return the time constant for a value of tau [s].
-
-        :raises ModelError: unless it is positive.
-        """
-        return (-positive(values[0]),)
-
-    def values_of(self, constants: Sequence[complex]) -> tuple[float, ...]:
-        """Return tau [s] of the time constant that :meth:`poles` returns."""
-        return (-constants[0].real,)
+        """Return tau [s] of what :meth:`poles` returns."""
+        return (self._sign * constants[0].real,)
 
 
 @dataclass(frozen=True)
@@ -256,7 +219,7 @@ class Quadratic:
         return frequency, 0.5 * frequency * (first + second).real
 
 
-Factor = Lag | UnstableLag | Quadratic
+Factor = Lag | Quadratic
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,6 @@ from relay_autotune.process.model_parameters import (
     Lag,
     Parameter,
     Quadratic,
-    UnstableLag,
     at_least_one,
     exactly,
 )
@@ -98,7 +97,7 @@ class Structure:
     def equal_lags(self) -> bool:
         """True if it is one lag, or several equal ones, and dead time."""
         plain = self.zero is None and not self.integrators and len(self.factors) == 1
-        return plain and isinstance(self.factors[0], Lag)
+        return plain and isinstance(self.factors[0], Lag) and not self.unstable
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -352,8 +351,8 @@ LAG_COMPLEX = Structure("lag_complex", (Quadratic(PAIR), Lag()))
 IPDT = Structure("ipdt", (), 1)
 INTEGRATOR_LAG = Structure("integrator_lag", (Lag(),), 1)
 INTEGRATOR_INVERSE = Structure("integrator_inverse", (Lag(),), 1, INVERSE)
-UNSTABLE_FOPDT = Structure("unstable_fopdt", (UnstableLag(),))
-UNSTABLE_SOPDT = Structure("unstable_sopdt", (UnstableLag(_ONE), Lag(1, _TWO)))
+UNSTABLE_FOPDT = Structure("unstable_fopdt", (Lag(unstable=True),))
+UNSTABLE_SOPDT = Structure("unstable_sopdt", (Lag(1, _ONE, unstable=True), Lag(1, _TWO)))
 
 # All structures by name, the simple ones first.
 TABLE = {

@@ -221,14 +221,6 @@ class TransferFunction:
         return cls(gain, (), (positive(time_constant),) * order, 0, dead_time, "lag_n")
 
     @classmethod
-    def lag_n_zero(
-        cls, gain: float, time_constant: float, order: int, zero: float, dead_time: float
-    ) -> TransferFunction:
-        """Return ``K (z s + 1) exp(-D s)/(tau s + 1)^n``; z < 0 is an inverse response."""
-        tau = (positive(time_constant),) * order
-        return cls(gain, (zero,), tau, 0, dead_time, "lag_n_zero")
-
-    @classmethod
     def sopdt(
         cls, gain: float, time_constants: Sequence[complex], dead_time: float, zero: float = 0.0
     ) -> TransferFunction:
@@ -251,70 +243,3 @@ class TransferFunction:
         """Return ``K (z s + 1) exp(-D s)/(s^2/w0^2 + 2 zeta s/w0 + 1)``, any damping."""
         pair = oscillating_pair(natural_frequency, damping)
         return cls.sopdt(gain, pair, dead_time, zero)
-
-    @classmethod
-    def two_equal_one(
-        cls, gain: float, repeated: float, single: float, dead_time: float
-    ) -> TransferFunction:
-        """Return ``K exp(-D s)/((tau1 s + 1)^2 (tau2 s + 1))`` (model 5 of Chang et al.)."""
-        constants = (positive(repeated), positive(repeated), positive(single))
-        return cls(gain, (), constants, 0, dead_time, "two_equal_one")
-
-    @classmethod
-    def three_lags(
-        cls, gain: float, time_constants: Sequence[float], dead_time: float
-    ) -> TransferFunction:
-        """Return ``K exp(-D s)/((tau1 s + 1)(tau2 s + 1)(tau3 s + 1))``."""
-        return cls(gain, (), exactly(3, time_constants), 0, dead_time, "three_lags")
-
-    @classmethod
-    def lag_complex(
-        cls,
-        gain: float,
-        time_constant: float,
-        natural_frequency: float,
-        damping: float,
-        dead_time: float,
-    ) -> TransferFunction:
-        """Return ``K exp(-D s)/((tau s + 1)(s^2/w0^2 + 2 zeta s/w0 + 1))``."""
-        constants = (positive(time_constant), *oscillating_pair(natural_frequency, damping))
-        return cls(gain, (), constants, 0, dead_time, "lag_complex")
-
-    @classmethod
-    def ipdt(cls, gain: float, dead_time: float) -> TransferFunction:
-        """Return ``K exp(-D s)/s``."""
-        return cls(gain, (), (), 1, dead_time, "ipdt")
-
-    @classmethod
-    def integrator_lag(
-        cls, gain: float, time_constant: float, dead_time: float
-    ) -> TransferFunction:
-        """Return ``K exp(-D s)/(s (tau s + 1))``."""
-        return cls(gain, (), (positive(time_constant),), 1, dead_time, "integrator_lag")
-
-    @classmethod
-    def integrator_inverse(
-        cls, gain: float, zero: float, time_constant: float, dead_time: float
-    ) -> TransferFunction:
-        """Return ``K (1 - tau1 s) exp(-D s)/(s (tau2 s + 1))`` (Luyben 2003, eq 1).
-
-        :param zero: tau1 > 0 [s].
-        :param time_constant: tau2 > 0 [s].
-        """
-        tau = (positive(time_constant),)
-        return cls(gain, (-positive(zero),), tau, 1, dead_time, "integrator_inverse")
-
-    @classmethod
-    def unstable_fopdt(
-        cls, gain: float, time_constant: float, dead_time: float
-    ) -> TransferFunction:
-        """Return ``K exp(-D s)/(tau s - 1)`` with tau > 0 (Thyagarajan and Yu, eq 13)."""
-        return cls(-gain, (), (-positive(time_constant),), 0, dead_time, "unstable_fopdt")
-
-    @classmethod
-    def unstable_sopdt(
-        cls, gain: float, unstable: float, stable: float, dead_time: float
-    ) -> TransferFunction:
-        """Return ``K exp(-D s)/((tau1 s - 1)(tau2 s + 1))`` with tau1, tau2 > 0."""
-        constants = (-positive(unstable), positive(stable))
-        return cls(-gain, (), constants, 0, dead_time, "unstable_sopdt")

@@ -13,10 +13,10 @@ import pytest
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Rival, identified
-from relay_autotune.process.structures import IPDT, SOPDT
+from relay_autotune.process.structures import IPDT, LAG_COMPLEX, SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 
-LONG = TransferFunction.lag_complex(-0.4356, 148.123, 0.0123456, 0.345678, 15.8612)
+LONG = LAG_COMPLEX.build((-0.4356, 148.123, 0.0123456, 0.345678, 15.8612))
 ZERO = TransferFunction.sopdt(1234.5, (123.45, 12.345), 1.2345, -98.765)
 
 

@@ -16,6 +16,15 @@ import yaml
 from relay_autotune.cli import tune
 from relay_autotune.cli.tune_model import model_of
 from relay_autotune.exchange.models import model_fields
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_N_ZERO,
+    THREE_LAGS,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, design
 from relay_autotune.tuning.compensators import COMPENSATORS
@@ -96,7 +105,7 @@ def test_what_is_asked_for_reaches_the_rules(capsys):
     flags = "--phase-peak -130 --resonance 3"
     (found,) = document(capsys, drum, flags, "--rule luyben2003")["gains"]
     asked = DesignOptions(phase_peak=math.radians(-130.0), resonance=3.0)
-    model = TransferFunction.integrator_inverse(0.5, 0.4, 1.0, 1.0)
+    model = INTEGRATOR_INVERSE.build((0.5, 0.4, 1.0, 1.0))
     wanted = design(DesignTask(model=model, options=asked), "luyben2003")
     assert (found["kc"], found["ti"]) == (wanted.kc, wanted.ti)
 
@@ -108,33 +117,33 @@ def test_what_is_asked_for_reaches_the_rules(capsys):
         ("--gain -2 --time-constants 5 --order 4", TransferFunction.lag_n(-2.0, 5.0, 4, 0.0)),
         (
             "--gain 1 --time-constants 5 5 --zeros -1e-1 --dead-time 1",
-            TransferFunction.lag_n_zero(1.0, 5.0, 2, -0.1, 1.0),
+            LAG_N_ZERO.of_order(2).build((1.0, 5.0, -0.1, 1.0)),
         ),
         ("--gain 1 --time-constants 5 2", TransferFunction.sopdt(1.0, (5.0, 2.0), 0.0)),
         (
             "--gain 1 --natural-frequency 2 --damping 0.5 --dead-time 1",
             TransferFunction.oscillator(1.0, 2.0, 0.5, 1.0),
         ),
-        ("--gain 1 --integrators 1 --dead-time 2", TransferFunction.ipdt(1.0, 2.0)),
+        ("--gain 1 --integrators 1 --dead-time 2", IPDT.build((1.0, 2.0))),
         (
             "--gain 1 --integrators 1 --time-constants 3",
-            TransferFunction.integrator_lag(1.0, 3.0, 0.0),
+            INTEGRATOR_LAG.build((1.0, 3.0, 0.0)),
         ),
         (
             "--gain 1 --integrators 1 --time-constants 3 --zeros -2 --dead-time 1",
-            TransferFunction.integrator_inverse(1.0, 2.0, 3.0, 1.0),
+            INTEGRATOR_INVERSE.build((1.0, 2.0, 3.0, 1.0)),
         ),
         (
             "--structure unstable_fopdt --gain 2 --time-constants 3 --dead-time 1",
-            TransferFunction.unstable_fopdt(2.0, 3.0, 1.0),
+            UNSTABLE_FOPDT.build((2.0, 3.0, 1.0)),
         ),
         (
             "--numerator 2 --denominator 3 -1 --dead-time 1",
-            TransferFunction.unstable_fopdt(2.0, 3.0, 1.0),
+            UNSTABLE_FOPDT.build((2.0, 3.0, 1.0)),
         ),
         (
             "--gain 1 --time-constants 3 2 1 --dead-time 1",
-            TransferFunction.three_lags(1.0, (3.0, 2.0, 1.0), 1.0),
+            THREE_LAGS.build((1.0, 3.0, 2.0, 1.0, 1.0)),
         ),
     ],
 )
@@ -153,8 +162,8 @@ def test_models_by_flags(flags, model):
         TransferFunction.fopdt(-1.65, 20.0, 10.0),
         TransferFunction.lag_n(1.0, 1.0, 20, 0.001),
         TransferFunction.oscillator(1.0, 1.0, 0.4, 0.5),
-        TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
-        TransferFunction.unstable_sopdt(1.0, 2.0, 0.2, 0.2),
+        INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
+        UNSTABLE_SOPDT.build((1.0, 2.0, 0.2, 0.2)),
     ],
 )
 @pytest.mark.parametrize("how", ["replay", "identify", "tune", "stdin"])
@@ -183,7 +192,7 @@ def test_people_may_write_a_document_too(tmp_path):
         ),
         (
             '{"structure": "unstable_fopdt", "gain": 2, "time_constants": [3], "dead_time": 1}',
-            TransferFunction.unstable_fopdt(2.0, 3.0, 1.0),
+            UNSTABLE_FOPDT.build((2.0, 3.0, 1.0)),
         ),
         ('{"numerator": [2], "denominator": [3, 1]}', TransferFunction.fopdt(2.0, 3.0, 0.0)),
     ):

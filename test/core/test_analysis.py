@@ -19,6 +19,14 @@ from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, InternalModelLaw
 from relay_autotune.loop.responses import step_responses
 from relay_autotune.loop.stability import closed_loop_unstable_poles, winding
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    IPDT,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.ensemble import ensemble_peaks
@@ -42,10 +50,10 @@ def _control():
 
 RATIONAL = [
     (Controller(2.0, 3.0, 0.6, 0.06), TransferFunction.lag_n(1.0, 1.0, 3, 0.0)),
-    (Controller(0.4, 6.0, 2.0, 0.2), TransferFunction.lag_n_zero(1.0, 2.0, 3, -1.0, 0.0)),
-    (Controller(0.5, 9.0, 1.0, 0.1), TransferFunction.integrator_inverse(0.5, 0.4, 1.0, 0.0)),
-    (Controller(0.6, 1.0, 1.0, 0.1), TransferFunction.lag_complex(1.0, 0.5, 1.0, 0.2, 0.0)),
-    (Controller(6.0, 4.0, 0.3, 0.03), TransferFunction.unstable_sopdt(1.0, 2.0, 0.2, 0.0)),
+    (Controller(0.4, 6.0, 2.0, 0.2), LAG_N_ZERO.of_order(3).build((1.0, 2.0, -1.0, 0.0))),
+    (Controller(0.5, 9.0, 1.0, 0.1), INTEGRATOR_INVERSE.build((0.5, 0.4, 1.0, 0.0))),
+    (Controller(0.6, 1.0, 1.0, 0.1), LAG_COMPLEX.build((1.0, 0.5, 1.0, 0.2, 0.0))),
+    (Controller(6.0, 4.0, 0.3, 0.03), UNSTABLE_SOPDT.build((1.0, 2.0, 0.2, 0.0))),
 ]
 
 
@@ -104,7 +112,7 @@ def test_figures_of_the_set_point_response_are_those_of_scipy(control):
 def test_margins_of_an_integrating_loop_with_dead_time():
     # k exp(-D s)/s: closed forms, with and without integral action too slow to matter.
     for ti, error in ((0.0, 1e-9), (1e4, 1e-3)):
-        found = analyse_loop(Controller(0.5, ti), TransferFunction.ipdt(1.0, 1.0))
+        found = analyse_loop(Controller(0.5, ti), IPDT.build((1.0, 1.0)))
         assert found.gain_margin == pytest.approx(math.pi, rel=error)
         assert found.phase_margin == pytest.approx(math.pi / 2 - 0.5, rel=error)
         assert found.delay_margin == pytest.approx((math.pi / 2 - 0.5) / 0.5, rel=error)
@@ -113,7 +121,7 @@ def test_margins_of_an_integrating_loop_with_dead_time():
 
 def test_an_unstable_process_needs_a_least_gain():
     # (s - 1) + k: stable for k > 1, whatever else.
-    model = TransferFunction.unstable_fopdt(1.0, 1.0, 0.0)
+    model = UNSTABLE_FOPDT.build((1.0, 1.0, 0.0))
     found = analyse_loop(Controller(4.0, 0.0), model)
     assert found.gain_margin_low == pytest.approx(0.25, rel=1e-9)
     assert math.isinf(found.gain_margin)

@@ -29,6 +29,7 @@ from relay_autotune.identification.result import Validation
 from relay_autotune.identification.waveform.residuals import noise_to_signal
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import told_fields
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
@@ -82,7 +83,7 @@ def test_both_ratios_by_hand():
 
 
 def test_an_unstable_model_follows_no_open_loop(record):
-    fit = fit_of_model(TransferFunction.unstable_fopdt(1.0, 2.0, 0.3), record, 3.0)
+    fit = fit_of_model(UNSTABLE_FOPDT.build((1.0, 2.0, 0.3)), record, 3.0)
     assert math.isnan(fit.residual_rms)
 
 

@@ -29,6 +29,7 @@ from relay_autotune.identification.methods.chang import (
 from relay_autotune.identification.methods.square_wave import fundamental, level, peak, slope_sign
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -44,9 +45,9 @@ PROCESSES = [
     TransferFunction.lag_n(2.0, 3.0, 6, 0.1),
     TransferFunction.sopdt(2.0, (3.0, 1.0), 0.5),
     TransferFunction.sopdt(2.0, (300.0, 0.2), 0.5),
-    TransferFunction.two_equal_one(2.0, 1.0, 5.0, 0.5),
-    TransferFunction.two_equal_one(2.0, 10.0, 3.0, 2.0),
-    TransferFunction.two_equal_one(2.0, 3.0, 3.02, 1.0),
+    TWO_EQUAL_ONE.build((2.0, 1.0, 5.0, 0.5)),
+    TWO_EQUAL_ONE.build((2.0, 10.0, 3.0, 2.0)),
+    TWO_EQUAL_ONE.build((2.0, 3.0, 3.02, 1.0)),
 ]
 RELAY = 0.7
 

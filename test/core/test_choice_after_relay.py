@@ -12,7 +12,7 @@ import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.process.structures import structure_named
+from relay_autotune.process.structures import LAG_COMPLEX, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.process.virtual_process import Plant
@@ -54,7 +54,7 @@ def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
     "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
 )
 def test_a_pair_faster_than_its_lag_is_no_drift(seed):
-    model = TransferFunction.lag_complex(1.0, 1.0, 10.0, 0.7, 0.0)
+    model = LAG_COMPLEX.build((1.0, 1.0, 10.0, 0.7, 0.0))
     found = identify_waveform(_record(model, 0.005, seed))
     assert found.structure == "lag_complex"
     assert found.model.gain == pytest.approx(1.0, rel=0.03)

@@ -12,6 +12,7 @@ import pytest
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.sampled import simulate_closed_loop
+from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, analyse_loop
 from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator
@@ -110,7 +111,7 @@ def test_the_operating_point_is_an_offset():
 @pytest.mark.parametrize(
     ("make", "model", "message"),
     [
-        (dead_time_compensator, TransferFunction.ipdt(1.0, 1.0), "stable FOPDT"),
+        (dead_time_compensator, IPDT.build((1.0, 1.0)), "stable FOPDT"),
         (high_order_compensator, FOPDT, "equal lags"),
         (high_order_compensator, TransferFunction.sopdt(1.0, (1.0, 2.0), 0.0), "equal lags"),
         (high_order_compensator, TransferFunction.oscillator(1.0, 1.0, 0.4, 0.0), "equal lags"),

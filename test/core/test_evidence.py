@@ -16,6 +16,7 @@ from relay_autotune.exchange.evidence import ExperimentFacts, check_finding
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import INTEGRATOR_INVERSE, IPDT, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome, Record, RelaySettings
@@ -26,9 +27,9 @@ PROCESSES = {
     "reverse": TransferFunction.fopdt(-2.0, 1.0, 0.5),
     "dead time": TransferFunction.fopdt(1.0, 0.05, 1.0),
     "lags": TransferFunction.lag_n(3.0, 1.0, 4, 0.2),
-    "integrator": TransferFunction.ipdt(0.5, 1.0),
-    "unstable": TransferFunction.unstable_fopdt(1.0, 3.0, 0.5),
-    "inverse response": TransferFunction.integrator_inverse(0.5, 0.4, 1.5, 0.5),
+    "integrator": IPDT.build((0.5, 1.0)),
+    "unstable": UNSTABLE_FOPDT.build((1.0, 3.0, 0.5)),
+    "inverse response": INTEGRATOR_INVERSE.build((0.5, 0.4, 1.5, 0.5)),
     "resonance": TransferFunction.oscillator(1.0, 1.0, 0.3, 0.5),
 }
 

@@ -19,7 +19,7 @@ from relay_autotune.experiment.faults import (
     RunawayWatch,
     is_growing,
 )
-from relay_autotune.process.structures import structure_named
+from relay_autotune.process.structures import UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.cycles import limit_cycle
@@ -309,7 +309,7 @@ def test_cycles_of_a_relay_on_noise_alone_do_not_complete_it(found):
 
 
 def test_what_runs_away_is_given_up_long_before_the_patience_is_over():
-    model = TransferFunction.unstable_fopdt(1.0, 1.0, 0.2)
+    model = UNSTABLE_FOPDT.build((1.0, 1.0, 0.2))
     tune = experiment(process_gain_sign=1)
     plant, period, command = Plant(model), 0.02, 0.0
     stuck = None

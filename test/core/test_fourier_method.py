@@ -14,6 +14,12 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import METHODS, identify
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    UNSTABLE_FOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -94,7 +100,7 @@ def test_a_biased_relay_tells_even_harmonics_and_the_static_gain():
     [
         TransferFunction.lag_n(1.0, 6.0, 8, 0.6),
         TransferFunction.oscillator(1.0, 1.0, 0.4, 0.5),
-        TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+        INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
     ],
 )
 def test_the_ultimate_point_needs_no_structure(model):
@@ -109,9 +115,9 @@ def test_the_ultimate_point_needs_no_structure(model):
 @pytest.mark.parametrize(
     ("model", "known"),
     [
-        (TransferFunction.ipdt(0.5, 1.0), Known(structure="ipdt")),
-        (TransferFunction.integrator_lag(0.5, 2.0, 1.0), Known(structure="integrator_lag")),
-        (TransferFunction.unstable_fopdt(1.0, 1.0, 0.3), Known(structure="unstable_fopdt")),
+        (IPDT.build((0.5, 1.0)), Known(structure="ipdt")),
+        (INTEGRATOR_LAG.build((0.5, 2.0, 1.0)), Known(structure="integrator_lag")),
+        (UNSTABLE_FOPDT.build((1.0, 1.0, 0.3)), Known(structure="unstable_fopdt")),
         (TransferFunction.lag_n(1.0, 2.0, 3, 1.0), Known(structure="lag_n", order=3)),
         (TransferFunction.lag_n(1.0, 2.0, 3, 1.0), Known(order=3, gain=1.0, dead_time=1.0)),
     ],

@@ -16,6 +16,7 @@ from relay_autotune.identification.methods.thyagarajan2003 import equal_lags
 from relay_autotune.identification.shown.shape import normalised_growth
 from relay_autotune.process.half_cycle import HalfCycle
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 
@@ -24,8 +25,8 @@ MODELS = {
     "reverse": TransferFunction.lag_n(-1.0, 1.0, 3, 1.0),
     "equal lags": TransferFunction.lag_n(1.0, 1.0, 8, 0.1),
     "oscillator": TransferFunction.oscillator(1.0, 2.0, 0.4, 0.5),
-    "integrator": TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
-    "unstable": TransferFunction.unstable_fopdt(1.0, 1.0, 0.3),
+    "integrator": INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
+    "unstable": UNSTABLE_FOPDT.build((1.0, 1.0, 0.3)),
 }
 
 
@@ -59,7 +60,7 @@ def test_the_next_half_mirrors_it():
 def test_multiplier(name, inputs, exact, tol):
     p = inputs
     model = (
-        TransferFunction.integrator_inverse(p["Kp"], p["tau1"], p["tau2"], p["D"])
+        INTEGRATOR_INVERSE.build((p["Kp"], p["tau1"], p["tau2"], p["D"]))
         if "Kp" in p
         else TransferFunction.lag_n(p["K"], p["tau"], p["n"], p["D"])
     )

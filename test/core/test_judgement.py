@@ -24,7 +24,7 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.waveform.theta import theta_of
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import GivenModel, structure_named
+from relay_autotune.process.structures import UNSTABLE_FOPDT, GivenModel, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -99,7 +99,7 @@ def test_a_response_that_is_not_the_models_makes_its_gains_doubtful(record, gain
 
 @pytest.mark.long
 def test_a_model_that_would_have_run_away_is_refused(record, gains):
-    growing = TransferFunction.unstable_fopdt(2.0, 5.0, 1.0)
+    growing = UNSTABLE_FOPDT.build((2.0, 5.0, 1.0))
     found = findings(record, growing, gains)["growth"]
     # The command stood still for 60 s.
     assert found.value == pytest.approx(60.0 / 5.0, rel=1e-9)

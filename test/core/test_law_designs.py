@@ -15,6 +15,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, law_named
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
+from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design, tune
 from relay_autotune.tuning.frontier import Bounds
@@ -24,7 +25,7 @@ PROCESSES = {
     "fopdt": TransferFunction.fopdt(0.9, 2.0, 0.8),
     "negative": TransferFunction.fopdt(-3.0, 1.0, 4.0),
     "inverse": TransferFunction(1.0, (-0.3,), (1.0, 1.0, 1.0)),
-    "integrating": TransferFunction.integrator_lag(0.3, 0.5, 0.7),
+    "integrating": INTEGRATOR_LAG.build((0.3, 0.5, 0.7)),
     "oscillating": TransferFunction.oscillator(1.0, 2.0, 0.5, 0.5),
     "without dead time": TransferFunction(2.0, (), (3.0,)),
 }
@@ -121,7 +122,7 @@ def test_noise_in_the_command_is_limited_as_far_as_the_law_has_a_filter():
         assert gains.noise_gain * 0.02 < 0.1 * 1.1
         assert (gains.tf > 0.0) is (law != "simple_pid")
     assert "no filter to set" in " ".join(gains.warnings)
-    unstable = TransferFunction.unstable_fopdt(1.0, 1.0, 0.2)
+    unstable = UNSTABLE_FOPDT.build((1.0, 1.0, 0.2))
     gains = tune(unstable, options=asked("pid_controller", period, **noisy))
     assert "the noise is not limited" in gains.reason
     assert gains.ms < 1.41

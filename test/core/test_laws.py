@@ -18,6 +18,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, LawRate, law_named
 from relay_autotune.loop.sampled import Limits, SampledPid, simulate_closed_loop
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
+from relay_autotune.process.structures import INTEGRATOR_LAG
 from relay_autotune.process.transfer_function import TransferFunction
 
 PERIOD = 0.25
@@ -244,7 +245,7 @@ def test_its_ms_is_that_of_a_sinusoidal_test_of_its_source(name):
     [
         (PROCESS, 2.0),
         (TransferFunction(1.0, (-0.3,), (1.0, 1.0, 1.0)), 2.0),
-        (TransferFunction.integrator_lag(0.3, 0.5, 0.7), 20.0),
+        (INTEGRATOR_LAG.build((0.3, 0.5, 0.7)), 20.0),
         (TransferFunction.oscillator(1.0, 2.0, 0.3, 0.5), 2.0),
     ],
     ids=["fopdt", "inverse", "integrating", "oscillating"],

@@ -23,6 +23,7 @@ from relay_autotune.identification.methods.luyben import (
 )
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
@@ -92,7 +93,7 @@ def test_it_is_the_response_of_the_transfer_function():
     gain, tau1, tau2, dead_time = EXAMPLE
     time = np.linspace(0.0, 5.0, 101)
     u = PiecewiseConstant(np.array([0.0]), np.array([10.0]), 0.0)
-    model = TransferFunction.integrator_inverse(gain, tau1, tau2, dead_time)
+    model = INTEGRATOR_INVERSE.build((gain, tau1, tau2, dead_time))
     late = np.maximum(time - dead_time, 0.0)
     expected = step_response(late, gain, tau1, tau2, 10.0)
     assert response(model, time, u) == pytest.approx(expected, abs=1e-9)
@@ -122,7 +123,7 @@ def test_numbers_by_hand_make_a_model():
 
 def step_record(process, step=2.0, end=4.0, samples=401, noise=0.0, seed=0, begin=1.0):
     """Return a step from 40 about 50, with noise in parts of the extremum."""
-    model = TransferFunction.integrator_inverse(*process)
+    model = INTEGRATOR_INVERSE.build(process)
     time = np.linspace(0.0, end, samples)
     u = PiecewiseConstant(np.array([begin]), np.array([40.0 + step]), 40.0)
     y = 50.0 + response(model, time, u)

@@ -34,7 +34,7 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import FitReport, Identification, Validation
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains
-from relay_autotune.process.structures import GivenModel
+from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT, GivenModel
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
@@ -202,8 +202,8 @@ def identification(model: TransferFunction) -> Identification:
     "model",
     [
         TransferFunction.fopdt(1.65, 20.0, 10.0),
-        TransferFunction.ipdt(0.5, 2.0),
-        TransferFunction.unstable_fopdt(2.0, 5.0, 1.0),
+        IPDT.build((0.5, 2.0)),
+        UNSTABLE_FOPDT.build((2.0, 5.0, 1.0)),
         TransferFunction.from_polynomials([1.0], [4.0, 0.8, 1.0], 0.5),
     ],
 )

@@ -15,7 +15,13 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from relay_autotune.errors import ModelError
-from relay_autotune.process.structures import STRUCTURES, recognised, structure_named
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    STRUCTURES,
+    UNSTABLE_FOPDT,
+    recognised,
+    structure_named,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 
 W = np.logspace(-3, 3, 50)
@@ -82,12 +88,12 @@ def test_a_model_of_no_structure_stays_general():
 def test_the_controllers_sign_follows_the_process():
     assert TransferFunction.fopdt(1.0, 1.0, 1.0).process_sign == 1
     assert TransferFunction.fopdt(-1.0, 1.0, 1.0).process_sign == -1
-    assert TransferFunction.unstable_fopdt(1.0, 1.0, 0.3).process_sign == 1
-    assert TransferFunction.integrator_inverse(0.5, 0.4, 1.0, 0.1).process_sign == 1
+    assert UNSTABLE_FOPDT.build((1.0, 1.0, 0.3)).process_sign == 1
+    assert INTEGRATOR_INVERSE.build((0.5, 0.4, 1.0, 0.1)).process_sign == 1
 
 
 def test_an_unstable_fopdt_is_k_over_tau_s_minus_one():
-    model = TransferFunction.unstable_fopdt(2.0, 5.0, 0.3)
+    model = UNSTABLE_FOPDT.build((2.0, 5.0, 0.3))
     s = 1j * W
     np.testing.assert_allclose(model(s), 2.0 * np.exp(-0.3 * s) / (5.0 * s - 1.0), rtol=1e-12)
     assert not model.is_stable

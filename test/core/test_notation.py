@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
+from relay_autotune.process.structures import INTEGRATOR_LAG
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import date_text, digits, process_latex, process_mathml
 
@@ -18,7 +19,7 @@ MODELS = {
     "-2.000 (1 - 3.000 s) / (1 + 2.000 s + 4.000 s^2)": TransferFunction.oscillator(
         -2.0, 0.5, 0.5, 0.0, zero=-3.0
     ),
-    "0.1000 e^(-1.000e-05 s) / (s (1 + 3.000 s))": TransferFunction.integrator_lag(0.1, 3.0, 1e-5),
+    "0.1000 e^(-1.000e-05 s) / (s (1 + 3.000 s))": INTEGRATOR_LAG.build((0.1, 3.0, 1e-5)),
     "4.000": TransferFunction(4.0),
 }
 

@@ -13,13 +13,14 @@ import pytest
 from relay_autotune.errors import MissingPackageError, ModelError
 from relay_autotune.exchange.python_control import to_control
 from relay_autotune.loop.gains import Controller
+from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 
 MODELS = [
     TransferFunction.fopdt(1.65, 20.0, 10.0),
     TransferFunction.oscillator(-2.0, 0.3, 0.4, 0.0, zero=-1.5),
-    TransferFunction.integrator_lag(0.1, 3.0, 1.0),
-    TransferFunction.unstable_fopdt(2.0, 5.0, 0.5),
+    INTEGRATOR_LAG.build((0.1, 3.0, 1.0)),
+    UNSTABLE_FOPDT.build((2.0, 5.0, 0.5)),
 ]
 
 

@@ -15,6 +15,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
+from relay_autotune.process.structures import INTEGRATOR_LAG
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import Record
@@ -49,7 +50,7 @@ def test_methods_for_an_ideal_relay_step_aside(method):
 @pytest.mark.long
 @pytest.mark.parametrize(
     "model",
-    [TransferFunction.fopdt(1.65, 20.0, 10.0), TransferFunction.integrator_lag(0.5, 2.0, 1.0)],
+    [TransferFunction.fopdt(1.65, 20.0, 10.0), INTEGRATOR_LAG.build((0.5, 2.0, 1.0))],
 )
 def test_a_command_that_moves_between_its_samples(model):
     # Straight lines of the command, and the process by an independent solver.

@@ -15,7 +15,12 @@ from scipy.linalg import expm
 from relay_autotune.errors import RecordError
 from relay_autotune.identification.waveform.theta import columns_of
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import FOPDT
+from relay_autotune.process.structures import (
+    FOPDT,
+    INTEGRATOR_INVERSE,
+    LAG_COMPLEX,
+    UNSTABLE_FOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import PiecewiseConstant
@@ -55,10 +60,10 @@ MODELS = {
     "lags in a ladder": TransferFunction(1.0, (0.3,), (1.0, 1.3, 1.7, 2.2), 0, 0.5),
     "far apart": TransferFunction.sopdt(37.3, (7200.0, 2.0), 1.0),
     "underdamped": TransferFunction.oscillator(1.0, 2.0, 0.05, 0.123456789),
-    "lag and pair": TransferFunction.lag_complex(1.0, 2.0, 1.9, 0.2, 0.5),
-    "inverse response": TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+    "lag and pair": LAG_COMPLEX.build((1.0, 2.0, 1.9, 0.2, 0.5)),
+    "inverse response": INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
     "double integrator": TransferFunction(0.2, (2.0,), (1.0,), 2, 0.3),
-    "unstable": TransferFunction.unstable_fopdt(1.0, 5.0, 0.3),
+    "unstable": UNSTABLE_FOPDT.build((1.0, 5.0, 0.3)),
     "unstable pair": TransferFunction(1.0, (), (-2 + 1j, -2 - 1j), 0, 0.1),
     "biproper": TransferFunction(2.0, (0.5,), (3.0,), 0, 1.0),
 }

@@ -13,6 +13,7 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.analysis import analyse_loop, is_stable
+from relay_autotune.process.structures import UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design
 from relay_autotune.tuning.frontier import Bounds
@@ -80,14 +81,14 @@ def test_the_least_iae_of_pid(name, inputs, exact, tol):
     ("ratio", "pi", "pid"), [(0.22, 1.61, 1.35), (0.3, 1.97, 1.52), (0.5, 3.55, 2.08)]
 )
 def test_the_least_ms_on_an_unstable_process(ratio, pi, pid):
-    search = Search(TransferFunction.unstable_fopdt(1.0, 1.0, ratio))
+    search = Search(UNSTABLE_FOPDT.build((1.0, 1.0, ratio)))
     assert search.least_ms(derivative=False) == pytest.approx(pi, rel=0.01)
     assert search.least_ms(derivative=True) == pytest.approx(pid, rel=0.015)
 
 
 @pytest.mark.long
 def test_an_infeasible_bound_is_relaxed_with_a_warning():
-    model = TransferFunction.unstable_fopdt(2.0, 3.0, 0.9)
+    model = UNSTABLE_FOPDT.build((2.0, 3.0, 0.9))
     options = DesignOptions(controller="pi")
     controller, reason = robust(DesignTask(model=model, options=options))
     performance = analyse_loop(controller, model)
@@ -151,12 +152,10 @@ def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
     rng = np.random.default_rng(0)
     gains, lags, delays = np.array([0.09, 0.005, 0.009])[:, None] * rng.standard_normal((3, 100))
     models = tuple(
-        TransferFunction.unstable_fopdt(
-            6.8 * math.exp(g), 1.64 * math.exp(g) * (1.0 + t), 0.1656 + d
-        )
+        UNSTABLE_FOPDT.build((6.8 * math.exp(g), 1.64 * math.exp(g) * (1.0 + t), 0.1656 + d))
         for g, t, d in zip(gains, lags, 0.1656 * delays, strict=True)
     )
-    model = TransferFunction.unstable_fopdt(6.8, 1.64, 0.1656)
+    model = UNSTABLE_FOPDT.build((6.8, 1.64, 0.1656))
     controller, reason = robust(DesignTask(model=model, models=models))
     assert "Ms <= 1.4 and Mt <= 1.4" in reason
     peaks = sorted(_ms_of(controller, m) for m in models)
@@ -167,7 +166,7 @@ def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
 @pytest.mark.long
 def test_a_gain_beside_the_ultimate_one_does_not_pass_for_one_without_limit():
     # With the filter, one of the gains that are scanned lies within a cell of the ultimate one.
-    model = TransferFunction.unstable_sopdt(0.976, 0.5765, 0.04902, 0.04714)
+    model = UNSTABLE_SOPDT.build((0.976, 0.5765, 0.04902, 0.04714))
     options = DesignOptions(sample_period=0.0033408, noise_std=0.01503, amplitude=1.0)
     controller, _ = robust(DesignTask(model=model, options=options))
     assert is_stable(controller, model)
@@ -176,8 +175,8 @@ def test_a_gain_beside_the_ultimate_one_does_not_pass_for_one_without_limit():
 @pytest.mark.parametrize(
     ("model", "limit"),
     [
-        (lambda: TransferFunction.unstable_fopdt(1.0, 1.0, 2.3), "D/tau = 2.3"),
-        (lambda: TransferFunction.unstable_fopdt(1.0, 1.0, 0.9), "below Ms = 4.4"),
+        (lambda: UNSTABLE_FOPDT.build((1.0, 1.0, 2.3)), "D/tau = 2.3"),
+        (lambda: UNSTABLE_FOPDT.build((1.0, 1.0, 0.9)), "below Ms = 4.4"),
         (lambda: TransferFunction.fopdt(1.0, 1.0, 0.0), "nothing limits the gain"),
         (lambda: TransferFunction.fopdt(0.0, 1.0, 1.0), "gain"),
         (lambda: TransferFunction.fopdt(1.0, -1.0, 1.0), "time constant"),
@@ -191,7 +190,7 @@ def test_what_cannot_be_designed_is_refused_with_the_limit(model, limit):
 
 def test_a_pi_controller_cannot_hold_what_only_pid_can():
     task = DesignTask(
-        model=TransferFunction.unstable_fopdt(1.0, 1.0, 1.1),
+        model=UNSTABLE_FOPDT.build((1.0, 1.0, 1.1)),
         options=DesignOptions(controller="pi"),
     )
     with pytest.raises(TuningError, match="no PI controller"):

@@ -12,6 +12,7 @@ import pytest
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
+from relay_autotune.process.structures import INTEGRATOR_INVERSE, INTEGRATOR_LAG, IPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, DesignOptions, DesignTask, analyse_loop
 from relay_autotune.tuning.forms import SeriesForm, series_form
@@ -99,10 +100,10 @@ def test_an_integral_time_may_be_too_short_for_the_resonance():
     [
         (DRUM, "pi"),
         (DRUM, "pid"),
-        (TransferFunction.integrator_inverse(-0.547, 0.418, 1.06, 0.1), "pi"),
-        (TransferFunction.ipdt(0.5, 2.0), "pi"),
-        (TransferFunction.integrator_lag(3.0, 2.0, 0.5), "pi"),
-        (TransferFunction.integrator_lag(-3.0, 2.0, 0.5), "pid"),
+        (INTEGRATOR_INVERSE.build((-0.547, 0.418, 1.06, 0.1)), "pi"),
+        (IPDT.build((0.5, 2.0)), "pi"),
+        (INTEGRATOR_LAG.build((3.0, 2.0, 0.5)), "pi"),
+        (INTEGRATOR_LAG.build((-3.0, 2.0, 0.5)), "pid"),
     ],
 )
 def test_the_loop_has_the_resonance_that_was_asked_for(model, kind):
@@ -126,11 +127,11 @@ def test_angle_and_decibels_are_free():
 
 
 def test_proportional_action_alone_for_an_ordinary_level():
-    found, reason = luyben2003_p(task(TransferFunction.ipdt(-2.0, 3.0)))
+    found, reason = luyben2003_p(task(IPDT.build((-2.0, 3.0))))
     assert (found.ti, found.td) == (0.0, 0.0)
     assert found.kc < 0.0
     w = np.geomspace(1e-3, 3.0, 100_001)
-    value = found.loop(TransferFunction.ipdt(-2.0, 3.0))(1j * w)
+    value = found.loop(IPDT.build((-2.0, 3.0)))(1j * w)
     assert 20.0 * np.log10(np.abs(value / (1.0 + value)).max()) == pytest.approx(2.0, abs=1e-4)
     assert "offset" in reason
 
@@ -139,7 +140,7 @@ def test_proportional_action_alone_for_an_ordinary_level():
     ("ti", "model"),
     [
         (4.0, TransferFunction.lag_n(1.0, 1.0, 5, 0.5)),
-        (8.0, TransferFunction.ipdt(0.5, 1.0)),
+        (8.0, IPDT.build((0.5, 1.0))),
         (2.0, TransferFunction.oscillator(1.0, 1.0, 0.3, 0.4)),
     ],
 )

@@ -29,6 +29,7 @@ from relay_autotune.identification.shown.shape import (
 )
 from relay_autotune.process.half_cycle import HalfCycle
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings
 
@@ -83,7 +84,7 @@ def test_categories_of_the_examples(name, inputs, exact, tol):
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.65])
 def test_an_unstable_fopdt_process_has_sharp_edges_too(share):
-    model = TransferFunction.unstable_fopdt(2.0, 3.0, 3.0 * share)
+    model = UNSTABLE_FOPDT.build((2.0, 3.0, 3.0 * share))
     assert exact_shape(model).category == "1a"
 
 

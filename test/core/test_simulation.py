@@ -18,6 +18,12 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.methods.wang import fopdt_limit_cycle
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    LAG_COMPLEX,
+    TWO_EQUAL_ONE,
+    UNSTABLE_FOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 
@@ -69,7 +75,7 @@ def test_closed_forms_of_thyagarajan_for_a_stable_process(ratio):
 @pytest.mark.parametrize("ratio", [0.05, 0.3, 0.6])
 def test_closed_forms_of_thyagarajan_for_an_unstable_process(ratio):
     # Eqs 13 to 17, eq 17 as a quotient; the limit cycle exists for D/tau < ln 2.
-    cycle = exact_limit_cycle(TransferFunction.unstable_fopdt(2.0, 3.0, 3.0 * ratio), IDEAL)
+    cycle = exact_limit_cycle(UNSTABLE_FOPDT.build((2.0, 3.0, 3.0 * ratio)), IDEAL)
     half = 3.0 * math.log(1.0 / (2.0 * math.exp(-ratio) - 1.0))
     assert cycle.period == pytest.approx(2.0 * half, rel=1e-9)
     assert cycle.peak_max == pytest.approx(2.0 * math.expm1(ratio), rel=1e-9)
@@ -83,13 +89,13 @@ def test_closed_forms_of_thyagarajan_for_an_unstable_process(ratio):
 def test_worked_limit_cycles(name, inputs, exact, tol):
     p = inputs
     if name.startswith("luyben"):
-        model = TransferFunction.integrator_inverse(p["Kp"], p["tau1"], p["tau2"], p["D"])
+        model = INTEGRATOR_INVERSE.build((p["Kp"], p["tau1"], p["tau2"], p["D"]))
     elif name == "thy.eq14-17":
-        model = TransferFunction.unstable_fopdt(p["K"], p["tau"], p["D"])
+        model = UNSTABLE_FOPDT.build((p["K"], p["tau"], p["D"]))
     elif name.startswith("chang.eq11"):
         model = TransferFunction.sopdt(1.0, (p["tau1"], p["tau2"]), p["D"])
     elif name.startswith("chang.eq12"):
-        model = TransferFunction.two_equal_one(1.0, p["tau1"], p["tau2"], p["D"])
+        model = TWO_EQUAL_ONE.build((1.0, p["tau1"], p["tau2"], p["D"]))
     else:
         model = TransferFunction.lag_n(p["K"], p["tau"], p["n"], p["D"])
     cycle = exact_limit_cycle(model, IDEAL)
@@ -122,7 +128,7 @@ def test_samples_equal_the_response_to_the_recorded_command():
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("cycles", [1, 2, 5])
 def test_as_many_whole_cycles_are_run_as_asked_for(cycles, reverse):
-    model = TransferFunction.lag_complex(-1.0 if reverse else 1.0, 2.0, 1.0, 0.4, 1.0)
+    model = LAG_COMPLEX.build((-1.0 if reverse else 1.0, 2.0, 1.0, 0.4, 1.0))
     relay = RelaySettings(0.0, 0.0, 1.0, 0.1, 0.05, reverse_acting=reverse)
     run = simulate_relay(model, relay, cycles=cycles)
     assert [c.index for c in run.cycles] == list(range(cycles))
@@ -192,7 +198,7 @@ def test_a_relay_blind_to_the_noise_switches_as_without_it():
 
 
 def test_a_change_of_sign_that_was_rounding_is_no_error():
-    model = TransferFunction.lag_complex(1.0, 1.0, 1.0 / 0.9, 0.7, 0.0)
+    model = LAG_COMPLEX.build((1.0, 1.0, 1.0 / 0.9, 0.7, 0.0))
     biased = RelaySettings(0.0, 0.0, 1.0, 0.3)
     with pytest.raises(ModelError, match="kick"):
         simulate_relay(model, biased, cycles=6)

@@ -14,6 +14,7 @@ from scipy.special import gammaincc
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.methods.square_wave import fundamental, level, peak, peak_part
 from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 
@@ -62,7 +63,7 @@ def test_amplitude_with_more_and_more_harmonics(lags, period):
         TransferFunction.fopdt(1.0, 3.0, 1.0),
         TransferFunction.lag_n(1.0, 3.0, 4, 1.0),
         TransferFunction.sopdt(1.0, (3.0, 0.01), 1.0),
-        TransferFunction.two_equal_one(1.0, 3.0, 40.0, 1.0),
+        TWO_EQUAL_ONE.build((1.0, 3.0, 40.0, 1.0)),
     ],
     ids=str,
 )

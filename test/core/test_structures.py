@@ -19,10 +19,21 @@ from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.rational import free_motion, responses
 from relay_autotune.identification.waveform.selection import support
 from relay_autotune.identification.waveform.theta import columns_of
-from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic, UnstableLag
+from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
-from relay_autotune.process.structures import FOPDT
+from relay_autotune.process.structures import (
+    FOPDT,
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    THREE_LAGS,
+    TWO_EQUAL_ONE,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
@@ -42,8 +53,8 @@ DENOMINATORS = {
     "third order": (Denominator((Quadratic(), Lag())), (0,), [0.5, 0.2, 1.5, 2.03]),
     "integrator": (Denominator((), 1), (0,), [2.03]),
     "integrator and lag": (Denominator((Lag(),), 1), (0, 1), [0.7, 2.03]),
-    "unstable": (Denominator((UnstableLag(),)), (0,), [1.1, 0.53]),
-    "unstable and lag": (Denominator((UnstableLag(), Lag())), (0,), [1.1, 0.2, 0.53]),
+    "unstable": (Denominator((Lag(unstable=True),)), (0,), [1.1, 0.53]),
+    "unstable and lag": (Denominator((Lag(unstable=True), Lag())), (0,), [1.1, 0.2, 0.53]),
 }
 
 
@@ -111,17 +122,17 @@ PROCESSES = {
     "fopdt": TransferFunction.fopdt(1.65, 20.0, 10.0),
     "lag_n": TransferFunction.lag_n(1.0, 1.0, 3, 10.0),
     "lag_n, order 8": TransferFunction.lag_n(1.0, 6.0, 8, 0.6),
-    "lag_n_zero": TransferFunction.lag_n_zero(1.0, 2.0, 3, -1.0, 1.0),
+    "lag_n_zero": LAG_N_ZERO.of_order(3).build((1.0, 2.0, -1.0, 1.0)),
     "sopdt": TransferFunction.sopdt(1.0, (5.0, 1.0), 1.0),
     "sopdt, underdamped": TransferFunction.oscillator(1.0, 1.0, 0.4, 0.5),
-    "two_equal_one": TransferFunction.two_equal_one(1.0, 10.0, 3.0, 2.0),
-    "three_lags": TransferFunction.three_lags(1.0, (10.0, 3.0, 1.0), 2.0),
-    "lag_complex": TransferFunction.lag_complex(1.0, 2.0, 1.0, 0.4, 1.0),
-    "ipdt": TransferFunction.ipdt(0.5, 1.0),
-    "integrator_lag": TransferFunction.integrator_lag(0.5, 2.0, 1.0),
-    "integrator_inverse": TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
-    "unstable_fopdt": TransferFunction.unstable_fopdt(1.0, 1.0, 0.3),
-    "unstable_sopdt": TransferFunction.unstable_sopdt(1.0, 2.0, 0.2, 0.2),
+    "two_equal_one": TWO_EQUAL_ONE.build((1.0, 10.0, 3.0, 2.0)),
+    "three_lags": THREE_LAGS.build((1.0, 10.0, 3.0, 1.0, 2.0)),
+    "lag_complex": LAG_COMPLEX.build((1.0, 2.0, 1.0, 0.4, 1.0)),
+    "ipdt": IPDT.build((0.5, 1.0)),
+    "integrator_lag": INTEGRATOR_LAG.build((0.5, 2.0, 1.0)),
+    "integrator_inverse": INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
+    "unstable_fopdt": UNSTABLE_FOPDT.build((1.0, 1.0, 0.3)),
+    "unstable_sopdt": UNSTABLE_SOPDT.build((1.0, 2.0, 0.2, 0.2)),
 }
 # The others differ from one of these in the number of lags, or by a zero.
 BY_DAY = {"fopdt", "sopdt", "sopdt, underdamped", "three_lags", "ipdt", "unstable_fopdt"}

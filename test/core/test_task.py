@@ -10,6 +10,7 @@ import math
 import pytest
 
 from relay_autotune.errors import TuningError
+from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
@@ -40,7 +41,7 @@ def test_what_cannot_be_asked_is_refused_with_its_limit(asked, limit):
 
 
 def test_the_bound_on_the_complementary_sensitivity_follows_the_process():
-    stable, integrating = TransferFunction.fopdt(1.0, 1.0, 1.0), TransferFunction.ipdt(1.0, 1.0)
+    stable, integrating = TransferFunction.fopdt(1.0, 1.0, 1.0), IPDT.build((1.0, 1.0))
     assert DesignOptions().largest_mt(stable) == 1.4
     # +2 dB
     assert DesignOptions().largest_mt(integrating) == pytest.approx(10**0.1, rel=2e-3)
@@ -49,4 +50,4 @@ def test_the_bound_on_the_complementary_sensitivity_follows_the_process():
 
 def test_a_held_sample_lags_by_half_a_period():
     assert DesignOptions(sample_period=0.2, loop_delay=0.3).added_delay == pytest.approx(0.4)
-    assert DesignTask(model=TransferFunction.ipdt(1.0, 1.0)).options.added_delay == 0.0
+    assert DesignTask(model=IPDT.build((1.0, 1.0))).options.added_delay == 0.0

@@ -30,6 +30,7 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
 from relay_autotune.identification.shown.shape import shape_of_half_cycle
 from relay_autotune.process.half_cycle import HalfCycle
 from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 
@@ -127,7 +128,7 @@ def test_a_fopdt_process_with_hysteresis(relay, dead_time):
 @pytest.mark.parametrize("relay", RELAYS)
 @pytest.mark.parametrize("dead_time", [0.1, 0.3])
 def test_an_unstable_fopdt_process_with_hysteresis(relay, dead_time):
-    s = reading(TransferFunction.unstable_fopdt(1.5, 1.0, dead_time), relay)
+    s = reading(UNSTABLE_FOPDT.build((1.5, 1.0, dead_time)), relay)
     found = unstable_fopdt(s.period, s.amplitude, s.time_to_peak, 2.0, relay.hysteresis)
     assert found == pytest.approx((1.5, 1.0, dead_time), rel=1e-8)
     forward = unstable_limit_cycle(1.5, 1.0, dead_time, 2.0, relay.hysteresis)
@@ -161,7 +162,7 @@ def test_eqs_8_9_14_15(relay, tau, dead_time):
     model = (
         TransferFunction.fopdt(1.5, tau, dead_time)
         if tau > 0.0
-        else TransferFunction.unstable_fopdt(1.5, -tau, dead_time)
+        else UNSTABLE_FOPDT.build((1.5, -tau, dead_time))
     )
     half = HalfCycle(model, 0.5 * exact_limit_cycle(model, relay).period, relay.amplitude)
     time = np.linspace(0.0, half.half_period, 101, endpoint=False)

@@ -16,6 +16,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -52,7 +53,7 @@ def test_a_fopdt_record(gain, hysteresis):
 
 
 def test_an_unstable_record():
-    found = thyagarajan(record_of(TransferFunction.unstable_fopdt(1.0, 1.0, 0.3), 0.03))
+    found = thyagarajan(record_of(UNSTABLE_FOPDT.build((1.0, 1.0, 0.3)), 0.03))
     assert found.structure == "unstable_fopdt"
     assert found.values == pytest.approx([1.0, 1.0, 0.3], rel=1e-4)
     assert "unstable" in found.warnings[0]

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.loop.stability import closed_loop_unstable_poles
+from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 
@@ -54,7 +55,7 @@ def test_a_reverse_acting_process_has_a_negative_ultimate_gain():
     [
         TransferFunction.fopdt(1.0, 1.0, 0.0),
         TransferFunction.lag_n(1.0, 1.0, 2, 0.0),
-        TransferFunction.unstable_fopdt(1.0, 1.0, 1.3),
+        UNSTABLE_FOPDT.build((1.0, 1.0, 1.3)),
         TransferFunction(1.0, (), (1.0,), 2, 0.1),
     ],
     ids=["first order", "second order", "delay beyond tau", "double integrator"],
@@ -64,7 +65,7 @@ def test_a_process_without_ultimate_point_has_none(model):
 
 
 def test_an_unstable_process_has_the_upper_limit():
-    model = TransferFunction.unstable_fopdt(1.0, 1.0, 0.3)
+    model = UNSTABLE_FOPDT.build((1.0, 1.0, 0.3))
     point = ultimate_point(model)
     assert point.gain > 1.0
     assert abs(complex(point.gain * model(1j * point.frequency)) + 1.0) < 1e-12
@@ -159,9 +160,9 @@ def test_the_ultimate_point_holds_over_any_number_of_decades(exponent, ratio, or
 @given(st.floats(-140.0, 140.0), st.floats(-12.0, -0.31))
 def test_integrators_and_unstable_processes_hold_over_decades_too(exponent, ratio):
     scale = 10.0**exponent
-    point = ultimate_point(TransferFunction.ipdt(1.0, scale))
+    point = ultimate_point(IPDT.build((1.0, scale)))
     assert point.frequency * scale == pytest.approx(math.pi / 2.0, rel=1e-9)
-    point = ultimate_point(TransferFunction.unstable_fopdt(1.0, scale, scale * 10.0**ratio))
+    point = ultimate_point(UNSTABLE_FOPDT.build((1.0, scale, scale * 10.0**ratio)))
     x = point.frequency * scale
     assert math.atan(x) == pytest.approx(x * 10.0**ratio, rel=1e-9)
     assert point.gain == pytest.approx(math.hypot(1.0, x), rel=1e-9)

@@ -16,6 +16,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.judgement.assessment import integrated_error, validate
 from relay_autotune.identification.shown.fold import fold
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings
 
@@ -35,9 +36,9 @@ def record_of(model, relay, cycles=6, samples=1200, noise_std=0.0):
         (FOPDT, RelaySettings(5.0, 40.0, 1.0, 0.3, 0.1)),
         (TransferFunction.fopdt(-1.0, 1.0, 1.0), RelaySettings(5, 4, 1, 0.2, 0.1, 0, 0, True)),
         (TransferFunction.lag_n(1.0, 6.0, 8, 0.6), RelaySettings(5.0, 40.0, 1.0, 0.0, 0.05)),
-        (TransferFunction.unstable_fopdt(1.0, 1.0, 0.3), RelaySettings(5.0, 40.0, 1.0, 0, 0.03)),
+        (UNSTABLE_FOPDT.build((1.0, 1.0, 0.3)), RelaySettings(5.0, 40.0, 1.0, 0, 0.03)),
         (
-            TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+            INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
             RelaySettings(5.0, 40.0, 1.0, 0.0, 0.05),
         ),
     ],
@@ -133,9 +134,9 @@ def test_eqs_29_and_30(name, inputs, exact, tol):
     gain, tau, order, dead_time = inputs["process"]
     process = TransferFunction.lag_n(gain, tau, order, dead_time)
     first, second, third = (inputs["models"][n] for n in ("FOPDT", "SOPSDT", "HO"))
-    build = TransferFunction.fopdt if first["tau"] > 0.0 else TransferFunction.unstable_fopdt
+    structure = structure_named("fopdt" if first["tau"] > 0.0 else "unstable_fopdt")
     models = (
-        build(first["K"], abs(first["tau"]), first["D"]),
+        structure.build((first["K"], abs(first["tau"]), first["D"])),
         TransferFunction.lag_n(second["K"], second["tau"], 2, second["D"]),
         TransferFunction.lag_n(third["K"], third["tau"], 5, 0.0),
     )

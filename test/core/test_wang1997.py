@@ -25,6 +25,7 @@ from relay_autotune.identification.methods.wang import (
 )
 from relay_autotune.identification.shown.fourier import cycle_means, frequency_point
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -165,7 +166,7 @@ def test_a_known_gain_is_used(method, bias, gain):
 
 def test_the_mean_command_of_an_integrating_process_tells_no_gain():
     # Biased or not, what goes in must come out again over a cycle.
-    model = TransferFunction.ipdt(0.5, 1.0)
+    model = IPDT.build((0.5, 1.0))
     relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.1)
     run = simulate_relay(model, relay, cycles=8, time=np.arange(0.0, 40.0, 0.01))
     with pytest.raises(IdentificationError, match=r"eq 6.*integrating process"):
@@ -242,8 +243,6 @@ def test_noise_that_makes_a_lag_look_like_an_integrator_leaves_the_ultimate_poin
 
 def test_an_exact_integrator_is_refused():
     relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.0)
-    run = simulate_relay(
-        TransferFunction.ipdt(1.0, 1.0), relay, cycles=9, time=np.arange(0.0, 30.0, 0.02)
-    )
+    run = simulate_relay(IPDT.build((1.0, 1.0)), relay, cycles=9, time=np.arange(0.0, 30.0, 0.02))
     with pytest.raises(IdentificationError, match="no stable FOPDT"):
         identify_unbiased(run.record())

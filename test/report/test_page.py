@@ -23,7 +23,20 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Rival, identified
 from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.loop.gains import Controller
-from relay_autotune.process.structures import FOPDT, GivenModel, structure_of
+from relay_autotune.process.structures import (
+    FOPDT,
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    THREE_LAGS,
+    TWO_EQUAL_ONE,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+    GivenModel,
+    structure_of,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import (
     Case,
@@ -223,7 +236,7 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
             {"gain": 2.0, "time_constant": 3.0},
         ),
         (
-            lambda v: TransferFunction.lag_n_zero(v[0], v[1], 3, v[2], v[3]),
+            LAG_N_ZERO.of_order(3).build,
             {"gain": 2.0, "time_constant": 3.0, "zero": -0.7},
         ),
         (
@@ -235,26 +248,26 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
             {"gain": 2.0, "natural_frequency": 3.0, "damping": 0.3},
         ),
         (
-            lambda v: TransferFunction.two_equal_one(*v),
+            TWO_EQUAL_ONE.build,
             {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 0.5},
         ),
         (
-            lambda v: TransferFunction.three_lags(v[0], v[1:4], v[4]),
+            THREE_LAGS.build,
             {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 2.0, "time_constant_3": 1.0},
         ),
         (
-            lambda v: TransferFunction.lag_complex(*v),
+            LAG_COMPLEX.build,
             {"gain": 2.0, "time_constant": 3.0, "natural_frequency": 4.0, "damping": 0.3},
         ),
-        (lambda v: TransferFunction.ipdt(*v), {"gain": 2.0}),
-        (lambda v: TransferFunction.integrator_lag(*v), {"gain": 2.0, "time_constant": 3.0}),
+        (IPDT.build, {"gain": 2.0}),
+        (INTEGRATOR_LAG.build, {"gain": 2.0, "time_constant": 3.0}),
         (
-            lambda v: TransferFunction.integrator_inverse(*v),
+            INTEGRATOR_INVERSE.build,
             {"gain": 2.0, "inverse_time_constant": 0.4, "time_constant": 3.0},
         ),
-        (lambda v: TransferFunction.unstable_fopdt(*v), {"gain": 2.0, "time_constant": 3.0}),
+        (UNSTABLE_FOPDT.build, {"gain": 2.0, "time_constant": 3.0}),
         (
-            lambda v: TransferFunction.unstable_sopdt(*v),
+            UNSTABLE_SOPDT.build,
             {"gain": 2.0, "time_constant_1": 3.0, "time_constant_2": 0.5},
         ),
     ],
@@ -305,7 +318,7 @@ def test_a_simulated_process_is_compared_with_the_truth(tmp_path) -> None:
 
 
 def test_the_truth_is_in_the_terms_of_the_structure() -> None:
-    unstable = TransferFunction.unstable_fopdt(2.0, 5.0, 0.5)
+    unstable = UNSTABLE_FOPDT.build((2.0, 5.0, 0.5))
     names = ("gain", "time_constant", "dead_time", "damping")
     found = [true_value(name, unstable, unstable) for name in names]
     assert found[:3] == [2.0, 5.0, 0.5]

@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 
 _CASES = json.loads((Path(__file__).parent / "data" / "worked_cases.json").read_text())
@@ -25,7 +26,7 @@ PROCESSES = {
     "fopdt 1": TransferFunction.fopdt(1.0, 1.0, 1.0),
     "fopdt 10": TransferFunction.fopdt(1.0, 1.0, 10.0),
     "Chang 1.65e-10s/(20s+1)": TransferFunction.fopdt(1.65, 20.0, 10.0),
-    "Luyben int+inv": TransferFunction.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+    "Luyben int+inv": INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
 }
 
 

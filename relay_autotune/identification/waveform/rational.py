@@ -9,7 +9,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.partial_fractions import follow, partial_fractions
-from relay_autotune.process.model_parameters import Denominator, Lag, UnstableLag
+from relay_autotune.process.model_parameters import Denominator, Lag
 from relay_autotune.process.modes import Modes
 from relay_autotune.process.response import coordinates_at_changes
 from relay_autotune.record.record import Input, PiecewiseLinear
@@ -84,7 +84,7 @@ def free_motion(
         first = place.stop
         if growing_only and not factor.unstable:
             continue
-        if isinstance(factor, UnstableLag):
+        if factor.unstable:
             x = (time - time[-1]) / np.exp(part[0])
             found, changes = np.exp(x)[None, :], (-x * np.exp(x))[None, None, :]
         elif isinstance(factor, Lag):
