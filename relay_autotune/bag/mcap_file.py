@@ -11,13 +11,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.compressed_messages import Expander, are_compressed
-from relay_autotune.bag.limits import LARGEST_CHUNK, MOST_NOTES
+from relay_autotune.bag.bag_file import BagFile
+from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.locate import (
     Content,
     Messages,
@@ -35,8 +34,7 @@ from relay_autotune.bag.mcap_layout import (
     scan,
     segment_content,
 )
-from relay_autotune.bag.mcap_records import RECORD, Channel, DamageError
-from relay_autotune.bag.source import Source
+from relay_autotune.bag.mcap_records import RECORD, DamageError
 
 # Least distance between the beginnings of two records [bytes].
 _SMALLEST_RECORD = 9
@@ -63,7 +61,7 @@ class _Piece:
     listed: dict[int, IntArray]
 
 
-class McapFile:
+class McapFile(BagFile):
     """An MCAP file open for reading.
 
     :param path: the file.
@@ -72,34 +70,16 @@ class McapFile:
     """
 
     def __init__(self, path: Path, largest_chunk: int = LARGEST_CHUNK) -> None:
-        self.path = path
-        self._largest = largest_chunk
-        self._source = Source(path)
+        super().__init__(path, largest_chunk)
         try:
             layout = layout_by_summary(self._source) or scan(self._source, largest_chunk)
         except BaseException:
             self.close()
             raise
-        self.channels: dict[int, Channel] = layout.declared.channels
+        self.channels = layout.declared.channels
         self.metadata = layout.declared.metadata
-        self.notes = [*self._source.notes, *layout.notes]
+        self.notes += layout.notes
         self._layout = layout
-        self._refused: set[int] = set()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._source.close()
-
-    @property
-    def size(self) -> int:
-        """Size of the file, expanded if it is compressed as a whole [bytes]."""
-        return self._source.size
 
     def message_count(self, channel: int) -> int:
         """Return how many messages of a channel the file says it has; 0: it does not say."""
@@ -149,7 +129,7 @@ class McapFile:
             for size, found in self._messages(pieces, wanted):
                 for channel, messages in found.items():
                     counts[channel] += messages.begin.size
-                    for part in self._expanded(channel, messages):
+                    for part in self._as_sent(channel, messages, f" of {self._name(channel)}"):
                         yield channel, before, part
                 before += size + _SMALLEST_RECORD
         self._compare(counts)
@@ -167,21 +147,6 @@ class McapFile:
                     f"{self.path.name} says that it has {declared.get(channel, 0)} messages of "
                     f"{self._name(channel)}; it has {count}"
                 )
-
-    def _expanded(self, channel: int, messages: Messages) -> Iterator[Messages]:
-        """Yield messages as they were before rosbag2 compressed them, if it did."""
-        if not are_compressed(messages):
-            yield messages
-            return
-        expander = Expander(self._source, self._largest)
-        yield from expander.expand(messages)
-        if expander.first_refusal and channel not in self._refused:
-            self._refused.add(channel)
-            self._note(
-                f"{self.path.name} has compressed messages of {self._name(channel)} that cannot "
-                f"be expanded, the first of them because {expander.first_refusal}; they are left "
-                f"out"
-            )
 
     def _batches(self, wanted: frozenset[int]) -> Iterator[list[_Piece]]:
         """Yield the segments that may hold messages of some channels, small ones together."""
@@ -270,10 +235,3 @@ class McapFile:
     def _name(self, channel: int) -> str:
         declared = self.channels.get(channel)
         return declared.topic if declared else f"channel {channel}"
-
-    def _note(self, note: str) -> None:
-        if note in self.notes or len(self.notes) > MOST_NOTES:
-            return
-        if len(self.notes) == MOST_NOTES:
-            note = f"{self.path.name} has more faults, which are not listed"
-        self.notes.append(note)

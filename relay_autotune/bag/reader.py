@@ -11,11 +11,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from relay_autotune.arrays import IntArray
+from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.signals import Selection, join, preceded, window
@@ -29,10 +30,6 @@ from relay_autotune.exchange.messages import (
     start_seconds,
 )
 from relay_autotune.record.record import Outcome, Record
-
-if TYPE_CHECKING:
-    from relay_autotune.bag.sqlite_file import SqliteFile
-
 
 _STORED = (".mcap", ".db3")
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
@@ -89,7 +86,7 @@ def read_experiments(
         )
     else:
         with ExitStack() as opened:
-            files: list[McapFile | SqliteFile] = []
+            files: list[BagFile] = []
             for file in (file for part in paths for file in _data_files(part)):
                 files.append(_opened(file, wanted.largest_chunk))
                 opened.enter_context(files[-1])
@@ -134,7 +131,7 @@ def _named_so(path: Path) -> bool:
     return path.suffix in _STORED or path.suffixes[-2:] in _WHOLE
 
 
-def _opened(path: Path, largest: int) -> McapFile | SqliteFile:
+def _opened(path: Path, largest: int) -> BagFile:
     if ".db3" in path.suffixes[-2:]:
         # Imported here: most recordings need no database.
         from relay_autotune.bag.sqlite_file import SqliteFile

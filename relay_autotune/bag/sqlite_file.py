@@ -10,24 +10,24 @@ import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from relay_autotune.bag.compressed_messages import Expander, are_compressed
+from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.definitions import find_definition
 from relay_autotune.bag.limits import LARGEST_CHUNK, LARGEST_DEFINITION, MOST_DECLARATIONS
 from relay_autotune.bag.locate import Messages
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.source import SQLITE_MAGIC, Source
+from relay_autotune.bag.source import SQLITE_MAGIC
 from relay_autotune.errors import BagError
 
 # Size of the messages that are handed on together [bytes].
 _BATCH = 4 << 20
 
 
-class SqliteFile:
-    """A ``.db3`` file of rosbag2 open for reading; it offers what ``McapFile`` does.
+class SqliteFile(BagFile):
+    """A ``.db3`` file of rosbag2 open for reading.
 
     It holds definitions of types since Iron; for an older one, those of the installed packages
     count.
@@ -38,12 +38,7 @@ class SqliteFile:
     """
 
     def __init__(self, path: Path, largest: int = LARGEST_CHUNK) -> None:
-        self.path = path
-        self.metadata: list[tuple[str, dict[str, str]]] = []
-        self._largest = largest
-        self._source = Source(path, SQLITE_MAGIC)
-        self.size = self._source.size
-        self.notes = [*self._source.notes]
+        super().__init__(path, largest, SQLITE_MAGIC)
         if path.with_name(path.name + "-wal").exists():
             self.notes.append(f"{path.name}-wal holds the end of the recording and is not read")
         try:
@@ -60,17 +55,11 @@ class SqliteFile:
             self.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the file."""
         with suppress(AttributeError):
             self._database.close()
-        self._source.close()
+        super().close()
 
     def _opened(self) -> sqlite3.Connection:
         descriptor = self._source.fileno()
@@ -122,10 +111,6 @@ class SqliteFile:
             )
         return channels
 
-    def message_count(self, _channel: int) -> int:
-        """Return how many messages of a channel the file says it has; 0: it does not say."""
-        return 0
-
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:
         """Yield the messages of some channels, a run of them at a time.
 
@@ -168,18 +153,5 @@ class SqliteFile:
                 np.append(0, end[:-1]),
                 end,
             )
-            if not are_compressed(messages):
-                yield channel, before, messages
-                continue
-            expander = Expander(self._source, self._largest)
-            for part in expander.expand(messages):
+            for part in self._as_sent(channel, messages):
                 yield channel, before, part
-            if expander.first_refusal:
-                self._note(
-                    f"{self.path.name} has compressed messages that cannot be expanded, the first "
-                    f"of them because {expander.first_refusal}; they are left out"
-                )
-
-    def _note(self, note: str) -> None:
-        if note not in self.notes:
-            self.notes.append(note)

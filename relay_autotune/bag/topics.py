@@ -12,26 +12,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
 from relay_autotune.bag.definitions import message_type
 from relay_autotune.bag.field_path import first_numbers, some_numbers, steps_of
 from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
 from relay_autotune.bag.locate import Messages
-from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.schema import Struct, Type
 from relay_autotune.bag.signals import SignalReader, TimedSignal
 from relay_autotune.errors import BagError, FieldError, SelectionError
-
-if TYPE_CHECKING:
-    from relay_autotune.bag.sqlite_file import SqliteFile
-
 
 # Called with the progress of reading: bytes done, bytes in all.
 Progress = Callable[[int, int], None]
@@ -67,7 +63,7 @@ class Topics:
     """
 
     path: FilePath
-    files: Sequence[McapFile | SqliteFile]
+    files: Sequence[BagFile]
     clock: str = "publish"
     progress: Progress | None = None
     _signals: dict[str, TimedSignal] = field(default_factory=dict)
