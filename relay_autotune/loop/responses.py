@@ -47,21 +47,25 @@ class StepResponse:
     command: FloatArray
 
 
-def abscissae(duration: float, points: int) -> ComplexArray:
-    """Return the values of s for the transform of :func:`inverted` [rad/s], shape (points + 1,).
+def abscissae(duration: float | FloatArray, points: int) -> ComplexArray:
+    """Return the values of s for the transform of :func:`inverted` [rad/s].
 
-    :param duration: s.
+    They lie on a line right of the imaginary axis (Dubner and Abate 1968).
+
+    :param duration: s; or one of each function, shape (k, 1).
     :param points: number of instants of the function.
+    :return: shape (points + 1,), or (k, points + 1).
     """
     return _DECAY / (2.0 * duration) + 1j * np.arange(points + 1) * (math.pi / duration)
 
 
-def inverted(values: ComplexArray, duration: float, jump: float = 0.0) -> FloatArray:
+def inverted(values: ComplexArray, duration: float | FloatArray, jump: float = 0.0) -> FloatArray:
     """Return the function of a Laplace transform at equally spaced times from 0 on.
 
     :param values: the transform at :func:`abscissae`, shape (..., points + 1); it must not have
         poles right of the imaginary axis.
-    :param duration: s; the last instant is one step before it.
+    :param duration: s; the last instant is one step before it; or one of each function, shape
+        (k, 1).
     :param jump: value just after t = 0.
     :return: shape (..., points).
     """

@@ -33,6 +33,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.margins import frequencies, peaks
 from relay_autotune.loop.noise import filter_for
+from relay_autotune.loop.responses import abscissae, inverted
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.candidates import (
@@ -46,7 +47,6 @@ from relay_autotune.tuning.frontier import Bounds, Responses, design_grid
 
 _POINTS = 512
 _RESETS, _TURNS = 6.0, 5.0
-_DECAY = math.log(1e8)
 
 
 def load_iaes(
@@ -59,9 +59,6 @@ def load_iaes(
 ) -> FloatArray:
     """Return the IAE of a unit step of the load for each controller [y s/u].
 
-    The response is inverted by a fast Fourier transform along ``Re s = sigma`` (Dubner and Abate
-    1968), the dead time being exact.
-
     :param model: the process.
     :param kp: proportional gains, positive, of stable loops, shape (k,).
     :param ki: integral gains, shape (k,).
@@ -73,19 +70,14 @@ def load_iaes(
     if model.is_stable:
         # With a small gain the response is that of the integral alone.
         reset = reset + 1.0 / (ki * abs(model.gain))
-    duration = _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
-    period = 2.0 * duration[:, None]
-    sigma = _DECAY / period
-    s = sigma + 1j * np.arange(_POINTS + 1) * (2.0 * math.pi / period)
+    duration = (_RESETS * reset + _TURNS * 2.0 * math.pi / frequency)[:, None]
+    s = abscissae(duration, _POINTS)
     p, i, d, f = (values[:, None] for values in (kp, ki, td, tf))
     process = model.process_sign * model(s)
     controller = (p * (1.0 + d * s) + i / s) / (1.0 + f * s + 0.5 * (f * s) ** 2)
-    smooth = np.sinc(np.arange(_POINTS + 1) / _POINTS)
-    transform = process / (s * (1.0 + controller * process)) * smooth
-    step = period / (2 * _POINTS)
-    time = np.arange(_POINTS) * step
-    y = np.fft.irfft(transform, axis=-1)[:, :_POINTS] * np.exp(sigma * time) / step
-    return np.asarray(1.0 / ki + 2.0 * step[:, 0] * np.maximum(-y, 0.0).sum(axis=1))
+    y = inverted(process / (s * (1.0 + controller * process)), duration)
+    step = duration[:, 0] / _POINTS
+    return np.asarray(1.0 / ki + 2.0 * step * np.maximum(-y, 0.0).sum(axis=1))
 
 
 _SHRINK, _GROW = 0.5, 1.5
