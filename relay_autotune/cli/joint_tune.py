@@ -176,7 +176,7 @@ class JointTune:
 
     def plan(self) -> list[str]:
         """Return the plan, as lines of a checklist."""
-        from relay_autotune.nodes.checklist import ChecklistLine, Mark
+        from relay_autotune.nodes.readiness import ChecklistLine, Mark
 
         loop = self._loop
         lines = [

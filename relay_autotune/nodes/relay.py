@@ -24,15 +24,6 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.narration import how_long
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
-from relay_autotune.nodes.checklist import (
-    Checklist,
-    LastSamples,
-    expected,
-    look_at_identifier,
-    look_at_limits,
-    look_at_recording,
-    look_at_rest,
-)
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
@@ -43,10 +34,18 @@ from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.nodes.quality import FOLLOW_EVERY, described, who, why_no_publisher
 from relay_autotune.nodes.readiness import (
+    Checklist,
+    LastSamples,
     NotReadyError,
     Ready,
     baseline_from,
+    expected,
     is_beyond_known,
+    look_at_identifier,
+    look_at_limits,
+    look_at_recording,
+    look_at_rest,
+    on_setpoint,
     plan_of,
     policy_from,
     require_actuator,
@@ -57,7 +56,6 @@ from relay_autotune.nodes.readiness import (
 )
 from relay_autotune.nodes.recordings import Recordings
 from relay_autotune.nodes.reports import (
-    Counter,
     cycle_message,
     diagnostics,
     experiment_message,
@@ -65,10 +63,9 @@ from relay_autotune.nodes.reports import (
     state_values,
 )
 from relay_autotune.nodes.results import MODEL, OwnResults
-from relay_autotune.nodes.session import Session
-from relay_autotune.nodes.setpoint_session import SetpointSession, on_setpoint, reported_by
+from relay_autotune.nodes.session import Session, SetpointSession, reported_by
 from relay_autotune.nodes.signs_of_life import said_by
-from relay_autotune.nodes.silence import Sensor, require_own_time
+from relay_autotune.nodes.silence import Counter, Sensor, require_own_time
 from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from relay_autotune.errors import RecordError
 from relay_autotune.exchange.messages import fill_cycle, fill_experiment, fill_settings, set_stamp
 from relay_autotune.nodes.session import Session
+from relay_autotune.nodes.silence import Counter
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 
@@ -70,45 +70,6 @@ def experiment_message(session: Session, *, arrays: bool = True) -> Any:
 def losses(count: int) -> str:
     """Say how many samples were lost on the way; "" for none."""
     return f"{count} {'sample' if count == 1 else 'samples'} lost on the way" if count else ""
-
-
-class Counter:
-    """Count arrivals: their number, the time since the last, and losses in the middleware."""
-
-    def __init__(self) -> None:
-        self.lost = 0
-        """Samples lost since `begin`, by the publisher's numbers."""
-        self._last_arrival = -math.inf
-        self._arrivals = self._arrivals_before = 0
-        self._sequence = 0
-
-    @property
-    def age(self) -> float:
-        """Time since the last arrival [s]; inf before the first."""
-        return time.monotonic() - self._last_arrival
-
-    def begin(self) -> None:
-        """Count losses, and the age, from here on."""
-        self.lost = 0
-        self._last_arrival = time.monotonic()
-
-    def add(self, number: int | None) -> None:
-        """Take an arrival.
-
-        :param number: its publication sequence number; None: not known.
-        """
-        self._last_arrival = time.monotonic()
-        self._arrivals += 1
-        if number is not None:
-            if number > self._sequence + 1 and self._sequence:
-                self.lost += number - self._sequence - 1
-            self._sequence = number
-
-    def since_last_asked(self) -> int:
-        """Return the number of arrivals since this was last asked."""
-        count = self._arrivals - self._arrivals_before
-        self._arrivals_before = self._arrivals
-        return count
 
 
 def state_values(

@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import array
+import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +17,15 @@ import numpy as np
 # numpy imports this at its first median; load it now, since it takes 20 ms in a tune.
 import numpy.ma
 
+from relay_autotune.arrays import FloatArray
+from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import start_seconds
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.experiment.faults import ClockWatch
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import Record, RelaySettings
 
 # A measurement waits no longer than this for its callback, unless a clock was set back [ns].
 _LONGEST_WAIT_NS = 1_000_000_000
@@ -109,14 +114,8 @@ class Session:
         :param measurement: the sensor's last value, possibly from before the tune [y].
         :param ago: age of the repeated sample [s].
         """
-        now = self.now_ns() - round(1e9 * ago)
-        if self._count == 0:
-            self.start_ns = now
-        self._count += 1
-        self._repeated_ns = now
-        command = self.experiment.repeat((now - self.start_ns) * 1e-9, measurement)
-        self._last = (now, now, measurement, command)
-        return command
+        now = self._repeated_ns = self.now_ns() - round(1e9 * ago)
+        return self._answer_at(now, now, measurement, self.experiment.repeat)
 
     def now_ns(self) -> int:
         """Return the present time on the clock of the experiment [ns]."""
@@ -152,45 +151,46 @@ class Session:
             lost_samples=self.lost_samples,
         )
 
+    def _answer_at(
+        self,
+        received: int,
+        source: int,
+        measurement: float,
+        step: Callable[[float, float], float],
+    ) -> float:
+        """Take a sample with its stamps [ns]; return the command."""
+        if self._count == 0:
+            self.start_ns = source
+        self._count += 1
+        # Relative to the first sample: a float of seconds since 1970 cannot hold microseconds.
+        command = step((source - self.start_ns) * 1e-9, measurement)
+        self._last = (received, source, measurement, command)
+        return command
+
     def _answer_by_stamp(self, measurement: float, info: Mapping[str, Any]) -> float:
         received = info["received_timestamp"] or time.time_ns()
         source = info["source_timestamp"] or received
         if self._one_clock:
             # A simulated robot's clock may run at another pace than ours.
             received = source
-        if self._count == 0:
-            self.start_ns = source
-        self._count += 1
-        command: float = self._step((source - self.start_ns) * 1e-9, measurement)
-        # Relative to the first sample: a float of seconds since 1970 cannot hold microseconds.
+        command = self._answer_at(received, source, measurement, self._step)
         start = self.start_ns
         stepped = self.clocks.add((source - start) * 1e-9, (received - start) * 1e-9)
         if stepped:
             command = self.experiment.abort(stepped)
-        self._last = (received, source, measurement, command)
+            self._last = (received, source, measurement, command)
         return command
 
     def _answer_by_arrival(self, measurement: float, info: Mapping[str, Any]) -> float:
         received = info["received_timestamp"] or time.time_ns()
-        if self._count == 0:
-            self.start_ns = received
-        elif 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
+        if 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
             # The message waited in the queue while the value before it was repeated.
             received = self._repeated_ns
-        self._count += 1
-        command: float = self._step((received - self.start_ns) * 1e-9, measurement)
-        self._last = (received, received, measurement, command)
-        return command
+        return self._answer_at(received, received, measurement, self._step)
 
     def _answer_by_clock(self, measurement: float, _: Mapping[str, Any]) -> float:
-        assert self._clock is not None
-        now = self._clock()
-        if self._count == 0:
-            self.start_ns = now
-        self._count += 1
-        command: float = self._step((now - self.start_ns) * 1e-9, measurement)
-        self._last = (now, now, measurement, command)
-        return command
+        now = self.now_ns()
+        return self._answer_at(now, now, measurement, self._step)
 
     def _answer_by_number(self, measurement: float, info: Mapping[str, Any]) -> float | None:
         k = self._count
@@ -223,3 +223,91 @@ class Session:
             return None
         self.may_be_no_repeat = False
         return self._answer_by_number(self._last[2], {"source_timestamp": None})
+
+
+# A relay experiment on the set-point: the present loop stays closed.
+
+
+def reported_by(values: Mapping[str, Any]) -> Callable[[Any], float] | None:
+    """Return what reads the controller's command from the measurement's messages.
+
+    :param values: the fixed parameters of relay_node.
+    :return: None: these messages do not have it.
+    :raises ParameterError: if they cannot have it, or nothing is done with it.
+    """
+    field = values["controller_command_field"]
+    if not field:
+        return None
+    if values["relay_on"] != "setpoint" or values["path"] != "passthrough":
+        raise ParameterError(
+            f"controller_command_field is {field!r}, which is for relay_on setpoint with path "
+            f"passthrough: found {values['relay_on']} and {values['path']}"
+        )
+    return reader_of(values["measurement_type"], field, "controller_command_field").value
+
+
+class SetpointSession(Session):
+    """A session whose record holds the controller's commands, not the set-points.
+
+    The controller answers a sample after the relay has seen it. So the command of a sample is
+    known only at the next sample.
+
+    :param actual: returns the last command to the actuator [u].
+    """
+
+    def __init__(self, *args: Any, actual: Callable[[], float], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._actual = actual
+        self._told: list[float] = []
+        self._record_later: Callable[[tuple[int, int, float, int, float]], None] | None = None
+        self._last_sample: tuple[int, int, float, int, float] | None = None
+
+    def record_with(self, sample: Callable[[tuple[int, int, float, int, float]], None]) -> None:
+        """Hand each sample and the controller's answer to ``sample``, one sample later."""
+        self._record_later = sample
+        super().record_with(self._keep)
+
+    def _keep(self, sample: tuple[int, int, float, int, float]) -> None:
+        self._hand_on()
+        self._last_sample = sample
+
+    def _hand_on(self) -> None:
+        last = self._last_sample
+        if last is None or self._record_later is None:
+            return
+        told = self._actual()
+        self._told.append(told)
+        self._record_later((*last[:4], told))
+        self._last_sample = None
+
+    def record(self) -> Record:
+        """Return the record, with the controller's commands.
+
+        While the experiment runs, the answer to the last sample may be missing; the previous
+        command stands in for it.
+
+        :raises RecordError: if there was no sample.
+        """
+        if self.experiment.finished:
+            self._hand_on()
+        record = super().record()
+        told = np.array(self._told[: len(record)])
+        if told.size < len(record):
+            told = np.append(told, np.full(len(record) - told.size, self._actual()))
+        settings = record.settings
+        if settings is not None:
+            settings = _settings_of(settings, told, record)
+        return replace(record, command=told, settings=settings)
+
+
+def _settings_of(settings: RelaySettings, told: FloatArray, record: Record) -> RelaySettings:
+    moved = np.flatnonzero(record.command != record.command[0])
+    rest = float(told[: moved[0]].mean()) if moved.size and moved[0] > 0 else float(told[0])
+    low, high = float(told.min()), float(told.max())
+    return replace(
+        settings,
+        baseline=rest,
+        amplitude=0.5 * (high - low) or math.ulp(rest),
+        bias=0.5 * (high + low) - rest,
+        reverse_acting=False,
+    )

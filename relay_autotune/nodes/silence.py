@@ -19,7 +19,6 @@ from relay_autotune.experiment.faults import Repetition
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import Reader
-from relay_autotune.nodes.reports import Counter
 
 # Shortest period of a timer, and interval of the graph checks during a tune [s].
 _LEAST_WAIT = 1e-3
@@ -138,6 +137,45 @@ class Repeater:
 
     def _is_due(self, now: float) -> bool:
         return self._repetition.wait(now) <= _ROUNDING
+
+
+class Counter:
+    """Count arrivals: their number, the time since the last, and losses in the middleware."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        """Samples lost since `begin`, by the publisher's numbers."""
+        self._last_arrival = -math.inf
+        self._arrivals = self._arrivals_before = 0
+        self._sequence = 0
+
+    @property
+    def age(self) -> float:
+        """Time since the last arrival [s]; inf before the first."""
+        return time.monotonic() - self._last_arrival
+
+    def begin(self) -> None:
+        """Count losses, and the age, from here on."""
+        self.lost = 0
+        self._last_arrival = time.monotonic()
+
+    def add(self, number: int | None) -> None:
+        """Take an arrival.
+
+        :param number: its publication sequence number; None: not known.
+        """
+        self._last_arrival = time.monotonic()
+        self._arrivals += 1
+        if number is not None:
+            if number > self._sequence + 1 and self._sequence:
+                self.lost += number - self._sequence - 1
+            self._sequence = number
+
+    def since_last_asked(self) -> int:
+        """Return the number of arrivals since this was last asked."""
+        count = self._arrivals - self._arrivals_before
+        self._arrivals_before = self._arrivals
+        return count
 
 
 class Sensor:

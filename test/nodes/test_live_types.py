@@ -20,7 +20,7 @@ from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import remote_loop
 from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.live_types import reader_of, struct_of
-from relay_autotune.nodes.setpoint_session import reported_by
+from relay_autotune.nodes.session import reported_by
 
 JOINTS = [f"arm_{k}" for k in range(7)]
 
