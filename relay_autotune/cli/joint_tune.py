@@ -527,7 +527,7 @@ class JointTune:
 
         :raises LoopError: if it does not answer.
         """
-        from relay_autotune.nodes.remote_gains import controller_of
+        from relay_autotune.nodes.gains_place import controller_of
 
         p, i, d = self._client.values(self._loop.node, self._loop.parameters).values()
         return controller_of({"p": p, "i": i, "d": d}) if p else None

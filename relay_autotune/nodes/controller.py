@@ -21,7 +21,7 @@ from relay_autotune.control.controller import GainBounds, is_usable, running
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Step, runs_stably
 from relay_autotune.errors import FieldError, ParameterError, RelayAutotuneError, TuningError
-from relay_autotune.loop.gains import Gains
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import (
     FIXED,
@@ -36,12 +36,11 @@ from relay_autotune.nodes.controller_parameters import (
     rate_from,
 )
 from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
+from relay_autotune.nodes.gains_place import OwnGains, Place, RemoteGains, mapping_of, said
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.own_gains import OwnGains, controller_of, said, set_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
-from relay_autotune.nodes.remote_gains import RemoteGains, mapping_of
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.silence import Repeater, require_own_time
@@ -115,15 +114,13 @@ class ControllerNode(ServedNode):
             ended=self._after_verification,
         )
         self._remote: RemoteLoop | None = None
-        self._place: OwnGains | RemoteGains = OwnGains(self._use, self._rate)
+        self._place: Place = OwnGains(self._use, self._rate)
         self._reported, setpoints = reported_by(values)
         if values["apply_to"]:
-            mapping = mapping_of([part.strip() for part in values["apply_parameters"].split(",")])
-            self._place = RemoteGains(
-                self, values["apply_to"], mapping, values["apply_feedforward"]
-            )
+            target, mapping = values["apply_to"], mapping_of(values["apply_parameters"])
+            self._place = RemoteGains(self, target, mapping, values["apply_feedforward"])
             self._remote = RemoteLoop(
-                self, self._place, self._setpoint, setpoints, self._verifier.interrupt
+                self, target, self._setpoint, setpoints, self._verifier.interrupt
             )
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
@@ -170,7 +167,7 @@ class ControllerNode(ServedNode):
             # The same numbers are other gains under another law.
             " ".join(filter(None, (measurement.topic_name, values["apply_to"], under))),
         )
-        given = set_of(gains) if gains is not None and self._remote is None else None
+        given = self._own(gains) if self._remote is None else None
         self._keeper = GainsKeeper(self, self._place, journal, given)
         if self._remote is None and self._keeper.gains != given:
             self._use(self._keeper.gains)
@@ -422,7 +419,7 @@ class ControllerNode(ServedNode):
 
     def _use(self, kept: GainSet | None) -> None:
         """Put gains in force, and into the parameters."""
-        gains = None if kept is None else controller_of(kept)
+        gains = None if kept is None else self._place.controller_of(kept)
         self._pid.use(gains)
         values: dict[str, Any] = {entry.name: entry.default for entry in GAINS}
         if gains is not None:
@@ -544,6 +541,10 @@ class ControllerNode(ServedNode):
 
     # Parameters.
 
+    def _own(self, gains: Controller | None) -> GainSet | None:
+        """Return the gains of the parameters as the history keeps them."""
+        return None if gains is None else self._place.set_of(gains)
+
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         if self._following:
             return SetParametersResult(successful=True)
@@ -557,7 +558,9 @@ class ControllerNode(ServedNode):
             if gains is not None:
                 bounds.require(gains)
             if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
-                self._keeper.require_editable(set_of(gains) if gains is not None else None)
+                self._keeper.require_editable(
+                    self._place.set_of(gains) if gains is not None else None
+                )
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -570,7 +573,7 @@ class ControllerNode(ServedNode):
         if names & NAMES_OF_GAINS and self._remote is None:
             gains = gains_from(values)
             self._pid.use(gains)
-            self._keeper.edited(set_of(gains) if gains is not None else None)
+            self._keeper.edited(self._own(gains))
         self._range = range_from(values)
         if names & {"command_min", "command_max"}:
             self._limits = limits_from(values)

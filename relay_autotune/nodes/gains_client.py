@@ -34,8 +34,8 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import FIXED, GAINS, NONE_WAIT, rate_from
+from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
-from relay_autotune.nodes.remote_gains import controller_of, mapping_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.text import TOLD_EVERY, duration
@@ -162,7 +162,7 @@ class GainsClient(LoopClient):
         names = ("apply_to", "apply_parameters")
         target, mapping = self.values(self.name, names).values()
         if target:
-            places = mapping_of([part.strip() for part in mapping.split(",")])
+            places = mapping_of(mapping)
             there = self.values(target, list(places.values()))
             return controller_of({gain: there[place] for gain, place in places.items()})
         found = self.values(self.name, [entry.name for entry in GAINS])

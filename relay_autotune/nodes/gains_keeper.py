@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.task import Future
 from rclpy.timer import Timer
@@ -33,7 +33,7 @@ from relay_autotune.control.gains_history import (
     Work,
 )
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.gains import Gains
+from relay_autotune.nodes.gains_place import Place
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 
 _VERSION = 1
@@ -188,33 +188,6 @@ def _history_of(found: dict[str, Any]) -> GainsHistory:
 
 # Time between attempts when the place of the gains does not answer [s].
 _ASK_AGAIN = 1.0
-
-
-class Place(Protocol):
-    """Where gains act: this node's controller, or another node's parameters."""
-
-    name: str
-    outlives: bool
-    """True if the gains stay in force when this process ends."""
-
-    def require_law(self, gains: Gains) -> None:
-        """Refuse gains that are for a law which does not run there.
-
-        :raises TuningError: with what to do.
-        """
-
-    async def read(self) -> GainSet | None:
-        """Return the gains in force, None if the command is held."""
-
-    async def put(self, gains: GainSet | None) -> None:
-        """Apply gains, all or none.
-
-        :param gains: None: hold the command, if the place can.
-        :raises RelayAutotuneError: if they are not in force, or it is unknown whether they are.
-        """
-
-    def said(self, gains: GainSet | None) -> str:
-        """Return a sentence on the gains in force now."""
 
 
 class GainsKeeper:

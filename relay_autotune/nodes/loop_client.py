@@ -12,14 +12,13 @@ from contextlib import contextmanager, suppress
 from typing import Any, Self
 
 import rclpy
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
-from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
@@ -270,10 +269,7 @@ class LoopClient:
         :raises LoopError: if the node refuses or does not answer.
         """
         request = SetParametersAtomically.Request(
-            parameters=[
-                Parameter(name=name, value=_parameter_value(value))
-                for name, value in values.items()
-            ]
+            parameters=[Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
         )
         result = self.call(
             SetParametersAtomically, f"{node}/set_parameters_atomically", request
@@ -412,9 +408,3 @@ class LoopClient:
                 return False
             self._executor.spin_once(timeout_sec=min(left, 0.05))
         return True
-
-
-def _parameter_value(value: float | bool) -> ParameterValue:
-    if isinstance(value, bool):
-        return ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=value)
-    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)

@@ -18,7 +18,6 @@ from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.remote_gains import RemoteGains
 from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.nodes.verifier import NotVerifiable
 
@@ -54,7 +53,7 @@ class RemoteLoop:
     """Hear another node's controller, and move its set-point.
 
     :param node: this node.
-    :param gains: the other node's parameters.
+    :param target: name of the other node.
     :param setpoint: its set-point until one is received [y]; NaN: not known.
     :param setpoints: writes a set-point into its message.
     :param disturbed: called with the reason when another node moves the set-point.
@@ -63,14 +62,14 @@ class RemoteLoop:
     def __init__(
         self,
         node: Node,
-        gains: RemoteGains,
+        target: str,
         setpoint: float,
         setpoints: CommandMessage,
         disturbed: Callable[[str], None],
     ) -> None:
         self.command = math.nan
         """The last command received [u]; NaN before the first."""
-        self._gains = gains
+        self._target = target
         self._heard_at = 0.0
         self.setpoint = setpoint
         """The set-point in force [y]; NaN: not known."""
@@ -93,14 +92,14 @@ class RemoteLoop:
         silent = time.monotonic() - self._heard_at
         if silent < _SILENCE:
             return ""
-        return f"no command of {self._gains.name} for {silent:.3g} s"
+        return f"no command of {self._target} for {silent:.3g} s"
 
     def require_ready(self) -> None:
         """Refuse a loop in which the effect of a set-point step could not be seen.
 
         :raises NotVerifiable: with the reason.
         """
-        topic, target = self._publisher.topic_name, self._gains.name
+        topic, target = self._publisher.topic_name, self._target
         if math.isnan(self.setpoint):
             raise NotVerifiable(
                 f"the set-point of {target} is not known: publish it on {topic}, or give "

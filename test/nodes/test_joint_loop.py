@@ -23,6 +23,7 @@ from relay_autotune.nodes.controller_manager import (
     forwarding,
     in_the_way,
 )
+from relay_autotune.nodes.gains_place import controller_of
 from relay_autotune.nodes.joint_loop import (
     LAWS,
     TRAJECTORY_CONTROLLER,
@@ -32,7 +33,6 @@ from relay_autotune.nodes.joint_loop import (
     limits_in,
     put_gains,
 )
-from relay_autotune.nodes.remote_gains import controller_of
 
 DESCRIPTION = """<?xml version="1.0"?>
 <robot name="arm">

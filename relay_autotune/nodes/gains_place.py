@@ -1,0 +1,292 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Where gains act: in the controller of this node, or through the parameters of another one."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+
+from relay_autotune.control.gains_history import GainSet
+from relay_autotune.errors import ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.laws import LAWS, LawRate
+from relay_autotune.nodes.controller_parameters import GAINS, OWN_LAWS, parameters_of_law
+from relay_autotune.nodes.lifetime import STEADY
+
+# Names of the gains that may be sent, of the ISA and of the parallel form.
+NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
+
+# Longest wait for an answer of another node [s].
+TIMEOUT = 2.0
+# Relative difference of two periods that are the same.
+_SAME_RATE = 0.01
+
+
+class RemoteError(RelayAutotuneError):
+    """Another node did not take the gains."""
+
+
+def mapping_of(text: str) -> dict[str, str]:
+    """Return the parameter name for each gain.
+
+    :param text: pairs such as ``p:gains.heater.p``, separated by commas.
+    :raises ParameterError: if one is not such a pair.
+    """
+    found = {}
+    for pair in map(str.strip, text.split(",")):
+        name, _, target = pair.partition(":")
+        if name not in NAMES or not target:
+            raise ParameterError(
+                f"apply_parameters has {pair!r}, expected GAIN:PARAMETER with a gain of "
+                f"{', '.join(NAMES)}"
+            )
+        found[name] = target
+    return found
+
+
+def controller_of(gains: Mapping[str, float], feedforward: float = 0.0) -> Controller:
+    """Return the controller with gains given by name, in the ISA or the parallel form.
+
+    :param gains: some of `NAMES`; defaults: no derivative, no filter, set-point weight 1.
+    :param feedforward: gain from the set-point to the command, beside these gains [u/y]; with
+        ``kc (b r - y)`` it is a set-point weight ``b + feedforward/kc``.
+    :raises RelayAutotuneError: if they are not enough for a controller.
+    """
+    proportional = gains.get("kc", gains.get("p"))
+    if proportional is None or not {"ti", "i"} & set(gains):
+        raise RemoteError(
+            f"only the gains {', '.join(gains)} are known, expected kc or p, and ti or i: name "
+            "their parameters in apply_parameters"
+        )
+    integral, derivative = gains.get("i", 0.0), gains.get("d", 0.0)
+    return Controller(
+        proportional,
+        gains.get("ti", proportional / integral if integral else 0.0),
+        gains.get("td", derivative / proportional if proportional else 0.0),
+        gains.get("tf", 0.0),
+        gains.get("b", 1.0) + (feedforward / proportional if proportional else 0.0),
+    )
+
+
+class Place(ABC):
+    """Where gains act.
+
+    :param name: of the controlling node, for people.
+    :param mapping: its parameter name for each gain.
+    :param feedforward: its gain from the set-point to the command beside these [u/y].
+    """
+
+    outlives = False
+    """True if the gains stay in force when this process ends."""
+
+    def __init__(self, name: str, mapping: Mapping[str, str], feedforward: float = 0.0) -> None:
+        self.name = name
+        self._mapping = dict(mapping)
+        self._feedforward = feedforward
+
+    def set_of(self, controller: Controller) -> GainSet:
+        """Return the parameters of a controller.
+
+        :param controller: the gains.
+        """
+        return GainSet.of({t: getattr(controller, name) for name, t in self._mapping.items()})
+
+    def controller_of(self, gains: GainSet) -> Controller:
+        """Return the controller with these parameters.
+
+        :param gains: the parameters.
+        :raises RelayAutotuneError: if they are not enough for a controller.
+        """
+        values = gains.by_name()
+        named = {name: values[target] for name, target in self._mapping.items()}
+        return controller_of(named, self._feedforward)
+
+    @abstractmethod
+    def require_law(self, gains: Gains) -> None:
+        """Refuse gains that are for a law which does not run there.
+
+        :raises TuningError: with what to do.
+        """
+
+    @abstractmethod
+    async def read(self) -> GainSet | None:
+        """Return the gains in force if another node may have changed them, else None.
+
+        :raises RelayAutotuneError: if they cannot be read.
+        """
+
+    @abstractmethod
+    async def put(self, gains: GainSet | None) -> None:
+        """Apply gains, all or none.
+
+        :param gains: None: hold the command, if the place can.
+        :raises RelayAutotuneError: if they are not in force, or it is unknown whether they are.
+        """
+
+    @abstractmethod
+    def said(self, gains: GainSet | None) -> str:
+        """Return a sentence on the gains in force now."""
+
+
+class OwnGains(Place):
+    """The controller of this node.
+
+    :param use: puts gains in force; None: the command is held.
+    :param rate: the law that it runs; None: its own.
+    """
+
+    def __init__(self, use: Callable[[GainSet | None], None], rate: LawRate | None) -> None:
+        super().__init__("this node", {entry.name: entry.name for entry in GAINS})
+        self._use = use
+        self._rate = rate
+
+    def require_law(self, gains: Gains) -> None:
+        """Refuse gains for another law than that of this node."""
+        law, period, rate = gains.law, gains.law_period, self._rate
+        own = law in OWN_LAWS
+        runs = own if rate is None else law == rate.law.name
+        if rate is not None and runs and not math.isclose(period, rate.period, rel_tol=_SAME_RATE):
+            raise TuningError(
+                f"they are for {law} every {period:g} s, and this node runs it every "
+                f"{rate.period:g} s: give both the same time (sample_period of identifier_node, "
+                f"law_period here)"
+            )
+        if runs:
+            return
+        if own:
+            raise TuningError(
+                "they are for this node's own law, and it was started with another one: start "
+                "it without the parameter law, or design for that law"
+            )
+        given = (f"-p {n}:={v}" for n, v in parameters_of_law(law, period).items())
+        raise TuningError(
+            f"they are for the law {law}, which this node does not run: start it with "
+            f"{' '.join(given)}, write them to a file with apply_gains --file, or tune without "
+            f"that law"
+        )
+
+    async def read(self) -> GainSet | None:
+        """Return None: no other node changes these gains."""
+        return None
+
+    async def put(self, gains: GainSet | None) -> None:
+        """Put gains in force, or hold the command."""
+        self._use(gains)
+
+    def said(self, gains: GainSet | None) -> str:
+        """Say which gains are in force."""
+        if gains is None:
+            return "no gains are in force, the command is held"
+        return f"{said(self.controller_of(gains))} in force"
+
+
+def said(gains: Controller | None) -> str:
+    """Return gains in words."""
+    if gains is None:
+        return "no gains"
+    return f"kc {gains.kc:.6g}, ti {gains.ti:.6g} s, td {gains.td:.6g} s"
+
+
+class RemoteGains(Place):
+    """The parameters of another node.
+
+    Each service call is given up after `TIMEOUT`, because the other node may hang.
+
+    :param node: the calling node.
+    :param target: name of the controlling node.
+    :param mapping: its parameter name for each gain.
+    :param feedforward: its gain from the set-point to the command beside these [u/y].
+    """
+
+    outlives = True
+
+    def __init__(
+        self, node: Node, target: str, mapping: Mapping[str, str], feedforward: float
+    ) -> None:
+        super().__init__(target, mapping, feedforward)
+        self._node = node
+        base = target.rstrip("/")
+        # Answers must be handled while the callback that waits for them is still running.
+        self._group = ReentrantCallbackGroup()
+        self._get, self._set = (
+            node.create_client(kind, f"{base}/{name}", callback_group=self._group)
+            for kind, name in (
+                (GetParameters, "get_parameters"),
+                (SetParametersAtomically, "set_parameters_atomically"),
+            )
+        )
+
+    def require_law(self, gains: Gains) -> None:
+        """Refuse gains for a program whose parameters are not the gains themselves."""
+        if gains.law and not LAWS[gains.law].sets_gains:
+            raise TuningError(
+                f"they are for the law {gains.law}, which {self.name} does not run: write them "
+                f"to a file with apply_gains --file, or tune without that law"
+            )
+
+    def said(self, gains: GainSet | None) -> str:
+        """Say which gains are in force."""
+        if gains is None:
+            return f"{self.name} keeps its gains, since no earlier gains are known: check them"
+        return f"{self.name} has {gains}"
+
+    async def read(self) -> GainSet:
+        """Return the present values of the parameters.
+
+        :raises RelayAutotuneError: if the node does not answer, or lacks one of them.
+        """
+        names = list(self._mapping.values())
+        answer = await self._ask(self._get, GetParameters.Request(names=names))
+        found = map(parameter_value_to_python, answer.values)
+        values = {n: v for n, v in zip(names, found, strict=False) if isinstance(v, float)}
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise RemoteError(f"{self.name} has no number {', '.join(missing)}")
+        return GainSet.of(values)
+
+    async def put(self, gains: GainSet | None) -> None:
+        """Set the parameters and read them back.
+
+        :param gains: None: leave them as they are, since another node's command cannot be held.
+        :raises RelayAutotuneError: if the values read back differ, or cannot be read.
+        """
+        if gains is None:
+            return
+        wanted = [Parameter(name, value=value).to_parameter_msg() for name, value in gains.values]
+        answer = await self._ask(self._set, SetParametersAtomically.Request(parameters=wanted))
+        if not answer.result.successful:
+            raise RemoteError(f"{self.name} refused the gains: {answer.result.reason}")
+        found = await self.read()
+        if not found.is_near(gains):
+            raise RemoteError(f"{self.name} did not take the gains: it has {found}, not {gains}")
+
+    async def _ask(self, client: Any, request: Any) -> Any:
+        if not client.service_is_ready():
+            raise RemoteError(f"the node {self.name} is not there, or has no parameter services")
+        answer = client.call_async(request)
+
+        def give_up() -> None:
+            if not answer.done():
+                answer.set_exception(
+                    RemoteError(f"{self.name} did not answer within {TIMEOUT:g} s")
+                )
+
+        timer = self._node.create_timer(
+            TIMEOUT,
+            give_up,
+            callback_group=self._group,
+            clock=STEADY,
+        )
+        try:
+            return await answer
+        finally:
+            self._node.destroy_timer(timer)
