@@ -14,6 +14,7 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.arguments import finite
 from relay_autotune.cli.asking import asked, number_of, pair_of
 from relay_autotune.cli.export import number
@@ -163,7 +164,7 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
         command_kind = client.kind_of(options.command, options.wait, published=False)
         others = options.command_message or ""
         client.require_uncontrolled()
-    _choose_field(client, kind, options)
+    _choose_field(kind, options)
     command_field = options.command_field or "data"
     try:
         with Working(f"listening to {options.command}"):
@@ -213,21 +214,23 @@ def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     return OwnNodes(nodes)
 
 
-def _choose_field(client: TuneClient, kind: str, options: argparse.Namespace) -> None:
+def _choose_field(kind: str, options: argparse.Namespace) -> None:
     """Ask for the number that measures where the messages do not have the one of --field.
 
-    :param client: a node of the graph.
     :param kind: message type of the measurement.
     :param options: with the flags of `add_new_loop`.
     :raises SelectionError: if nobody can be asked.
     """
+    # Imported here, because it needs ROS.
+    from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
+
     while True:
         try:
-            client.require_field(kind, options.field)
+            reader_of(kind, options.field)
             return
         except ParameterError as error:
             told = _as_flags(str(error))
-        first = client.first_number(kind)
+        first = "".join(first_numbers(struct_of(message_class(kind, "measurement_type")), 1))
         if not (first and sys.stdin.isatty()):
             raise SelectionError(f"{told}: give it, such as --field {first}" if first else told)
         print("\n".join(broken(told, width())), file=sys.stderr)

@@ -90,7 +90,7 @@ class GainsClient(LoopClient):
         :param patience: longest wait [s].
         :raises LoopError: if it is not there.
         """
-        if not self._wait(self._verify.server_is_ready, time.monotonic() + patience):
+        if not self.wait(self._verify.server_is_ready, patience):
             there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
             raise LoopError(
                 f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
@@ -340,7 +340,7 @@ class GainsClient(LoopClient):
         begun = time.monotonic()
         while (waited := time.monotonic() - begun) < seconds and not leave():
             tell(f"{what}, {duration(waited)} of {duration(seconds)}")
-            self._wait(leave, time.monotonic() + min(TOLD_EVERY, seconds - waited))
+            self.wait(leave, min(TOLD_EVERY, seconds - waited))
 
     def _verified(
         self,
@@ -357,7 +357,7 @@ class GainsClient(LoopClient):
             sent = self._verify.send_goal_async(
                 goal, feedback_callback=lambda message: tell(message.feedback.status)
             )
-            if not self._wait(sent.done, time.monotonic() + ANSWER_WITHIN):
+            if not self.wait(sent.done, ANSWER_WITHIN):
                 raise LoopError(f"{self.name} has not answered within {ANSWER_WITHIN:g} s")
             answer = self._ended(sent.result(), leave)
             result = answer.result
@@ -372,7 +372,7 @@ class GainsClient(LoopClient):
                     f"with --verify-only"
                 )
             tell(result.reason)
-            self._wait(leave, time.monotonic() + TOLD_EVERY)
+            self.wait(leave, TOLD_EVERY)
         raise LoopError("the verification was ended before its step; the gains stay in force")
 
     def _ended(self, goal: Any, leave: Callable[[], bool]) -> Any:
@@ -381,7 +381,7 @@ class GainsClient(LoopClient):
         while True:
             deadline = time.monotonic() + ANSWER_WITHIN
             while time.monotonic() < deadline:
-                if self._wait(answer.done, time.monotonic() + _TURN):
+                if self.wait(answer.done, _TURN):
                     return answer.result()
                 if leave() and not cancelled:
                     goal.cancel_goal_async()

@@ -19,16 +19,14 @@ from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameExceptio
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
-from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.command_message import CommandMessage
-from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
@@ -128,11 +126,8 @@ class LoopClient:
         :param patience: how long to wait for it [s].
         """
         came: list[Any] = []
-        ear = self._node.create_subscription(
-            kind, self._resolved(topic), came.append, quality.latched(10)
-        )
-        self._wait(lambda: any(map(wanted, came)), time.monotonic() + patience)
-        self._node.destroy_subscription(ear)
+        with self._hearing(kind, self._resolved(topic), came.append, quality.latched(10)):
+            self.wait(lambda: any(map(wanted, came)), patience)
         return next((message for message in reversed(came) if wanted(message)), None)
 
     def call(self, kind: Any, service: str, request: Any, patience: float = ANSWER_WITHIN) -> Any:
@@ -145,9 +140,9 @@ class LoopClient:
         :raises LoopError: if it does not answer.
         """
         deadline = time.monotonic() + patience
-        if self._wait(self._service(kind, service).service_is_ready, deadline):
+        if self.wait(self._service(kind, service).service_is_ready, patience):
             answer = self.begin(kind, service, request)
-            if self._wait(answer.done, deadline):
+            if self.wait(answer.done, deadline - time.monotonic()):
                 return answer.result()
         raise LoopError(f"{service} has not answered within {patience:g} s")
 
@@ -171,14 +166,20 @@ class LoopClient:
         :param condition: what is waited for.
         :param patience: how long [s].
         """
-        return self._wait(condition, time.monotonic() + patience)
+        deadline = time.monotonic() + patience
+        while not condition():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+        return True
 
     def rest(self, seconds: float) -> None:
         """Handle messages for a time.
 
         :param seconds: the time [s].
         """
-        self._wait(lambda: False, time.monotonic() + seconds)
+        self.wait(lambda: False, seconds)
 
     def heard(self, kind: Any, topic: str, seconds: float, least: int = 0) -> list[Any]:
         """Return the messages of a topic that come within a time.
@@ -189,12 +190,26 @@ class LoopClient:
         :param least: how many are waited for before it, for `ANSWER_WITHIN` at most.
         """
         came: list[Any] = []
-        # Best effort, so that nobody waits for this client.
-        ear = self._node.create_subscription(kind, topic, came.append, qos_profile_sensor_data)
-        self._wait(lambda: len(came) >= least, time.monotonic() + ANSWER_WITHIN)
-        self.rest(seconds)
-        self._node.destroy_subscription(ear)
+        with self._hearing(kind, topic, came.append):
+            self.wait(lambda: len(came) >= least, ANSWER_WITHIN)
+            self.rest(seconds)
         return came
+
+    @contextmanager
+    def _hearing(
+        self,
+        kind: Any,
+        topic: str,
+        take: Callable[[Any], object],
+        # Best effort, so that nobody waits for this client.
+        profile: QoSProfile = qos_profile_sensor_data,
+    ) -> Iterator[None]:
+        """Hear a topic until the end of the block."""
+        ear = self._node.create_subscription(kind, topic, take, profile)
+        try:
+            yield
+        finally:
+            self._node.destroy_subscription(ear)
 
     def publish(
         self, message: Any, topic: str, kind: Any, answers: str, accepted: Callable[[Any], bool]
@@ -209,15 +224,14 @@ class LoopClient:
         :return: whether one did.
         """
         shown: list[bool] = []
-        ear = self._node.create_subscription(
-            kind, answers, lambda m: shown.append(accepted(m)), qos_profile_sensor_data
-        )
         deadline = time.monotonic() + ANSWER_WITHIN
-        with self.publishing(message, topic) as publish:
+        with (
+            self._hearing(kind, answers, lambda m: shown.append(accepted(m))),
+            self.publishing(message, topic) as publish,
+        ):
             while not any(shown) and time.monotonic() < deadline:
                 publish()
                 self.wait(lambda: any(shown), _AGAIN)
-        self._node.destroy_subscription(ear)
         return any(shown)
 
     @contextmanager
@@ -292,7 +306,7 @@ class LoopClient:
             if published
             else node.get_subscriptions_info_by_topic
         )
-        if self._wait(lambda: bool(ends_of(name)), time.monotonic() + patience):
+        if self.wait(lambda: bool(ends_of(name)), patience):
             return str(ends_of(name)[0].topic_type)
         first, others = quality.nearest(node, name, ends_of)
         what = "publisher" if published else "subscription"
@@ -313,23 +327,6 @@ class LoopClient:
                 f"actuator only until the nodes of this command end; stop it, or start relay_node "
                 f"and identifier_node yourself, and leave out --measurement and --command"
             )
-
-    def require_field(self, type_name: str, field: str) -> None:
-        """Refuse a field that the measurement's type does not have.
-
-        :param type_name: of the measurement's messages.
-        :param field: path of the measurement in them.
-        :raises ParameterError: with the fields that it has.
-        """
-        reader_of(type_name, field)
-
-    def first_number(self, type_name: str) -> str:
-        """Return the path of the first number of a message type; empty: it has none.
-
-        :param type_name: such as ``sensor_msgs/msg/Temperature``.
-        """
-        struct = struct_of(message_class(type_name, "measurement_type"))
-        return next(iter(first_numbers(struct, 1)), "")
 
     def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         """Return the mean of the commands that are published now; NaN: none are.
@@ -375,7 +372,7 @@ class LoopClient:
                 there[:] = ends(name, space or "/")
             return bool(there)
 
-        self._wait(is_known, time.monotonic() + ANSWER_WITHIN)
+        self.wait(is_known, ANSWER_WITHIN)
         found = [end for end, types in there if type_name in types and end not in others]
         own = self._resolved(topic)
         if own in found or len(found) == 1:
@@ -400,11 +397,3 @@ class LoopClient:
 
     def _resolved(self, topic: str) -> str:
         return str(self._node.resolve_topic_name(topic))
-
-    def _wait(self, condition: Callable[[], bool], deadline: float) -> bool:
-        while not condition():
-            left = deadline - time.monotonic()
-            if left <= 0.0:
-                return False
-            self._executor.spin_once(timeout_sec=min(left, 0.05))
-        return True

@@ -87,7 +87,7 @@ class TuneClient(LoopClient):
         from relay_autotune.exchange import models  # noqa: F401
 
         deadline = time.monotonic() + patience
-        if not self._wait(lambda: leave() or self._client.server_is_ready(), deadline):
+        if not self.wait(lambda: leave() or self._client.server_is_ready(), patience):
             # This client itself appears in the graph under the name that it looks for.
             others = ", ".join(n for n in self.owners("/tune") if n != self.name) or "none"
             raise LoopError(
@@ -95,8 +95,8 @@ class TuneClient(LoopClient):
                 f"{others}. Start it, or name another with --namespace and --node"
             )
         gains = self._resolved("pi_gains")
-        if needs_identifier and not self._wait(
-            lambda: leave() or self._node.count_publishers(gains) > 0, deadline
+        if needs_identifier and not self.wait(
+            lambda: leave() or self._node.count_publishers(gains) > 0, deadline - time.monotonic()
         ):
             raise LoopError(
                 f"no identifier_node publishes {gains}, so that no model and no gains would come; "
@@ -114,7 +114,7 @@ class TuneClient(LoopClient):
             Tune.Goal(amplitude=amplitude, dry_run=dry_run),
             feedback_callback=lambda message: self._feedback.append(message.feedback),
         )
-        if not self._wait(sent.done, time.monotonic() + 10.0):
+        if not self.wait(sent.done, 10.0):
             raise LoopError(f"{self.name} has not answered the request within 10 s")
         self._goal = sent.result()
         if not self._goal.accepted:
@@ -138,7 +138,7 @@ class TuneClient(LoopClient):
         :param seconds: the time [s].
         :raises LoopError: if the node is lost.
         """
-        self._wait(self._answer.done, time.monotonic() + seconds)
+        self.wait(self._answer.done, seconds)
         if self._answer.done() or (self._alive and self._client.server_is_ready()):
             self._seen = time.monotonic()
         elif time.monotonic() - self._seen <= _GONE:

@@ -25,7 +25,7 @@ from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.joint_tune import is_of_joint
 from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
-from relay_autotune.errors import LoopError, ParameterError, SelectionError
+from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.controller_parameters import PARAMETERS
 from relay_autotune.nodes.live_types import FLOAT64
@@ -40,21 +40,14 @@ from relay_autotune_msgs.msg import PidGains
 class Looker:
     """A client of a loop whose topics have these types, with a present command."""
 
-    def __init__(self, present: float = math.nan) -> None:
-        self.present = present
+    def __init__(self, present: float = math.nan, measured: str = "std_msgs/msg/Float32") -> None:
+        self.present, self.measured = present, measured
 
     def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
-        return {"/tank/level": "std_msgs/msg/Float32"}.get(topic, "std_msgs/msg/Float64")
+        return self.measured if topic == "/tank/level" else "std_msgs/msg/Float64"
 
     def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         return self.present
-
-    def require_field(self, type_name: str, field: str) -> None:
-        if field == "nothing":
-            raise ParameterError(f"measurement_field: {type_name} has no field {field!r}")
-
-    def first_number(self, type_name: str) -> str:
-        return "temperature"
 
     def require_uncontrolled(self) -> None:
         pass
@@ -212,7 +205,7 @@ def test_commands_within_messages_become_parameters() -> None:
         "--command-field", "data[1]", "--command-message", "{data: [0, 0]}",
         "--command-period", "0.1",
     )  # fmt: skip
-    found = arguments(Looker(), given)
+    found = arguments(Looker(measured="sensor_msgs/msg/JointState"), given)
     assert found["measurement_field"] == "velocity[l]"
     assert found["command_field"] == "data[1]"
     # The value of a parameter is read as YAML once more.
@@ -223,10 +216,10 @@ def test_commands_within_messages_become_parameters() -> None:
 def test_a_field_that_is_not_there_is_asked_for_or_named_by_its_flag(typed: list[str]) -> None:
     words = "--within", "0", "1", "--at", "0", "--field", "nothing", "--command-within", "0", "1"
     typed += ["nothing", ""]
-    assert arguments(Looker(), options(*words))["measurement_field"] == "temperature"
+    assert arguments(Looker(), options(*words))["measurement_field"] == "data"
     assert not typed
     sys.stdin.isatty = lambda: False  # type: ignore[method-assign]
-    with pytest.raises(SelectionError, match=r"Float32 has no field .*, such as --field temp"):
+    with pytest.raises(SelectionError, match=r"Float32 has no field .*, such as --field data"):
         arguments(Looker(), options(*words))
 
 
