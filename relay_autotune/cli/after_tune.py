@@ -19,7 +19,7 @@ from relay_autotune.cli.asking import asked, asked_for_file, number_of
 from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of, write
 from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.cli.layout import labelled, width
-from relay_autotune.cli.new_loop import is_new_loop, ros_arguments
+from relay_autotune.cli.new_loop import PROGRAM, is_new_loop, ros_arguments
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import gains_from_message
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from relay_autotune.cli.own_nodes import OwnNodes
     from relay_autotune.nodes.tune_client import TuneClient
 
-PROGRAM = "tune_loop"
 # How long to wait for what the nodes still have to tell [s].
 PATIENCE = 5.0
 Steps = list[tuple[str, str]]

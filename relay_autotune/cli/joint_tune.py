@@ -19,7 +19,13 @@ from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
 from relay_autotune.cli.asking import agrees, asked, number_of, pair_of
 from relay_autotune.cli.export import Target
 from relay_autotune.cli.layout import labelled, width
-from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, own_node, ros_arguments
+from relay_autotune.cli.new_loop import (
+    PROGRAM,
+    START_WITHIN,
+    own_namespace,
+    own_node,
+    ros_arguments,
+)
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import check_lines
@@ -466,7 +472,7 @@ class JointTune:
                 yield self._manager.still_active(self._forward.name)
         finally:
             if why := self._why_no_references():
-                say("tune_loop", why)
+                say(PROGRAM, why)
 
     def _first_command(self) -> tuple[Any, str]:
         """Return the message of the first command, and its topic."""
@@ -587,7 +593,7 @@ class JointTune:
         print("\n".join(beside(self.present(), gains, model)))
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
         if not agrees(question, yes=self._options.yes):
-            say("tune_loop", "nothing was changed")
+            say(PROGRAM, "nothing was changed")
             return NOTHING_FOUND
         put_gains(client, loop.node, wanted, before)
         moved = f"move it by {loop.above[-1]}" if loop.above else "give it a short trajectory"

@@ -27,6 +27,7 @@ from relay_autotune.loop.laws import LAWS
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
 
+PROGRAM = "tune_loop"
 # How long the nodes may take to start on a busy machine [s].
 START_WITHIN = 30.0
 # What a checklist says to type, and the flags that give these parameters here.

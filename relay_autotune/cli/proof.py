@@ -19,7 +19,13 @@ from relay_autotune.cli.apply_gains import found_lines
 from relay_autotune.cli.arguments import say
 from relay_autotune.cli.asking import agreed_step
 from relay_autotune.cli.layout import labelled, width
-from relay_autotune.cli.new_loop import START_WITHIN, own_namespace, own_node, ros_arguments
+from relay_autotune.cli.new_loop import (
+    PROGRAM,
+    START_WITHIN,
+    own_namespace,
+    own_node,
+    ros_arguments,
+)
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import StatusLine, Working
 from relay_autotune.control.verification import (
@@ -43,7 +49,6 @@ from relay_autotune.record.record import Record, RelaySettings
 from relay_autotune.text import duration
 from relay_autotune.verdict import Verdict
 
-PROGRAM = "tune_loop"
 _CONTROLLER = "controller_node"
 _UNFINISHED = "the proof did not end"
 # How long to wait for the record of the tune [s].

@@ -19,17 +19,15 @@ import argparse
 import json
 import os
 import shlex
-import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, nullcontext, suppress
-from typing import TYPE_CHECKING, Any, TextIO
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
+from typing import TYPE_CHECKING
 
 from relay_autotune.cli.after_tune import (
     PATIENCE,
-    PROGRAM,
     HandedOver,
     hand_over,
     left,
@@ -51,6 +49,7 @@ from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.joint_tune import JointTune, add_joint, is_of_joint
 from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
+    PROGRAM,
     START_WITHIN,
     add_new_loop,
     is_new_loop,
@@ -61,25 +60,23 @@ from relay_autotune.cli.new_loop import (
 from relay_autotune.cli.page import add_web, check_web
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (
-    NARROWEST,
+    TICK,
     Paint,
+    Shown,
     check_lines,
     document,
-    live_lines,
-    log_line,
+    follow,
     next_commands,
     result_lines,
     wants_colour,
 )
-from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError
+from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.cli.own_nodes import OwnNodes
     from relay_autotune.loop.gains import Controller
     from relay_autotune.nodes.tune_client import TuneClient
-# Time between two updates of a terminal [s].
-_TICK = 0.25
 # Parts of the checklist's lines on rest while few samples have come, and on the model while
 # identifier_node is not discovered.
 NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
@@ -235,15 +232,11 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             heed(number)
         if interrupted:
             raise KeyboardInterrupt
-        shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if options.web:
             from relay_autotune.cli.tune_page import TunePage
 
-            # Lines of several loops must not be written over each other.
-            terminals = [shown]
-            if len(clients) > 1:
-                terminals = [Shown(sys.stderr, live=False) for _ in clients]
-            return TunePage(PROGRAM, clients, options, terminals, _follow).run(interrupted)
+            return TunePage(clients, options).run(interrupted)
+        shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {client.name}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
@@ -253,10 +246,10 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
             with joint.opened() if joint and opens else nullcontext(lambda: "") as why_over:
                 while True:
                     client.ask(options.amplitude, options.dry_run)
-                    _follow(client, shown, interrupted, why_over=why_over)
+                    follow(client, shown, interrupted, why_over=why_over)
                     if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
                         break
-                    time.sleep(_TICK)
+                    time.sleep(TICK)
                 shown.clear()
         finally:
             wait_again()
@@ -285,49 +278,13 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
                 break
             if time.monotonic() > deadline:
                 break
-            time.sleep(_TICK)
+            time.sleep(TICK)
     shown = check_lines(list(map(with_flags, checks)), width())
     print("\n".join(shown), flush=True, file=sys.stderr)
     if not client.succeeded:
         say(PROGRAM, f"{client.name} refuses: {client.result.reason}")
         return False
     return agrees("Start the tune?", yes=options.yes)
-
-
-def _follow(
-    client: TuneClient,
-    shown: Shown,
-    interrupted: list[int],
-    tick: float = _TICK,
-    why_over: Callable[[], str] = lambda: "",
-) -> None:
-    """Show the feedback until the result is there, and cancel when asked to.
-
-    :param client: that has asked for the tune.
-    :param shown: where the feedback goes.
-    :param interrupted: signals that have come.
-    :param tick: interval of the looks [s].
-    :param why_over: tells why the tune has to end by itself; empty: it goes on.
-    """
-    asked = 0
-    while not client.done():
-        client.spin(tick)
-        for feedback in client.news():
-            shown.take(feedback)
-        shown.tick()
-        over = why_over() if not asked else ""
-        if (interrupted or over) and not asked:
-            asked = 1
-            client.cancel()
-            if over:
-                shown.say(over)
-            shown.say("cancelling: the safe command goes out, then the recording is closed")
-        elif any(number != signal.SIGHUP for number in interrupted[1:]):
-            # SIGHUP does not count: a shell that ends with its terminal sends it once more.
-            raise LoopError(
-                f"stopped waiting; {client.name} still sends the safe command, and its log says "
-                f"how the tune ended"
-            )
 
 
 def _conclude(
@@ -440,60 +397,6 @@ def _afterwards(
     if not options.json:
         print(f"  {'report':<16} {options.report}")
     return flags, str(options.report)
-
-
-class Shown:
-    """The progress of a tune on the screen or in the log.
-
-    :param stream: where it is written.
-    :param live: True for a terminal, whose lines may be overwritten.
-    """
-
-    def __init__(self, stream: TextIO, live: bool) -> None:
-        self._stream = stream
-        self._width = shutil.get_terminal_size().columns
-        self._live = live and os.environ.get("TERM") != "dumb" and self._width >= NARROWEST
-        blocks = (stream.encoding or "").lower().replace("-", "") == "utf8"
-        self._paint = Paint(wants_colour(live, os.environ), blocks)
-        self._lines = 0
-        self._last: Any = None
-        self._came = 0.0
-
-    def take(self, feedback: Any) -> None:
-        """Show a feedback."""
-        if not self._live:
-            self._write(f"{log_line(feedback, self._last)}\n")
-        elif self._last is not None and not feedback.transfer_function.experiment_id:
-            # A model comes only once.
-            feedback.transfer_function = self._last.transfer_function
-        self._last, self._came = feedback, time.monotonic()
-
-    def tick(self) -> None:
-        """Update the times on a terminal."""
-        if not self._live or self._last is None:
-            return
-        since = time.monotonic() - self._came
-        lines = live_lines(self._last, self._paint, since, self._width)
-        self.clear()
-        self._write("\n".join(lines) + "\n")
-        self._lines = len(lines)
-
-    def say(self, text: str) -> None:
-        """Write a line that stays."""
-        self.clear()
-        self._write(f"{text}\n")
-
-    def clear(self) -> None:
-        """Remove the lines that are shown in place."""
-        if self._lines:
-            self._write(f"\x1b[{self._lines}A\x1b[J")
-            self._lines = 0
-
-    def _write(self, text: str) -> None:
-        # The tune continues even if its progress cannot be written.
-        with suppress(OSError):
-            self._stream.write(text)
-            self._stream.flush()
 
 
 if __name__ == "__main__":

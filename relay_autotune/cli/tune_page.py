@@ -9,6 +9,7 @@ import argparse
 import math
 import shlex
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,12 +22,15 @@ from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, wor
 from relay_autotune.cli.export import Target, exported, exports_of
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.layout import WIDEST
+from relay_autotune.cli.new_loop import PROGRAM
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.tune_view import (
     STATES,
     Paint,
+    Shown,
     check_lines,
     estimate,
+    follow,
     oscillation,
     result_lines,
 )
@@ -51,125 +55,23 @@ _TICK = 0.05
 _PATIENCE = 5.0
 _TONES = {"completed": "good", "aborted": "bad", "failed": "bad"}
 
-Follow = Callable[[TuneClient, Any, list[int], float], None]
-
-
-class _OnPage:
-    """The progress of a tune on the page, and in the terminal as without one.
-
-    :param live: what pages see.
-    :param shown: the terminal.
-    :param ends: gets a number when the tune is to end.
-    :param interrupted: signals that have come.
-    :param cycles: messages of the cycles so far.
-    :param compute: has something computed by another thread.
-    :param begun: called at the first feedback.
-    """
-
-    def __init__(
-        self,
-        live: Live,
-        shown: Any,
-        ends: list[int],
-        interrupted: list[int],
-        cycles: list[Any],
-        compute: Callable[[Callable[[], None]], object],
-        begun: Callable[[], object],
-    ) -> None:
-        self._live = live
-        self._shown = shown
-        self._ends = ends
-        self._interrupted = interrupted
-        self._heeded = len(interrupted)
-        self._cycles, self._compute = cycles, compute
-        self._gains: list[tuple[int, EstimatedQuantity]] = []
-        self._begun: Callable[[], object] | None = begun
-
-    def take(self, feedback: Any) -> None:
-        """Show a feedback."""
-        if self._begun is not None:
-            self._begun()
-            self._begun = None
-        told, state = self._live.told, STATES[feedback.state]
-        changed: dict[str, Any] = {
-            "state": state,
-            "tone": _TONES.get(state, ""),
-            "status": feedback.status,
-            "progress": feedback.progress,
-            "elapsed": feedback.elapsed,
-            "remaining": feedback.remaining,
-        }
-        if feedback.cycle > len(told.cycles):
-            words = (f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback))
-            changed["cycles"] = (*told.cycles, ", ".join(filter(None, words)))
-        if feedback.transfer_function.experiment_id:
-            changed["process"] = self.model(feedback.transfer_function, feedback.cycle)
-        self._live.tell(**changed)
-        self._shown.take(feedback)
-
-    def model(self, message: Any, cycle: int) -> str:
-        """Show a model, and return it as text.
-
-        :param message: the `TransferFunction`.
-        :param cycle: number of whole cycles.
-        """
-        found = identification_from_message(message)
-        # By another thread: this one has to hear relay_node, and who ends the tune.
-        self._compute(partial(self._show_model, found, cycle, list(self._cycles)))
-        return process_text(found.model)
-
-    def _show_model(self, found: Identification, cycle: int, cycles: list[Any]) -> None:
-        """Show a model over the data so far, and how its intervals narrow."""
-        case = model_case(found, None)
-        self._gains += [(cycle, e) for e in case.ultimate if e.name == ULTIMATE_GAIN]
-        record = None
-        # Without the first cycle it is not known where the process was at rest.
-        if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
-            record = record_from_cycles(cycles)
-        self._live.show("model", of_running(case, record, self._gains))
-
-    def tick(self) -> None:
-        """Heed what was wished or signalled since the last call."""
-        # SIGHUP, as a wish that is repeated does not leave the tune alone.
-        if self._live.abort.is_set() and not self._ends:
-            self._ends.append(signal.SIGHUP)
-        self._ends += self._interrupted[self._heeded :]
-        self._heeded = len(self._interrupted)
-        self._shown.tick()
-
-    def say(self, text: str) -> None:
-        """Write a line that stays."""
-        self._live.tell(status=text, tone="warn")
-        self._shown.say(text)
-
 
 class TunePage:
     """The page of one or more loops.
 
-    :param program: name of the command.
     :param clients: of the loops' relay_nodes.
     :param options: as the command line gives them.
-    :param shown: the terminal, for each of them.
-    :param follow: shows a tune until it has ended.
     """
 
-    def __init__(
-        self,
-        program: str,
-        clients: Sequence[TuneClient],
-        options: argparse.Namespace,
-        shown: Sequence[Any],
-        follow: Follow,
-    ) -> None:
+    def __init__(self, clients: Sequence[TuneClient], options: argparse.Namespace) -> None:
         def written(gains: Gains, how: str, doubt: str) -> str:
             return exported(gains, how, Target(), doubt=doubt)
 
-        self._program = program
         lives = [Live(client.name) for client in clients]
         self._page = Page((), exports_of, written, address_of(options.web_address), lives)
         self._loops = [
-            _LoopOnPage(program, client, options, terminal, follow, self._page, number)
-            for number, (client, terminal) in enumerate(zip(clients, shown, strict=True))
+            _LoopOnPage(client, options, self._page, number)
+            for number, client in enumerate(clients)
         ]
 
     def run(self, interrupted: list[int]) -> int:
@@ -182,7 +84,7 @@ class TunePage:
         """
         with in_background(self._page) as url:
             say(
-                self._program,
+                PROGRAM,
                 f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is "
                 "started there",
             )
@@ -197,39 +99,33 @@ class TunePage:
 
 
 class _LoopOnPage:
-    """One loop of a page.
+    """One loop of a page; its tunes are shown there, and in the terminal as without a page.
 
-    :param program: name of the command.
     :param client: of the loop's relay_node.
     :param options: as the command line gives them.
-    :param shown: the terminal.
-    :param follow: shows a tune until it has ended.
     :param page: that shows it.
     :param number: of the loop on the page.
     """
 
     def __init__(
-        self,
-        program: str,
-        client: TuneClient,
-        options: argparse.Namespace,
-        shown: Any,
-        follow: Follow,
-        page: Page,
-        number: int,
+        self, client: TuneClient, options: argparse.Namespace, page: Page, number: int
     ) -> None:
-        self._program = program
         self._client = client
         self._options = options
-        self._shown = shown
-        self._follow = follow
         self._page, self._number = page, number
         self._live = page.lives[number]
+        # Lines of several loops must not be written over each other.
+        self._terminal = Shown(sys.stderr, live=len(page.lives) == 1 and sys.stderr.isatty())
         self._begin_command: Callable[[], Callable[[], None]] | None = None
         self._interrupted: list[int] = []
-        # Messages of the cycles of the running tune.
-        self._cycles: list[Any] = []
         self._gains = GainsPage(client, self._live, page, number, self._is_to_end)
+        # Of the running tune: messages of the cycles, K_u after each, signals and wishes to end
+        # it, how many of the signals are among these, and what is done at its first feedback.
+        self._cycles: list[Any] = []
+        self._ultimate: list[tuple[int, EstimatedQuantity]] = []
+        self._ends: list[int] = []
+        self._heeded = 0
+        self._at_first: Callable[[], object] | None = None
 
     def run(self, interrupted: list[int]) -> int:
         """Do what is wished on the page, until a signal comes.
@@ -310,24 +206,21 @@ class _LoopOnPage:
         client, live = self._client, self._live
         live.forget_wishes()
         self._cycles.clear()
+        self._ultimate, self._ends, self._heeded = [], [], len(interrupted)
         live.show("model", None)
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
             elapsed=0.0, cycles=(), process="", result=(),
         )  # fmt: skip
-        ends: list[int] = []
         with ExitStack() as stack:
             client.ask(self._options.amplitude, dry_run=False)
             # Only once it has begun: see TuneClient.command_watch.
-            shown = _OnPage(
-                live, self._shown, ends, interrupted, self._cycles, self._page.worker.ask,
-                lambda: stack.enter_context(self._commands_shown()),
-            )  # fmt: skip
-            self._follow(client, shown, ends, _TICK)
-            self._shown.clear()
+            self._at_first = lambda: stack.enter_context(self._commands_shown())
+            follow(client, self, self._ends, _TICK)
+            self._terminal.clear()
         result = client.result
         for refused in sorted(client.refused):
-            say(self._program, refused)
+            say(PROGRAM, refused)
         if not result.experiment.experiment_id:
             live.tell(phase="idle", status=f"refused: {result.reason}", tone="bad")
             return NOTHING_FOUND
@@ -341,7 +234,7 @@ class _LoopOnPage:
         if result.transfer_function.experiment_id:
             # A short tune ends before any model came.
             cycles = len(live.told.cycles)
-            live.tell(process=shown.model(result.transfer_function, cycles))
+            live.tell(process=self._show(result.transfer_function, cycles))
             self._add_subject(result)
         done = client.succeeded and bool(result.gains.experiment_id)
         live.forget_wishes()
@@ -352,6 +245,75 @@ class _LoopOnPage:
         )
         return deserved(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
 
+    # The progress of a tune, see `follow`.
+
+    def take(self, feedback: Any) -> None:
+        """Show a feedback."""
+        if self._at_first is not None:
+            self._at_first()
+            self._at_first = None
+        told, state = self._live.told, STATES[feedback.state]
+        changed: dict[str, Any] = {
+            "state": state,
+            "tone": _TONES.get(state, ""),
+            "status": feedback.status,
+            "progress": feedback.progress,
+            "elapsed": feedback.elapsed,
+            "remaining": feedback.remaining,
+        }
+        if feedback.cycle > len(told.cycles):
+            words = (f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback))
+            changed["cycles"] = (*told.cycles, ", ".join(filter(None, words)))
+        if feedback.transfer_function.experiment_id:
+            changed["process"] = self._show(feedback.transfer_function, feedback.cycle)
+        self._live.tell(**changed)
+        self._terminal.take(feedback)
+
+    def _show(self, message: Any, cycle: int) -> str:
+        """Show a model, and return it as text.
+
+        :param message: the `TransferFunction`.
+        :param cycle: number of whole cycles.
+        """
+        found = identification_from_message(message)
+        # By another thread: this one has to hear relay_node, and who ends the tune.
+        self._page.worker.ask(
+            partial(self._show_model, found, cycle, list(self._cycles), self._ultimate)
+        )
+        return process_text(found.model)
+
+    def _show_model(
+        self,
+        found: Identification,
+        cycle: int,
+        cycles: list[Any],
+        ultimate: list[tuple[int, EstimatedQuantity]],
+    ) -> None:
+        """Show a model over the data so far, and how its intervals narrow."""
+        case = model_case(found, None)
+        ultimate += [(cycle, e) for e in case.ultimate if e.name == ULTIMATE_GAIN]
+        record = None
+        # Without the first cycle it is not known where the process was at rest.
+        if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
+            record = record_from_cycles(cycles)
+        self._live.show("model", of_running(case, record, ultimate))
+
+    def tick(self) -> None:
+        """Heed what was wished or signalled since the last call."""
+        # SIGHUP, as a wish that is repeated does not leave the tune alone.
+        if self._live.abort.is_set() and not self._ends:
+            self._ends.append(signal.SIGHUP)
+        self._ends += self._interrupted[self._heeded :]
+        self._heeded = len(self._interrupted)
+        self._terminal.tick()
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
+        self._live.tell(status=text, tone="warn")
+        self._terminal.say(text)
+
+    # What comes of it.
+
     def _add_subject(self, result: Any) -> None:
         """Show the model of the tune, and let its gains be shaped."""
         from relay_autotune.nodes.identifier_parameters import options_from
@@ -361,7 +323,7 @@ class _LoopOnPage:
             values = self._client.identifier_values(_PATIENCE) or defaults()
             found = analysed_as_there(record, values)
         except RelayAutotuneError as error:
-            say(self._program, f"the gains cannot be shaped: {error}")
+            say(PROGRAM, f"the gains cannot be shaped: {error}")
             return
         bag = result.bag
 

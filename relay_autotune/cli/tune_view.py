@@ -1,31 +1,42 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The text that a tune shows: its progress, its result, and the next commands.
+"""What a tune shows: its progress, its result, and the next commands.
 
-Everything here is made from the messages of the action `Tune` alone.
+All text here is made from the messages of the action `Tune` alone.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import shlex
+import shutil
+import signal
 import textwrap
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.layout import WIDEST, labelled
 from relay_autotune.cli.table import gains_lines
+from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.text import digits, duration, process_text
 from relay_autotune.verdict import Verdict
 
+if TYPE_CHECKING:
+    from relay_autotune.nodes.tune_client import TuneClient
+
 # By the constants of Tune.Feedback and RelayExperiment.
 STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")
 OUTCOMES = ("unknown", "completed", "aborted", "failed")
 
+# Time between two updates of a terminal [s].
+TICK = 0.25
 # Columns that a terminal needs for lines that are updated in place.
 NARROWEST = 80
 
@@ -299,3 +310,93 @@ def _fields(value: Any) -> Any:
     if isinstance(value, (str, int)):
         return value
     return [_fields(item) for item in value]
+
+
+class Shown:
+    """The progress of a tune on the screen or in the log.
+
+    :param stream: where it is written.
+    :param live: True for a terminal, whose lines may be overwritten.
+    """
+
+    def __init__(self, stream: TextIO, live: bool) -> None:
+        self._stream = stream
+        self._width = shutil.get_terminal_size().columns
+        self._live = live and os.environ.get("TERM") != "dumb" and self._width >= NARROWEST
+        blocks = (stream.encoding or "").lower().replace("-", "") == "utf8"
+        self._paint = Paint(wants_colour(live, os.environ), blocks)
+        self._lines = 0
+        self._last: Any = None
+        self._came = 0.0
+
+    def take(self, feedback: Any) -> None:
+        """Show a feedback."""
+        if not self._live:
+            self._write(f"{log_line(feedback, self._last)}\n")
+        elif self._last is not None and not feedback.transfer_function.experiment_id:
+            # A model comes only once.
+            feedback.transfer_function = self._last.transfer_function
+        self._last, self._came = feedback, time.monotonic()
+
+    def tick(self) -> None:
+        """Update the times on a terminal."""
+        if not self._live or self._last is None:
+            return
+        since = time.monotonic() - self._came
+        lines = live_lines(self._last, self._paint, since, self._width)
+        self.clear()
+        self._write("\n".join(lines) + "\n")
+        self._lines = len(lines)
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
+        self.clear()
+        self._write(f"{text}\n")
+
+    def clear(self) -> None:
+        """Remove the lines that are shown in place."""
+        if self._lines:
+            self._write(f"\x1b[{self._lines}A\x1b[J")
+            self._lines = 0
+
+    def _write(self, text: str) -> None:
+        # The tune continues even if its progress cannot be written.
+        with suppress(OSError):
+            self._stream.write(text)
+            self._stream.flush()
+
+
+def follow(
+    client: TuneClient,
+    shown: Any,
+    interrupted: list[int],
+    tick: float = TICK,
+    why_over: Callable[[], str] = lambda: "",
+) -> None:
+    """Show the feedback until the result is there, and cancel when asked to.
+
+    :param client: that has asked for the tune.
+    :param shown: where the feedback goes, as :class:`Shown`.
+    :param interrupted: signals that have come.
+    :param tick: interval of the looks [s].
+    :param why_over: tells why the tune has to end by itself; empty: it goes on.
+    """
+    asked = 0
+    while not client.done():
+        client.spin(tick)
+        for feedback in client.news():
+            shown.take(feedback)
+        shown.tick()
+        over = why_over() if not asked else ""
+        if (interrupted or over) and not asked:
+            asked = 1
+            client.cancel()
+            if over:
+                shown.say(over)
+            shown.say("cancelling: the safe command goes out, then the recording is closed")
+        elif any(number != signal.SIGHUP for number in interrupted[1:]):
+            # SIGHUP does not count: a shell that ends with its terminal sends it once more.
+            raise LoopError(
+                f"stopped waiting; {client.name} still sends the safe command, and its log says "
+                f"how the tune ended"
+            )
