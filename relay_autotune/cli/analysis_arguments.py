@@ -9,21 +9,20 @@ import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from relay_autotune.analysis import check_names
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
 from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
+from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import RelayAutotuneError, SelectionError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
 from relay_autotune.text import visible
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
-
-if TYPE_CHECKING:
-    from relay_autotune.cli.export import Target
 
 
 def add_design(parser: argparse.ArgumentParser) -> None:
@@ -53,8 +52,6 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     :param options: with those of :func:`add_design`.
     :raises SelectionError: if a value is out of its range.
     """
-    from relay_autotune.cli.export import WITHOUT_LAW
-
     given = given_quantities(options, declared(DesignOptions))
     export = getattr(options, "export", None)
     if "law" not in given and export in LAWS and export != WITHOUT_LAW:
@@ -68,8 +65,6 @@ def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     :param parser: of the command.
     :return: the group that they are in.
     """
-    from relay_autotune.cli.export import EXPORTS
-
     group = parser.add_argument_group("gains as a file")
     group.add_argument(
         "--export",
@@ -95,8 +90,6 @@ def export_target(options: argparse.Namespace) -> Target:
     :param options: with those of :func:`add_export`.
     :raises SelectionError: if a name or a clamp cannot be.
     """
-    from relay_autotune.cli.export import Target
-
     limits = {n: getattr(options, n) for n in ("command_min", "command_max")}
     given = {n: v for n, v in limits.items() if v is not None}
     dof = options.dof or next(iter(getattr(options, "joint", ())), "joint")
@@ -190,9 +183,6 @@ def jobs_of(
     :param table_width: columns of a table for people; None: documents are wanted instead.
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
-    from relay_autotune.analysis import check_names
-    from relay_autotune.identification.methods import ONLY_JOINT
-
     try:
         check_names(options.method, options.rule)
         known = Known(**given_quantities(options, declared(Known)))

@@ -18,7 +18,10 @@ import numpy as np
 
 from relay_autotune.cli.arguments import DONE, finite, guarded
 from relay_autotune.cli.layout import labelled, width
+from relay_autotune.cli.table import identification_lines
 from relay_autotune.errors import ParameterError, SelectionError, look_up
+from relay_autotune.exchange.document import to_json
+from relay_autotune.exchange.fields import to_document
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods.atv import atv_from_numbers
@@ -372,10 +375,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from relay_autotune.cli.table import identification_lines
-    from relay_autotune.exchange.document import to_json
-    from relay_autotune.exchange.fields import to_document
-
     numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
     try:
         known = Known(structure=options.structure, order=options.order)

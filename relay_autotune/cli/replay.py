@@ -10,8 +10,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from relay_autotune.analysis import Analysis
 from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.analysis_arguments import add_analysis, add_export, export_target, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
@@ -27,10 +27,9 @@ from relay_autotune.cli.report import (
     command_line,
     write_report,
 )
+from relay_autotune.cli.results import ResultsFile
 from relay_autotune.errors import SelectionError
-
-if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis
+from relay_autotune.report.case import case_of
 
 PROGRAM = "replay"
 
@@ -70,8 +69,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     options.command_line = command_line(PROGRAM, arguments)
-    import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
-
     return guarded(PROGRAM, lambda: _run(parser, options))
 
 
@@ -137,8 +134,6 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         status = worst(status, done.status)
         analyses += [(done.name, analysis) for analysis in found]
     if analyses and (options.report or options.web):
-        from relay_autotune.report.case import case_of
-
         cases = as_asked([case_of(analysis, name) for name, analysis in analyses], options)
         if options.report:
             write_report(cases, options.report)
@@ -187,8 +182,6 @@ def _recordings(given: Sequence[str]) -> list[str]:
 
 def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
     """Write results to a file as they come."""
-    from relay_autotune.cli.results import ResultsFile
-
     with ResultsFile(options.output) as results:
         left = [job for job in jobs if job.name not in results.done]
         status = results.status

@@ -8,21 +8,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from relay_autotune.analysis import Analysis, analyse, analyse_jointly
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
+from relay_autotune.cli.export import Target, exported
+from relay_autotune.cli.table import table
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.exchange.document import document, to_json
+from relay_autotune.identification.known import Known
+from relay_autotune.record.record import Record
 from relay_autotune.text import visible
+from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
-
-if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis
-    from relay_autotune.cli.export import Target
-    from relay_autotune.identification.known import Known
-    from relay_autotune.record.record import Record
-    from relay_autotune.tuning.task import DesignOptions
 
 Progress = Callable[[int, int], None]
 Tell = Callable[[str], None]
@@ -137,23 +136,18 @@ def analysed(
     :param tell: told of what the computation is at.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
-    # Loading scipy takes longer than finding out that a bag does not exist.
     if job.jointly:
         records: list[Record] = []
         for path in job.paths:
             recording = read_experiments(path, job.selection, progress)
             said += [f"{path}: {note}" for note in recording.notes]
             records += recording.experiments
-        from relay_autotune.analysis import analyse_jointly
-
         found = analyse_jointly(
             records, method=job.method, rule=job.rule, known=job.known, options=job.options
         )
         return (found,)
     recording = read_experiments(job.paths, job.selection, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
-    from relay_autotune.analysis import analyse
-
     return tuple(
         analyse(
             record,
@@ -171,8 +165,6 @@ def _exported(
     analyses: Sequence[Analysis], how: str, target: Target, *, accept_doubtful: bool
 ) -> str:
     """Return the gains as a file; there must be those of one experiment alone."""
-    from relay_autotune.cli.export import exported
-
     found = [a for a in analyses if a.best_gains is not None]
     if not found:
         why = analyses[0].reason if analyses else "there is no experiment"
@@ -198,11 +190,7 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
     if job.table_width is not None:
         if error is not None:
             return ""
-        from relay_autotune.cli.table import table
-
         return table(job.name, analyses, job.table_width)
-    from relay_autotune.exchange.document import document, to_json
-
     return to_json(document(job.name, analyses, error=error))
 
 

@@ -16,8 +16,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import (
     DONE,
@@ -32,13 +33,9 @@ from relay_autotune.cli.progress import ProgressLine, Stages
 from relay_autotune.cli.replay_bag import Job, analysed
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
+from relay_autotune.record.record import Record
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
-
-if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis
-    from relay_autotune.record.record import Record
-    from relay_autotune.report.case import Case
-
+from relay_autotune.report.case import Case, case_of, read_documents
 
 PROGRAM = "report"
 
@@ -68,8 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     options.command_line = command_line(PROGRAM, arguments)
-    import relay_autotune.analysis  # noqa: F401  see guarded; --help need not wait for scipy
-
     return guarded(PROGRAM, lambda: _run(options))
 
 
@@ -218,8 +213,6 @@ _Source = tuple[tuple[str, ...], Callable[[], Sequence["Case"]]]
 
 def _sources(options: argparse.Namespace) -> list[_Source]:
     """Return the names of each source, with what reads it, in the order of the command line."""
-    from relay_autotune.report.case import read_documents
-
     names = list(dict.fromkeys(options.sources))
     jobs = jobs_of(options, [name for name in names if not _is_result(name)])
     found: list[_Source] = [(job.paths, partial(_cases, job)) for job in jobs]
@@ -234,8 +227,6 @@ def _is_result(source: str) -> bool:
 
 def _cases(job: Job) -> list[Case]:
     """Read recordings and make of them what a report tells."""
-    from relay_autotune.report.case import case_of
-
     said: list[str] = []
     try:
         with Stages(ProgressLine(f"{PROGRAM}: {job.name} read")) as stages:
@@ -282,7 +273,6 @@ def analysed_as_there(
     :param values: of its parameters, by name.
     :param tell: called with what begins.
     """
-    from relay_autotune.analysis import analyse
     from relay_autotune.nodes.identifier_parameters import known_from, options_from
 
     return analyse(
@@ -321,8 +311,6 @@ def report_of_tune(
     :return: a warning for the user; empty: none.
     :raises BagError: if it cannot be written.
     """
-    from relay_autotune.report.case import case_of
-
     found = analysed_as_there(record, values)
     case = replace(case_of(found, source), present=present)
     if result.bag:

@@ -22,17 +22,33 @@ from relay_autotune.cli.analysis_arguments import (
     export_target,
 )
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
+from relay_autotune.cli.export import exported, write
 from relay_autotune.cli.layout import in_columns, labelled, width
 from relay_autotune.cli.page import add_web, check_web, show
+from relay_autotune.cli.table import gains_lines
+from relay_autotune.cli.tune_model import model_of
 from relay_autotune.errors import SelectionError, TuningError
+from relay_autotune.exchange.document import to_json
+from relay_autotune.exchange.fields import to_document
+from relay_autotune.exchange.models import model_fields
+from relay_autotune.record.record import Outcome
+from relay_autotune.shaping import Shaping
 from relay_autotune.text import digits, process_text
-from relay_autotune.tuning.forms import series_form
+from relay_autotune.tuning import (
+    DEFAULT_RULE,
+    RULES,
+    DesignTask,
+    Gains,
+    Performance,
+    analyse_loop,
+    design,
+    task_of_model,
+)
+from relay_autotune.tuning.compensators import COMPENSATORS, Compensator
+from relay_autotune.tuning.forms import FORMS, series_form
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case
-    from relay_autotune.shaping import Shaping
-    from relay_autotune.tuning import DesignTask, Gains, Performance
-    from relay_autotune.tuning.compensators import Compensator
 
 
 _HEADINGS = ("kc", "ti", "td", "Ms", "Mt", "GM", "PM", "IAE")
@@ -190,8 +206,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from relay_autotune.tuning.forms import FORMS
-
     parser = _Parser(
         prog=PROGRAM,
         usage="%(prog)s [MODEL | flags of the model] [options]",
@@ -240,9 +254,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.tune_model import model_of
-    from relay_autotune.tuning import DEFAULT_RULE, RULES, task_of_model
-
     if options.output is not None and options.export is None:
         raise SelectionError("--output is for --export: say what to write")
     if options.table and options.export is not None:
@@ -265,10 +276,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
 
 def _to_shape(task: DesignTask, rule: str, gains: Sequence[Gains]) -> tuple[Case, Shaping]:
     """Return a model that was given as a page shows it, and what the design of gains takes."""
-    from relay_autotune.record.record import Outcome
     from relay_autotune.report.case import Case, given_model
-    from relay_autotune.shaping import Shaping
-    from relay_autotune.text import process_text
 
     case = Case(
         source=process_text(task.model),
@@ -287,11 +295,6 @@ def _to_shape(task: DesignTask, rule: str, gains: Sequence[Gains]) -> tuple[Case
 
 
 def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.export import exported, write
-    from relay_autotune.cli.table import gains_lines
-    from relay_autotune.cli.tune import further_forms, process_lines
-    from relay_autotune.tuning import design
-
     gains = design(task, rule)
     if options.export is not None:
         write(exported(gains, options.export, export_target(options)), options.output)
@@ -311,8 +314,6 @@ def _side_by_side(
     gains: Sequence[Gains],
     refused: dict[str, str],
 ) -> int:
-    from relay_autotune.cli.tune import process_lines, refusal_lines, side_by_side
-
     recommended = 0 if gains and gains[0].rule == rule else None
     inside = _compensators(task, refused)
     if options.json:
@@ -330,8 +331,6 @@ def _side_by_side(
 
 def _by_all_rules(task: DesignTask, rule: str) -> tuple[list[Gains], dict[str, str]]:
     """Return the gains of every rule, the chosen one's first, and why others give none."""
-    from relay_autotune.tuning import RULES, design
-
     gains: list[Gains] = []
     refused: dict[str, str] = {}
     for name in sorted(RULES, key=lambda n: n != rule):
@@ -346,9 +345,6 @@ def _compensators(
     task: DesignTask, refused: dict[str, str]
 ) -> list[tuple[Compensator, Performance]]:
     """Return the controllers with a model inside, and note why others do not apply."""
-    from relay_autotune.tuning import analyse_loop
-    from relay_autotune.tuning.compensators import COMPENSATORS
-
     found = []
     for name, make in COMPENSATORS.items():
         try:
@@ -367,11 +363,6 @@ def _print_document(
     form: str,
     inside: Sequence[tuple[Compensator, Performance]] = (),
 ) -> None:
-    from relay_autotune.exchange.document import to_json
-    from relay_autotune.exchange.fields import to_document
-    from relay_autotune.exchange.models import model_fields
-    from relay_autotune.tuning.forms import series_form
-
     found = []
     for each in gains:
         fields = to_document(each)
