@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.cli.arguments import DONE, as_typed, say
 from relay_autotune.cli.asking import asked, asked_for_file, number_of
 from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of, write
-from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.new_loop import PROGRAM, is_new_loop, ros_arguments
 from relay_autotune.cli.progress import Working
@@ -29,6 +28,7 @@ from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
+    from relay_autotune.cli.joint_tune import JointTune
     from relay_autotune.cli.own_nodes import OwnNodes
     from relay_autotune.nodes.tune_client import TuneClient
 

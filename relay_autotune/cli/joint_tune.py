@@ -12,7 +12,9 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import yaml
 
 from relay_autotune.cli.apply_gains import apply_at, beside
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
@@ -30,81 +32,34 @@ from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
-
-if TYPE_CHECKING:
-    from relay_autotune.loop.gains import Controller
-    from relay_autotune.nodes.controller_manager import ManagedController
-    from relay_autotune.nodes.tune_client import TuneClient
+from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
+from relay_autotune.loop.gains import Controller
+from relay_autotune.nodes.command_message import CommandMessage
+from relay_autotune.nodes.controller_manager import (
+    ControllerManager,
+    ManagedController,
+    Opened,
+    forwarding,
+    in_the_way,
+)
+from relay_autotune.nodes.gains_place import controller_of
+from relay_autotune.nodes.joint_loop import (
+    COMMAND_TYPE,
+    GAINS,
+    STATE_TYPE,
+    joint_loop,
+    put_gains,
+    told,
+)
+from relay_autotune.nodes.live_types import message_class
+from relay_autotune.nodes.readiness import ChecklistLine, Mark
+from relay_autotune.nodes.tune_client import TuneClient
 
 _JOINT_STATES = "/joint_states"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _FLOATS = "std_msgs/msg/Float64MultiArray"
 # Height of the trajectory that verifies gains by hand, as a part of the joint's range.
 _PROOF = 0.05
-# Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
-_OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
-_OF_TOPICS = (
-    "command", "command_field", "command_period", "verify", "step", "law", "sample_period",
-)  # fmt: skip
-
-
-def add_joint(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of a joint of ros2_control.
-
-    :param parser: of tune_loop.
-    """
-    group = parser.add_argument_group(
-        "a joint of ros2_control",
-        "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
-        "applies and verifies the gains",
-    )
-    group.add_argument(
-        "--controller", metavar="NAME",
-        help="an active pid_controller, or with --open a joint_trajectory_controller",
-    )  # fmt: skip
-    group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
-    group.add_argument(
-        "--controller-manager", default="", metavar="NAME",
-        help="full name of the controller_manager; default: the only one that is there",
-    )  # fmt: skip
-    group.add_argument(
-        "--open", action="store_true",
-        help="switch its controllers off for the tune, and command the joint itself; default: "
-        "the controller stays active, and its reference is moved",
-    )  # fmt: skip
-    group.add_argument(
-        "--forward", metavar="NAME",
-        help="with --open: the controller that passes commands on; default: found",
-    )  # fmt: skip
-    group.add_argument(
-        "--keep-gains", action="store_true", help="leave the gains of the controller as they are"
-    )
-
-
-def is_of_joint(options: argparse.Namespace) -> bool:
-    """Return whether a joint is to be tuned.
-
-    :param options: with the flags of `add_joint` and `add_new_loop`.
-    :raises SelectionError: if the flags do not go together.
-    """
-    if not (options.controller or options.joint):
-        if options.open or options.forward or options.keep_gains or options.controller_manager:
-            raise SelectionError("--open and the like are for a joint: give --controller, --joint")
-        return False
-    if not (options.controller and options.joint):
-        raise SelectionError("--controller and --joint go together: give both")
-    if options.web or (options.json and not (options.keep_gains or options.dry_run)):
-        raise SelectionError(
-            "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"
-        )
-    for name in (*_OF_TOPICS, *(() if options.open else _OF_OPENED)):
-        if getattr(options, name) is not None:
-            what = "a loop of two topics" if name in _OF_TOPICS else "--open"
-            raise SelectionError(
-                f"--{name.replace('_', '-')} is for {what}: leave it out, since the controller "
-                f"tells it"
-            )
-    return True
 
 
 class JointTune:
@@ -116,13 +71,6 @@ class JointTune:
     """
 
     def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
-        from relay_autotune.nodes.controller_manager import (
-            ControllerManager,
-            forwarding,
-            in_the_way,
-        )
-        from relay_autotune.nodes.joint_loop import joint_loop
-
         self._client, self._options = client, options
         self._space = own_namespace(options)
         self._forward: ManagedController | None = None
@@ -182,8 +130,6 @@ class JointTune:
 
     def plan(self) -> list[str]:
         """Return the plan, as lines of a checklist."""
-        from relay_autotune.nodes.readiness import ChecklistLine, Mark
-
         loop = self._loop
         lines = [
             ChecklistLine(Mark.OK, name, told)
@@ -335,8 +281,6 @@ class JointTune:
         return OwnNodes(nodes)
 
     def _closed_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
-        from relay_autotune.nodes.joint_loop import COMMAND_TYPE
-
         loop = self._loop
         topics = {"measurement": loop.state_topic, "setpoint": loop.reference_topic}
         return topics, self._of_state() | {
@@ -351,8 +295,6 @@ class JointTune:
         }
 
     def _of_state(self) -> dict[str, Any]:
-        from relay_autotune.nodes.joint_loop import STATE_TYPE
-
         return {
             "measurement_type": STATE_TYPE,
             "measurement_field": f"{self._loop.state_field}.feedback",
@@ -432,8 +374,6 @@ class JointTune:
         return [told[name] for name in forward.needs]
 
     def _given_beside(self, forward: ManagedController) -> list[float]:
-        import yaml
-
         with suppress(yaml.YAMLError, TypeError, ValueError, KeyError):
             data = [float(v) for v in yaml.safe_load(self._options.command_message)["data"]]
             if len(data) == len(forward.needs):
@@ -444,8 +384,6 @@ class JointTune:
         )
 
     def _position_of(self, joint: str) -> float:
-        from relay_autotune.nodes.live_types import message_class
-
         kind = message_class(_JOINT_STATE, "measurement_type")
         for message in self._client.heard(kind, _JOINT_STATES, 0.0, 1):
             if joint in message.name:
@@ -458,8 +396,6 @@ class JointTune:
 
         :return: what tells why the tune has to end; empty: it goes on.
         """
-        from relay_autotune.nodes.controller_manager import Opened
-
         if self._forward is None:
             yield self._manager.still_active(self._loop.controller)
             return
@@ -476,8 +412,6 @@ class JointTune:
 
     def _first_command(self) -> tuple[Any, str]:
         """Return the message of the first command, and its topic."""
-        from relay_autotune.nodes.command_message import CommandMessage
-
         topics, values = self._opened_ends()
         beside = json.loads(values["command_message"])
         message = CommandMessage(values["command_type"], values["command_field"], beside)
@@ -488,10 +422,6 @@ class JointTune:
 
         :return: why it does not have them; empty: it has, or it cannot.
         """
-        from relay_autotune.nodes.command_message import CommandMessage
-        from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE
-        from relay_autotune.nodes.live_types import message_class
-
         loop = self._loop
         active = False
         with suppress(LoopError):
@@ -533,8 +463,6 @@ class JointTune:
 
         :raises LoopError: if it does not answer.
         """
-        from relay_autotune.nodes.gains_place import controller_of
-
         p, i, d = self._client.values(self._loop.node, self._loop.parameters).values()
         return controller_of({"p": p, "i": i, "d": d}) if p else None
 
@@ -544,8 +472,6 @@ class JointTune:
         :param nodes: of this command.
         :param doubt: why they are doubtful; empty: they are trusted.
         """
-        from relay_autotune.nodes.joint_loop import COMMAND_TYPE, GAINS
-
         if doubt and self._options.yes:
             raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
         loop = self._loop
@@ -578,12 +504,6 @@ class JointTune:
 
     def _set(self) -> int:
         """Set the gains of a controller whose references nobody can move; return the status."""
-        from relay_autotune.exchange.messages import (
-            gains_from_message,
-            transfer_function_from_message,
-        )
-        from relay_autotune.nodes.joint_loop import put_gains, told
-
         loop, client = self._loop, self._client
         found = client.result
         gains = gains_from_message(found.gains)

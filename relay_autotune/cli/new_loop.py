@@ -1,7 +1,10 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What tune_loop does for a loop that has no nodes yet: look at it, ask, and start them."""
+"""What tune_loop does for a loop that has no nodes yet: look at it, ask, and start them.
+
+The flags of a joint of ros2_control stand here, too, since they exclude some of these.
+"""
 
 from __future__ import annotations
 
@@ -97,6 +100,12 @@ _OF_NEW_LOOP: dict[str, dict[str, Any]] = {
     "export": {"metavar": "FILE", "help": "write the gains for ros2_controllers' pid_controller"},
 }  # fmt: skip
 
+# Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
+_OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
+_OF_TOPICS = (
+    "command", "command_field", "command_period", "verify", "step", "law", "sample_period",
+)  # fmt: skip
+
 
 def add_new_loop(parser: argparse.ArgumentParser) -> None:
     """Add the flags of a loop that has no nodes yet.
@@ -128,6 +137,65 @@ def is_new_loop(options: argparse.Namespace) -> bool:
                 f"--command, too"
             )
     return False
+
+
+def add_joint(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a joint of ros2_control.
+
+    :param parser: of tune_loop.
+    """
+    group = parser.add_argument_group(
+        "a joint of ros2_control",
+        "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
+        "applies and verifies the gains",
+    )
+    group.add_argument(
+        "--controller", metavar="NAME",
+        help="an active pid_controller, or with --open a joint_trajectory_controller",
+    )  # fmt: skip
+    group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
+    group.add_argument(
+        "--controller-manager", default="", metavar="NAME",
+        help="full name of the controller_manager; default: the only one that is there",
+    )  # fmt: skip
+    group.add_argument(
+        "--open", action="store_true",
+        help="switch its controllers off for the tune, and command the joint itself; default: "
+        "the controller stays active, and its reference is moved",
+    )  # fmt: skip
+    group.add_argument(
+        "--forward", metavar="NAME",
+        help="with --open: the controller that passes commands on; default: found",
+    )  # fmt: skip
+    group.add_argument(
+        "--keep-gains", action="store_true", help="leave the gains of the controller as they are"
+    )
+
+
+def is_of_joint(options: argparse.Namespace) -> bool:
+    """Return whether a joint is to be tuned.
+
+    :param options: with the flags of `add_joint` and `add_new_loop`.
+    :raises SelectionError: if the flags do not go together.
+    """
+    if not (options.controller or options.joint):
+        if options.open or options.forward or options.keep_gains or options.controller_manager:
+            raise SelectionError("--open and the like are for a joint: give --controller, --joint")
+        return False
+    if not (options.controller and options.joint):
+        raise SelectionError("--controller and --joint go together: give both")
+    if options.web or (options.json and not (options.keep_gains or options.dry_run)):
+        raise SelectionError(
+            "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"
+        )
+    for name in (*_OF_TOPICS, *(() if options.open else _OF_OPENED)):
+        if getattr(options, name) is not None:
+            what = "a loop of two topics" if name in _OF_TOPICS else "--open"
+            raise SelectionError(
+                f"--{name.replace('_', '-')} is for {what}: leave it out, since the controller "
+                f"tells it"
+            )
+    return True
 
 
 def own_namespace(options: argparse.Namespace) -> str:

@@ -46,13 +46,14 @@ from relay_autotune.cli.arguments import (
 )
 from relay_autotune.cli.asking import agrees
 from relay_autotune.cli.export import EXPORTS
-from relay_autotune.cli.joint_tune import JointTune, add_joint, is_of_joint
 from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     PROGRAM,
     START_WITHIN,
+    add_joint,
     add_new_loop,
     is_new_loop,
+    is_of_joint,
     nodes_for,
     own_namespace,
     with_flags,
@@ -74,6 +75,7 @@ from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
+    from relay_autotune.cli.joint_tune import JointTune
     from relay_autotune.cli.own_nodes import OwnNodes
     from relay_autotune.loop.gains import Controller
     from relay_autotune.nodes.tune_client import TuneClient
@@ -186,6 +188,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     if options.web:
         check_web(options)
     of_joint = is_of_joint(options)
+    if of_joint:
+        from relay_autotune.cli.joint_tune import JointTune
     new = of_joint or is_new_loop(options)
     try:
         namespace = own_namespace(options) if new else options.namespace

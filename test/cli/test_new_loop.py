@@ -23,8 +23,13 @@ from relay_autotune.cli import proof, report, tune_loop
 from relay_autotune.cli.after_tune import hand_over, left, left_its_limits, prefix, repeated
 from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.cli.export import EXPORTS
-from relay_autotune.cli.joint_tune import is_of_joint
-from relay_autotune.cli.new_loop import add_new_loop, is_new_loop, nodes_for, with_flags
+from relay_autotune.cli.new_loop import (
+    add_new_loop,
+    is_new_loop,
+    is_of_joint,
+    nodes_for,
+    with_flags,
+)
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.controller_parameters import PARAMETERS
