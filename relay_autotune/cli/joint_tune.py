@@ -34,7 +34,6 @@ from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.controller_manager import (
     ControllerManager,
     ManagedController,
@@ -51,7 +50,7 @@ from relay_autotune.nodes.joint_loop import (
     put_gains,
     told,
 )
-from relay_autotune.nodes.live_types import message_class
+from relay_autotune.nodes.live_types import CommandMessage, message_class
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune.nodes.tune_client import TuneClient
 

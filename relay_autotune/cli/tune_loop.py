@@ -178,7 +178,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     # Only note the signal: an exception could be lost in an import or in a callback of rclpy.
     heed(signal.SIGINT)
     # Imported here, so that --help does not load rclpy.
-    from relay_autotune.nodes.signals import ending_signals, never_wait_for
+    from relay_autotune.nodes.lifetime import ending_signals, never_wait_for
     from relay_autotune.nodes.tune_client import TuneClient
 
     if options.report:

@@ -16,8 +16,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from relay_autotune.nodes import quality, signs_of_life
-from relay_autotune.nodes.command_message import CommandMessage
-from relay_autotune.nodes.live_types import Reader
+from relay_autotune.nodes.live_types import CommandMessage, Reader
 from relay_autotune.nodes.quality import Following
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 

@@ -5,7 +5,9 @@
 
 rclpy's own signal handlers invalidate the context before any Python code runs, so that nothing
 can be published afterwards. Here the process owns its handlers; the context lives until the
-node has brought its loop to a safe state.
+node has brought its loop to a safe state. A closed terminal sends SIGHUP and then refuses output.
+A terminal paused by Ctrl-S, or a pipe without a reader, blocks a write for any time. Neither may
+end or delay a process whose last command is in force.
 
 rclpy's executor checks every service, timer and event of a node twice for each message. Ours
 waits for the favoured subscription alone while its messages follow each other closely, and checks
@@ -14,11 +16,11 @@ everything else a few hundred times a second.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import itertools
 import os
 import signal
+import stat
 import sys
 import textwrap
 import threading
@@ -26,6 +28,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +48,6 @@ from rclpy.subscription import Subscription
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.parameters import unknown_parameters
-from relay_autotune.nodes.signals import ending_signals, never_wait_for, signal_name
 from relay_autotune.quantities import Quantity
 
 # Messages further apart than this take the ordinary path [s].
@@ -237,7 +239,7 @@ def run(
     own, ros = _apart(words)
     if {"-h", "--help"} & set(own):
         # A pager may have been closed early.
-        with contextlib.suppress(BrokenPipeError):
+        with suppress(BrokenPipeError):
             print(_help(name, str(sys.modules[create.__module__].__doc__), parameters), flush=True)
         return 0
     if own:
@@ -284,7 +286,7 @@ def run(
 def _refuse(name: str, why: str) -> int:
     """Say why a node cannot run; return the exit status."""
     # Standard error may be closed.
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         print(f"{name}: {why}", file=sys.stderr)
     return 2
 
@@ -378,6 +380,69 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
     signals.end()
     executor.shutdown(timeout_sec=0.0)
     return status
+
+
+# The first two cannot be caught. The next four report a defect of the process itself; a handler
+# would return to the same instruction for ever. The next four end nothing. The last two stop a
+# background process that uses its terminal.
+_OTHERS = {
+    signal.SIGKILL, signal.SIGSTOP,
+    signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL,
+    signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH,
+    signal.SIGTTIN, signal.SIGTTOU,
+}  # fmt: skip
+# These are obeyed even if the process was started with them ignored: a shell ignores the first two
+# for the background jobs of a script. An ignored SIGHUP stays ignored, for nohup.
+_ALWAYS = {signal.SIGINT, signal.SIGQUIT, signal.SIGTERM}
+
+
+def ending_signals() -> set[int]:
+    """Return the signals that would end or stop this process, and can be caught."""
+    others = signal.valid_signals() - _OTHERS
+    return {n for n in others if n in _ALWAYS or signal.getsignal(n) is not signal.SIG_IGN}
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal, such as SIGHUP."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"SIGRTMIN+{number - signal.SIGRTMIN}"
+
+
+def never_wait_for(output: int) -> Callable[[], None]:
+    """Drop writes to a terminal or a pipe when they would block.
+
+    The blocking mode belongs to the open file, which the process shares with its shell and others.
+    So the file is opened once more, for this process alone. A regular file never blocks and is
+    left unchanged.
+
+    :param output: file descriptor, 1 or 2.
+    :return: the function that undoes this.
+    """
+    try:
+        if stat.S_ISREG(os.fstat(output).st_mode):
+            return lambda: None
+        before, waited = os.dup(output), os.get_blocking(output)
+    except OSError:
+        # The descriptor is not open.
+        return lambda: None
+    try:
+        own = os.open(f"/proc/self/fd/{output}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+    except OSError:
+        # A socket (systemd's journal) or a file of another user cannot be opened again.
+        os.set_blocking(output, False)
+    else:
+        os.dup2(own, output)
+        os.close(own)
+
+    def undo() -> None:
+        with suppress(OSError):
+            os.dup2(before, output)
+            os.set_blocking(output, waited)
+            os.close(before)
+
+    return undo
 
 
 class _Signals:

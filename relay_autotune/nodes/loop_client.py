@@ -26,7 +26,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.command_message import CommandMessage
+from relay_autotune.nodes.live_types import CommandMessage
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0

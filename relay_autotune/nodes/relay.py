@@ -24,10 +24,9 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.narration import how_long
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
-from relay_autotune.nodes.command_message import CommandMessage
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
 from relay_autotune.nodes.narrator import Narrator

@@ -16,8 +16,7 @@ from rclpy.node import Node
 from relay_autotune.control.controller import is_usable
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.command_message import CommandMessage
-from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
 from relay_autotune.nodes.verifier import NotVerifiable
 

@@ -18,8 +18,7 @@ from rclpy.qos import qos_profile_sensor_data
 from relay_autotune.errors import FieldError, LoopError
 from relay_autotune.exchange.messages import record_from_message, without_impossible
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.command_message import CommandMessage
-from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune

@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32, Float64MultiArray
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.nodes.command_message import CommandMessage
+from relay_autotune.nodes.live_types import CommandMessage
 
 MULTI, DOUBLES = "std_msgs/msg/Float64MultiArray", "control_msgs/msg/MultiDOFCommand"
 STAMP = 1_790_000_000_123_456_789

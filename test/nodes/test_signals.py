@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from relay_autotune.nodes.signals import ending_signals, never_wait_for, signal_name
+from relay_autotune.nodes.lifetime import ending_signals, never_wait_for, signal_name
 
 
 @pytest.fixture
