@@ -12,13 +12,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import FieldError, RelayAutotuneError
-from relay_autotune.exchange.messages import finding_from_message
+from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.narration import how_long
@@ -54,17 +55,10 @@ from relay_autotune.nodes.readiness import (
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
-from relay_autotune.nodes.reports import (
-    cycle_message,
-    diagnostics,
-    experiment_message,
-    losses,
-    state_values,
-)
 from relay_autotune.nodes.results import MODEL, OwnResults
 from relay_autotune.nodes.session import Session, SetpointSession, reported_by
 from relay_autotune.nodes.signs_of_life import said_by
-from relay_autotune.nodes.silence import Counter, Sensor, require_own_time
+from relay_autotune.nodes.silence import Counter, Sensor, losses, require_own_time
 from relay_autotune.nodes.tune_action import Started, TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
@@ -393,14 +387,14 @@ class RelayNode(ServedNode):
             self.defer(self._narrator.now)
         if (early := session.early) is not None and early.is_due(session.experiment):
             early.look(session.experiment)
-            self.defer(lambda: self._ends.progress.publish(experiment_message(session)))
+            self.defer(lambda: self._ends.progress.publish(session.message()))
 
     def _publish_cycle(self, session: Session, index: int) -> None:
         self._tell(session.experiment.status)
         if self._on_setpoint:
             # The controller's commands are known only at the end.
             return
-        message = cycle_message(session, index)
+        message = session.cycle_message(index)
         self._ends.cycles.publish(message)
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
 
@@ -475,7 +469,7 @@ class RelayNode(ServedNode):
 
     def _complete(self, session: Session) -> None:
         experiment = session.experiment
-        message = experiment_message(session)
+        message = session.message()
         self._ends.experiments.publish(message)
         outcome = experiment.outcome.name.lower()
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
@@ -497,7 +491,7 @@ class RelayNode(ServedNode):
         def closed(missing: str) -> None:
             self._awaits_results = None
             bag = self._recordings.path_of(session.id)
-            summary = experiment_message(session, arrays=False)
+            summary = session.message(arrays=False)
             self._action.end(session.id, summary, bag, "; ".join(filter(None, (lost, missing))))
 
         if completed:
@@ -564,12 +558,30 @@ class RelayNode(ServedNode):
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem()))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
-        running = "" if session is None else session.id
-        values = state_values(self._counter, session, idle=idle, lost=self._lost())
-        summary = f"tune {running}: {self._words()}" if running else self._summary
-        now = self._now_ns()
-        message = diagnostics(self._name.lstrip("/"), now, problems, summary, values)
+        values: dict[str, object] = {
+            "state": idle,
+            "experiment": "",
+            "rate [Hz]": float(self._counter.since_last_asked()),
+            "age of the last sample [s]": self._counter.age,
+        }
+        summary = self._summary
+        if session is not None:
+            values |= session.facts(self._lost())
+            summary = f"tune {session.id}: {self._words()}"
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if problems else DiagnosticStatus.OK,
+            name=f"{self._name.lstrip('/')}: experiment",
+            hardware_id="none",
+            message="; ".join(problems) or summary,
+            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        set_stamp(message.header.stamp, self._now_ns())
         self._ends.diagnostics.publish(message)
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""One experiment in relay_node: its time base, its stamps and its recording."""
+"""One experiment in relay_node: its time base, its stamps, its recording and its messages."""
 
 from __future__ import annotations
 
@@ -18,14 +18,22 @@ import numpy as np
 import numpy.ma
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.errors import ParameterError
-from relay_autotune.exchange.messages import start_seconds
+from relay_autotune.errors import ParameterError, RecordError
+from relay_autotune.exchange.messages import (
+    fill_cycle,
+    fill_experiment,
+    fill_settings,
+    set_stamp,
+    start_seconds,
+)
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.experiment.faults import ClockWatch
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
 from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune_msgs.msg import RelayCycle
+from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 
 # A measurement waits no longer than this for its callback, unless a clock was set back [ns].
 _LONGEST_WAIT_NS = 1_000_000_000
@@ -150,6 +158,67 @@ class Session:
             start=start_seconds(self.start_ns),
             lost_samples=self.lost_samples,
         )
+
+    def cycle_message(self, index: int) -> RelayCycle:
+        """Return the message of a finished cycle.
+
+        :param index: number of the cycle.
+        """
+        experiment = self.experiment
+        first, stop = experiment.cycle_start[index], experiment.cycle_start[index + 1] + 1
+        begin = 0 if index == 0 else first
+        columns = experiment.samples(begin, stop)
+        message = RelayCycle()
+        fill_cycle(
+            message,
+            experiment.cycles[index],
+            settings=experiment.settings,
+            experiment_id=self.id,
+            start_ns=self.start_ns,
+            time=columns[0],
+            measurement=columns[1],
+            command=columns[2],
+            lead_in=first - begin,
+        )
+        return message
+
+    def message(self, *, arrays: bool = True) -> ExperimentMessage:
+        """Return the message of the whole record.
+
+        :param arrays: False: a summary, without the samples.
+        """
+        experiment = self.experiment
+        message = ExperimentMessage()
+        try:
+            fill_experiment(message, self.record(), arrays=arrays)
+        except RecordError:
+            # The tune ended before its first sample: an outcome, but no record.
+            fill_settings(message.settings, experiment.settings)
+            message.experiment_id = self.id
+            message.outcome = int(experiment.outcome)
+            message.reason = experiment.reason
+            message.noise_std = math.nan
+        if self.sample_count:
+            set_stamp(message.header.stamp, self.start_ns)
+        if self.early is not None:
+            message.sought, message.sought_width = self.early.sought, self.early.wanted
+        return message
+
+    def facts(self, lost: int) -> dict[str, object]:
+        """Return what /diagnostics tells of the running tune, by name.
+
+        :param lost: samples that the middleware has lost so far.
+        """
+        experiment = self.experiment
+        return {
+            "state": experiment.state.name.lower(),
+            "experiment": self.id,
+            "cycles": experiment.cycle_count,
+            "noise standard deviation": experiment.noise_std,
+            "samples": self.sample_count,
+            "lost samples": lost,
+            "clock drift [s]": self.clocks.drift,
+        }
 
     def _answer_at(
         self,

@@ -178,6 +178,11 @@ class Counter:
         return count
 
 
+def losses(count: int) -> str:
+    """Say how many samples were lost on the way; "" for none."""
+    return f"{count} {'sample' if count == 1 else 'samples'} lost on the way" if count else ""
+
+
 class Sensor:
     """Watch the measurement: by its messages, or with repetition by its publisher.
 
