@@ -107,10 +107,8 @@ class ControllerNode(ServedNode):
         self._commanded = False
         self._verifier = Verifier(
             self,
-            ready=self._ready_to_verify,
-            heights=self._steps_of,
+            prepare=self._prepare_verification,
             move=self._move,
-            begin=self._begin_verification,
             ended=self._after_verification,
         )
         self._remote: RemoteLoop | None = None
@@ -436,7 +434,7 @@ class ControllerNode(ServedNode):
 
     # Proof.
 
-    async def _ready_to_verify(self) -> Verifiable:
+    async def _prepare_verification(self, request: Verify.Goal) -> Verifiable:
         if self._held:
             raise NotVerifiable("a tune is running")
         self._verifier.require_samples()
@@ -456,10 +454,9 @@ class ControllerNode(ServedNode):
                 f"the model that would predict the step is {doubt}; set the parameter "
                 "accept_doubtful to true to step all the same"
             )
-        return Verifiable(self._place.controller_of(kept), model, self._limits, self._rate)
-
-    async def _begin_verification(self) -> None:
+        gains, steps = self._place.controller_of(kept), self._steps_of(request)
         await self._keeper.begin_verification()
+        return Verifiable(steps, gains, model, self._limits, self._rate)
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value

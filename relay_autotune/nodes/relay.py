@@ -26,11 +26,11 @@ from relay_autotune.experiment.narration import how_long
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.nodes.ends import Ends
+from relay_autotune.nodes.goals import Narrator
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
-from relay_autotune.nodes.narrator import Narrator
 from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.nodes.quality import FOLLOW_EVERY, described, who, why_no_publisher
 from relay_autotune.nodes.readiness import (

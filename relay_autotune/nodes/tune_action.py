@@ -10,12 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.action import ActionServer, CancelResponse
-from rclpy.node import Node
-
 from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.narrator import conclude
+from relay_autotune.nodes.goals import OneGoal, conclude
+from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
 
@@ -46,11 +44,8 @@ class Started:
     checks: tuple[str, ...] = ()
 
 
-class TuneAction:
-    """Serve the action; no callback waits, because the experiment advances with the samples.
-
-    A goal is always accepted, because a rejection carries no reason. A goal that cannot start ends
-    at once as aborted, with the reason in its result.
+class TuneAction(OneGoal):
+    """Serve the action.
 
     :param node: the node.
     :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune.
@@ -59,44 +54,32 @@ class TuneAction:
 
     def __init__(
         self,
-        node: Node,
+        node: ServedNode,
         start: Callable[[float, bool], Started],
         cancel: Callable[[], None],
     ) -> None:
-        self._node = node
+        super().__init__(
+            node, Tune, "~/tune", self._accept, cancel, status_pub_qos_profile=quality.STATUS
+        )
         self._start = start
-        self._cancel = cancel
-        self._goal: Any = None
-        self._id = ""
+        self._forget("")
+
+    def _forget(self, experiment_id: str) -> None:
+        """Begin an experiment without results."""
+        self._id = experiment_id
         self._result = Tune.Result()
         self._newest = TransferFunction()
         self._ultimate_gain = self._ultimate_gain_std = math.nan
-        self._server = ActionServer(
-            node,
-            Tune,
-            "~/tune",
-            self._set_state,
-            handle_accepted_callback=self._accept,
-            cancel_callback=self._on_cancel,
-            status_pub_qos_profile=quality.STATUS,
-        )
 
     def _accept(self, goal: Any) -> None:
         request = goal.request
         started = self._start(request.amplitude, request.dry_run)
         if started.experiment_id:
-            self._goal, self._id = goal, started.experiment_id
-            self._result = Tune.Result()
-            self._newest = TransferFunction()
-            self._ultimate_gain = self._ultimate_gain_std = math.nan
+            self.running = goal
+            self._forget(started.experiment_id)
             return
         result = Tune.Result(reason=started.reason, checks=started.checks)
         conclude(goal, result, succeeded=started.accepted)
-
-    def _on_cancel(self, goal: Any) -> CancelResponse:
-        if self._goal is not None and goal.goal_id == self._goal.goal_id:
-            self._node.executor.create_task(self._cancel)
-        return CancelResponse.ACCEPT
 
     def tell(self, experiment: RelayExperiment, status: str) -> None:
         """Publish feedback, if a goal is active.
@@ -104,7 +87,7 @@ class TuneAction:
         :param experiment: the running experiment.
         :param status: what it waits for and what it sees, a sentence.
         """
-        if self._goal is None:
+        if self.running is None:
             return
         feedback = Tune.Feedback(
             state=_STATES[experiment.state],
@@ -123,7 +106,7 @@ class TuneAction:
             last = experiment.cycles[-1]
             feedback.period = last.period
             feedback.amplitude = 0.5 * (last.peak_max - last.peak_min)
-        self._goal.publish_feedback(feedback)
+        self.running.publish_feedback(feedback)
         # Each model is told once, since it is long.
         self._newest = TransferFunction()
 
@@ -133,7 +116,7 @@ class TuneAction:
         :param name: unresolved name of its topic.
         :param message: the message.
         """
-        if self._goal is None or message.experiment_id != self._id:
+        if self.running is None or message.experiment_id != self._id:
             return
         if name == "transfer_function":
             self._newest = message
@@ -152,7 +135,7 @@ class TuneAction:
         :param bag: folder of the recording; empty: no recording.
         :param missing: a sentence on samples or results that are missing; empty: none are.
         """
-        goal = self._goal
+        goal = self.running
         if goal is None or experiment_id != self._id:
             return
         result = self._result
@@ -164,10 +147,5 @@ class TuneAction:
         told = result.gains if given else result.transfer_function
         result.verdict = told.verdict if given else Tune.Result.VERDICT_NONE
         result.verdict_reason = told.verdict_reason or ("" if given else result.reason)
-        self._goal = None
+        self.running = None
         conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
-
-    def _set_state(self, goal: Any) -> Any:
-        # Only the constructor needs this callback; each goal has its own.
-        goal.abort()
-        return Tune.Result()

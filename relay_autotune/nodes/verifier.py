@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.action import ActionServer, CancelResponse
 
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
@@ -26,8 +25,8 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.goals import Narrator, OneGoal, conclude
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
-from relay_autotune.nodes.narrator import Narrator, conclude
 from relay_autotune.nodes.results import keep
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import duration
@@ -62,18 +61,20 @@ class NotVerifiable(RelayAutotuneError):  # noqa: N818  it is a state of the loo
 
 @dataclass(frozen=True)
 class Verifiable:
-    """The gains to verify, with model and limits.
+    """What is to be verified.
 
+    :param steps: to be made.
     :param gains: the controller in force.
     :param model: the process as identified.
     :param limits: range of the command.
     :param rate: the law that runs them; None: our own.
     """
 
+    steps: Sequence[Step]
     gains: Controller
     model: TransferFunction
     limits: Limits
-    rate: LawRate | None = None
+    rate: LawRate | None
 
 
 class Predictors:
@@ -150,11 +151,9 @@ class Verifier:
     The predictions take up to seconds, so they are computed in another thread.
 
     :param node: the node.
-    :param ready: returns the gains to verify; raises RelayAutotuneError with the reason if the
-        loop is not ready.
-    :param heights: returns the steps of a request; raises likewise.
+    :param prepare: takes a request and returns what is to be verified; raises RelayAutotuneError
+        with the reason if the loop is not ready.
     :param move: adds a step to the set-point [y] and one to the command [u]; 0: no step.
-    :param begin: called before the first step; raises RelayAutotuneError if it must not begin.
     :param ended: called with True if all steps passed, False if one failed, None without a
         verdict, and a sentence; returns the sentence for the client.
     """
@@ -163,24 +162,18 @@ class Verifier:
         self,
         node: ServedNode,
         *,
-        ready: Callable[[], Awaitable[Verifiable]],
-        heights: Callable[[Any], list[Step]],
+        prepare: Callable[[Any], Awaitable[Verifiable]],
         move: Callable[[float, float], None],
-        begin: Callable[[], Awaitable[None]],
         ended: Callable[[bool | None, str], Awaitable[str]],
     ) -> None:
         self._node = node
-        self._ready = ready
-        self._heights = heights
+        self._verifiable = prepare
         self._move = move
-        self._begin = begin
         self._ended = ended
         self._phase = _Phase.IDLE
         self._recent: deque[_Sample] = deque(maxlen=_BEFORE)
         self._arrivals: deque[float] = deque(maxlen=_BEFORE)
-        self._goal: Any = None
         self._tried: Verifiable
-        self._steps: list[Step] = []
         self._plans: list[Plan] = []
         self._found: list[Any] = []
         self._number = 0
@@ -196,19 +189,14 @@ class Verifier:
         self._full = quality.publisher(
             node, Verification, "verification", quality.latched(_STEPS_KEPT)
         )
-        self._server = ActionServer(
-            node,
-            Verify,
-            "~/verify",
-            self._unused,
-            handle_accepted_callback=self._accept,
-            cancel_callback=self._on_cancel,
+        self._action = OneGoal(
+            node, Verify, "~/verify", self._accept, partial(self.interrupt, "cancelled")
         )
 
     @property
     def is_running(self) -> bool:
         """True from the acceptance of a goal to its end."""
-        return self._goal is not None
+        return self._action.running is not None
 
     @property
     def rested_at(self) -> float:
@@ -230,10 +218,11 @@ class Verifier:
             )
 
     def _accept(self, goal: Any) -> None:
-        if self._goal is not None:
-            _refuse(goal, NotVerifiable("a verification is running"))
+        if self._action.running is not None:
+            reason = "a verification is running"
+            conclude(goal, Verify.Result(passed=False, reason=reason), succeeded=False)
             return
-        self._goal, self._phase, self._found = goal, _Phase.PREPARING, []
+        self._action.running, self._phase, self._found = goal, _Phase.PREPARING, []
         self._until = time.monotonic() + _PREPARED_WITHIN
         self._watch.reset()
         self._node.defer(self._narrator.now)
@@ -241,39 +230,36 @@ class Verifier:
 
     async def _prepare(self, goal: Any) -> None:
         try:
-            tried = await self._ready()
-            steps = self._heights(goal.request)
-            await self._begin()
-            rest, period = self._at_rest(steps)
+            tried = await self._verifiable(goal.request)
+            rest, period = self._at_rest(tried.steps)
         except RelayAutotuneError as error:
-            await self._leave(goal, error)
+            self._refuse(goal, error)
             return
-        if goal is not self._goal or self._phase is not _Phase.PREPARING:
+        if not self._is_prepared(goal):
             await self._ended(None, "the verification ended before its first step")
             return
-        self._tried, self._steps, self._rest, self._period = tried, steps, rest, period
+        self._tried, self._rest, self._period = tried, rest, period
 
         def plans() -> list[Plan]:
             loop = tried.gains, tried.model
-            return [plan(*loop, s, period, rest.noise_std, tried.rate) for s in steps]
+            return [plan(*loop, s, period, rest.noise_std, tried.rate) for s in tried.steps]
 
         self._node.compute(plans, partial(self._planned, goal))
 
-    async def _leave(self, goal: Any, error: Exception) -> None:
-        """Refuse a goal before its first step."""
-        if goal is not self._goal or self._phase is not _Phase.PREPARING:
-            return
-        self._phase = _Phase.ENDING
-        self._watch.cancel()
-        await self._ended(None, _said(error))
-        self._goal, self._phase = None, _Phase.IDLE
-        _refuse(goal, error)
+    def _is_prepared(self, goal: Any) -> bool:
+        """Tell whether a goal has neither ended nor begun its steps."""
+        return goal is self._action.running and self._phase is _Phase.PREPARING
+
+    def _refuse(self, goal: Any, error: Exception) -> None:
+        """End a goal before its first step."""
+        if self._is_prepared(goal):
+            self._end(None, _said(error), succeeded=False)
 
     def _planned(self, goal: Any, plans: list[Plan] | Exception) -> None:
-        if goal is not self._goal or self._phase is not _Phase.PREPARING:
-            return
         if isinstance(plans, Exception):
-            self._node.executor.create_task(self._leave, goal, plans)
+            self._refuse(goal, plans)
+            return
+        if not self._is_prepared(goal):
             return
         self._plans, self._number, self._beyond = plans, 0, 0
         self._begun = self._recent[-1][0]
@@ -289,7 +275,7 @@ class Verifier:
         theirs = self._recent[-1][0] - self._recent[0][0]
         return ours / theirs if theirs > 0.0 else 1.0
 
-    def _at_rest(self, steps: list[Step]) -> tuple[Rest, float]:
+    def _at_rest(self, steps: Sequence[Step]) -> tuple[Rest, float]:
         """Return the loop's state of rest and its sample period [s]."""
         t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
         period = float(np.median(np.diff(t)))
@@ -308,7 +294,7 @@ class Verifier:
 
     def _begin_step(self) -> None:
         self._phase, self._samples = _Phase.STEPPING, []
-        step = self._steps[self._number]
+        step = self._tried.steps[self._number]
         self._move(step.setpoint, step.load)
         self._node.defer(self._narrator.now)
 
@@ -369,14 +355,14 @@ class Verifier:
     def _return(self) -> None:
         """Remove the step, and judge it meanwhile."""
         judge = partial(
-            judged, self._tried, self._steps[self._number], tuple(self._samples), self._rest
+            judged, self._tried, self._tried.steps[self._number], tuple(self._samples), self._rest
         )
-        self._node.compute(judge, partial(self._judged, self._goal))
+        self._node.compute(judge, partial(self._judged, self._action.running))
         self._phase, self._samples = _Phase.RETURNING, []
         self._move(0.0, 0.0)
 
     def _judged(self, goal: Any, message: Any) -> None:
-        if goal is not self._goal or self._phase is not _Phase.RETURNING:
+        if goal is not self._action.running or self._phase is not _Phase.RETURNING:
             return
         if isinstance(message, Exception):
             self.interrupt(f"the step could not be judged: {_said(message)}")
@@ -385,7 +371,7 @@ class Verifier:
         self._full.publish(message)
         if not message.passed:
             self._end(False, message.reason)
-        elif len(self._found) == len(self._steps):
+        elif len(self._found) == len(self._tried.steps):
             self._end(True, "; ".join(m.reason for m in self._found))
 
     def _go_on(self) -> None:
@@ -409,19 +395,19 @@ class Verifier:
         now = (
             f"{done} of {duration(wanted.duration)}: the measurement is {self._recent[-1][1]:.6g}"
         )
-        step = self._steps[self._number]
+        step = self._tried.steps[self._number]
         if self._phase is _Phase.RETURNING:
             return f"back without the step, {now}"
         what = f"set-point {step.setpoint:+g} y" if step.setpoint else f"load {step.load:+g} u"
-        return f"step {self._number + 1} of {len(self._steps)}, {what}, {now}"
+        return f"step {self._number + 1} of {len(self._tried.steps)}, {what}, {now}"
 
     def _tell(self, status: str) -> None:
-        if self._goal is None:
+        if self._action.running is None:
             return
         planned = self._phase is not _Phase.PREPARING
         elapsed = self._recent[-1][0] - self._begun if planned else 0.0
         whole = 2.0 * sum(p.duration for p in self._plans) if planned else 0.0
-        self._goal.publish_feedback(
+        self._action.running.publish_feedback(
             Verify.Feedback(
                 step=self._number + 1 if planned else 1,
                 elapsed=elapsed,
@@ -452,29 +438,20 @@ class Verifier:
         elif now - self._advanced > patience:
             self.interrupt("the time of the samples stands still: is /clock published?")
 
-    def _on_cancel(self, goal: Any) -> CancelResponse:
-        if self._goal is not None and goal.goal_id == self._goal.goal_id:
-            self._node.executor.create_task(self.interrupt, "cancelled")
-        return CancelResponse.ACCEPT
-
-    def _end(self, passed: bool | None, reason: str) -> None:
+    def _end(self, passed: bool | None, reason: str, *, succeeded: bool = True) -> None:
         if self._phase is not _Phase.PREPARING:
             self._move(0.0, 0.0)
         self._phase = _Phase.ENDING
         self._watch.cancel()
-        self._node.executor.create_task(self._conclude, passed, reason)
+        self._node.executor.create_task(self._conclude, passed, reason, succeeded)
 
-    async def _conclude(self, passed: bool | None, reason: str) -> None:
+    async def _conclude(self, passed: bool | None, reason: str, succeeded: bool) -> None:
         reason = await self._ended(passed, reason)
-        goal, self._goal, self._phase = self._goal, None, _Phase.IDLE
+        goal, self._action.running, self._phase = self._action.running, None, _Phase.IDLE
         steps = [without_arrays(message) for message in self._found]
         result = Verify.Result(passed=passed is True, reason=reason, steps=steps)
         self._found = []
-        conclude(goal, result, succeeded=True)
-
-    def _unused(self, goal: Any) -> Any:
-        goal.abort()
-        return Verify.Result()
+        conclude(goal, result, succeeded=succeeded)
 
 
 def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Rest) -> Any:
@@ -528,10 +505,6 @@ def without_arrays(message: Any) -> Any:
         if not kind.startswith("sequence"):
             setattr(summary, name, getattr(message, name))
     return summary
-
-
-def _refuse(goal: Any, error: Exception) -> None:
-    conclude(goal, Verify.Result(passed=False, reason=_said(error)), succeeded=False)
 
 
 def _said(error: Exception) -> str:
