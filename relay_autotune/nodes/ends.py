@@ -26,6 +26,43 @@ REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
 
 
+class Outlet:
+    """A topic on which numbers go out, each in a message of its own.
+
+    :param node: the node.
+    :param messages: writes them.
+    :param topic: unresolved name of the topic.
+    :param overridable: True: parameters may change the quality of service.
+    """
+
+    def __init__(
+        self, node: Node, messages: CommandMessage, topic: str, *, overridable: bool = False
+    ) -> None:
+        self.messages = messages
+        self.publisher: Publisher = quality.publisher(
+            node, messages.kind, topic, quality.COMMAND, overridable=overridable
+        )
+        self.topic: str = self.publisher.topic_name
+        # Looked up once, because they are called for each measurement.
+        self._written, self._publish = messages.written, self.publisher.publish
+        self.sent: Callable[[float], None] | None = None
+        """Called with each number before it is published."""
+        self.last: float | None = None
+        """The number published last; None: there was none."""
+        self.is_fresh = False
+        """Set to True by each number."""
+
+    def send(self, value: float) -> None:
+        """Publish a number, unless the other elements of its message are not known yet."""
+        message = self._written(value)
+        if message is None:
+            return
+        if self.sent is not None:
+            self.sent(value)
+        self._publish(message)
+        self.last, self.is_fresh = value, True
+
+
 class Ends:
     """Publishers and subscriptions of relay_node.
 
@@ -57,20 +94,18 @@ class Ends:
         is_reported: bool = False,
     ) -> None:
         # /diagnostics and the answer to a start report an incompatible QoS.
-        plain = CommandMessage()
         self.is_reported = is_reported
-        self.commands = commands
-        self._setpoints = commands if is_reported else plain
-        passed = plain if is_reported else commands
-        self._written = passed.written
-        self.setpoint = None
-        if relay_on_setpoint:
-            self.setpoint = quality.publisher(
-                node, self._setpoints.kind, "setpoint", quality.COMMAND
-            )
-        self.command = quality.publisher(
-            node, passed.kind, "command", quality.COMMAND, overridable=True
+        self.command = Outlet(
+            node, CommandMessage() if is_reported else commands, "command", overridable=True
         )
+        self.setpoint: Outlet | None = None
+        """Where set-points go out; None: the relay does not move them."""
+        if relay_on_setpoint:
+            self.setpoint = Outlet(node, commands if is_reported else CommandMessage(), "setpoint")
+        self.relay = self.setpoint or self.command
+        """Where the relay's levels go out."""
+        self.own = self.relay if is_reported else self.command
+        """Where the message goes out that the node was given, and that may have to be repeated."""
         self.cycles = quality.publisher(
             node, RelayCycle, "relay_cycle", quality.latched(cycles_kept)
         )
@@ -90,14 +125,6 @@ class Ends:
         quality.subscription(
             node, DiagnosticStatus, signs_of_life.TOPIC, on_status, quality.RESULT
         )
-        self.sent: Callable[[float], None] | None = None
-        """Called with each command before it is published."""
-        # Looked up once, because it is called for each measurement.
-        self._publish = self.command.publish
-        self.last: float | None = None
-        """The last number that the relay's message carried; None: there was none."""
-        self.is_fresh = False
-        """Set to True by each command."""
 
     @property
     def measurement(self) -> Subscription:
@@ -112,49 +139,12 @@ class Ends:
         """Return the publishers and subscriptions to record, by the topics' unresolved names."""
         return {
             "measurement": self.measurement,
-            "command": self.command,
+            "command": self.command.publisher,
             "relay_cycle": self.cycles,
             "relay_experiment": self.experiments,
             "transfer_function": self.models,
             "pi_gains": self.gains,
         }
-
-    def send(self, command: float) -> None:
-        """Publish a command, unless the other elements of its message are not known yet."""
-        message = self._written(command)
-        if message is None:
-            return
-        if self.sent is not None:
-            self.sent(command)
-        self._publish(message)
-        self.last, self.is_fresh = command, True
-
-    def send_setpoint(self, setpoint: float) -> None:
-        """Publish a set-point."""
-        assert self.setpoint is not None
-        message = self._setpoints.written(setpoint)
-        if message is None:
-            return
-        self.setpoint.publish(message)
-        if self.is_reported:
-            self.last, self.is_fresh = setpoint, True
-
-    def send_again(self) -> None:
-        """Publish the last command again, or the last set-point if these alone are sent."""
-        if self.last is not None:
-            (self.send_setpoint if self.is_reported else self.send)(self.last)
-
-    @property
-    def sent_to(self) -> Publisher:
-        """The publisher of what the relay's message carries."""
-        return self.setpoint if self.is_reported and self.setpoint else self.command
-
-    def relay(self, value: float) -> None:
-        """Publish the relay's output: a command, or a set-point."""
-        if self.setpoint is None:
-            self.send(value)
-        else:
-            self.send_setpoint(value)
 
     def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
         """Publish the relay's output until every subscriber has acknowledged it.
@@ -163,7 +153,7 @@ class Ends:
         :return: how often it was published, and whether it was acknowledged.
         """
         for count in range(1, REPEATS + 1):
-            self.relay(command)
-            if (self.setpoint or self.command).wait_for_all_acked(REPEAT_SAFE):
+            self.relay.send(command)
+            if self.relay.publisher.wait_for_all_acked(REPEAT_SAFE):
                 return count, True
         return REPEATS, False

@@ -154,7 +154,7 @@ class LoopEnds:
         self._ends = ends
         self._takeover = takeover
         self._stop = stop
-        self.handover = Handover(ends.send)
+        self.handover = Handover(ends.command.send)
         # The actuator is there already; the controller may be elsewhere.
         self.handover.give_back(self._value("initial_command"), self._value("return_time"))
         self.commanded = math.nan
@@ -170,11 +170,12 @@ class LoopEnds:
         self._guard = Guard(node, stop)
         self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
         self._hold.publish(Bool(data=False))
-        self._topic = ends.command.topic_name
+        self._messages = ends.own.messages
+        self._topic = ends.command.topic
         if takeover:
-            ends.sent = self._note_own
+            ends.command.sent = self._note_own
             quality.subscription(
-                node, ends.commands.kind, "command", self._on_command, quality.COMMAND
+                node, self._messages.kind, "command", self._on_command, quality.COMMAND
             )
         elif not ends.is_reported:
             self._controller = quality.subscription(
@@ -183,7 +184,7 @@ class LoopEnds:
             node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._value("command_others") == "other_commands":
             quality.subscription(
-                node, ends.commands.kind, "other_commands", self._on_others, quality.MEASUREMENT
+                node, self._messages.kind, "other_commands", self._on_others, quality.MEASUREMENT
             )
         self.repeat_period: float = self._value("command_period")
         """Time without a command after which the last is sent again [s]; 0: never."""
@@ -338,7 +339,7 @@ class LoopEnds:
             self._ends.send_until_acknowledged(safe)
         self._node.get_logger().warning(
             f"nobody passes on what comes on {self._controller.topic_name} any more: the command "
-            f"stays at {self._ends.last:g}"
+            f"stays at {self._ends.command.last:g}"
         )
 
     # Callbacks.
@@ -351,7 +352,7 @@ class LoopEnds:
             self._experiment.safe_command = self.handover.last
 
     def _note_own(self, command: float) -> None:
-        self._own.append(self._ends.commands.on_wire(command))
+        self._own.append(self._messages.on_wire(command))
 
     def report(self, command: float) -> None:
         """Take what the controller says that it commands the actuator itself [u]."""
@@ -361,7 +362,7 @@ class LoopEnds:
     def _on_command(self, message: Any) -> None:
         """Take a message on the command topic, where other nodes may publish, too."""
         try:
-            command = self._ends.commands.value(message)
+            command = self._messages.value(message)
         except FieldError as error:
             self._stop(f"another node commanded on {self._topic} during the tune: {error}")
             return
@@ -377,18 +378,18 @@ class LoopEnds:
         self.handover.note(command)
 
     def _on_others(self, message: Any) -> None:
-        commands = self._ends.commands
-        commands.take_others(message)
-        if commands.why_unknown:
-            self._stop(f"the other elements of the command are not known: {commands.why_unknown}")
+        messages = self._messages
+        messages.take_others(message)
+        if messages.why_unknown:
+            self._stop(f"the other elements of the command are not known: {messages.why_unknown}")
 
     def _send_again(self) -> None:
         """Send the last command again if none has gone out since the last look."""
-        ends = self._ends
-        if ends.is_fresh:
-            ends.is_fresh = False
-        elif not self.is_driven:
-            ends.send_again()
+        own = self._ends.own
+        if own.is_fresh:
+            own.is_fresh = False
+        elif own.last is not None and not self.is_driven:
+            own.send(own.last)
 
     def _on_feedback(self, message: Float64) -> None:
         self._feedback_at = time.monotonic()

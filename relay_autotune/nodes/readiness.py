@@ -229,12 +229,12 @@ def require_actuator(node: Node, ends: Ends) -> None:
     :raises NotReadyError: with the reason, as far as the graph shows it.
     """
     # In takeover one of the subscriptions is the node's own.
-    sent = ends.sent_to
+    messages, sent = ends.own.messages, ends.own.publisher
     own = sum(s.topic_name == sent.topic_name for s in node.subscriptions)
     if sent.get_subscription_count() <= own:
-        why = why_no_subscriber(node, sent.topic_name, ends.commands.type_name)
+        why = why_no_subscriber(node, sent.topic_name, messages.type_name)
         raise NotReadyError(f"no command would arrive: {why}")
-    if unknown := ends.commands.why_unknown:
+    if unknown := messages.why_unknown:
         raise NotReadyError(
             f"the other elements of the command are not known: {unknown}; publish there, or give "
             f"command_message"

@@ -123,7 +123,7 @@ class RelayNode(ServedNode):
             relay_on_setpoint=fixed["relay_on"] == "setpoint",
             is_reported=self._reported is not None,
         )
-        self._send, self._relay = self._ends.send, self._ends.relay
+        self._send, self._relay = self._ends.command.send, self._ends.relay.send
         self._on_setpoint = fixed["relay_on"] == "setpoint"
         takeover = fixed["path"] == "takeover"
         self._loop = LoopEnds(self, self._ends, takeover=takeover, stop=self._stop_now)
@@ -146,7 +146,7 @@ class RelayNode(ServedNode):
         self.add_on_set_parameters_callback(self._on_set)
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(
-            f"ready: {self._ends.measurement.topic_name} in, {self._ends.command.topic_name} out; "
+            f"ready: {self._ends.measurement.topic_name} in, {self._ends.command.topic} out; "
             f"start with the service {self._name}/start_tune or the action {self._name}/tune"
         )
 
@@ -326,10 +326,10 @@ class RelayNode(ServedNode):
 
     def _served(self) -> str:
         """Say who takes the commands."""
-        topic = self._ends.sent_to.topic_name
-        there = self.get_subscriptions_info_by_topic(topic)
+        own = self._ends.own
+        there = self.get_subscriptions_info_by_topic(own.topic)
         takers = ", ".join(described(e) for e in there if who(e) != self._name)
-        return f"{self._ends.commands.described} on {topic} to {takers}"
+        return f"{own.messages.described} on {own.topic} to {takers}"
 
     def _from_small(self, parameters: ExperimentParameters, baseline: float) -> bool:
         # Who tells where the actuator is, tells of its ends, too.
