@@ -31,7 +31,6 @@ from relay_autotune.cli.progress import StatusLine, Working
 from relay_autotune.control.verification import (
     LEAST_OF_NOISE,
     Step,
-    StepRange,
     allowed_steps,
     noise_of,
     plan,
@@ -39,13 +38,10 @@ from relay_autotune.control.verification import (
 )
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
-from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.controller_parameters import parameters_of_law, rate_from
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tune_client import TuneClient
-from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Record, RelaySettings
 from relay_autotune.text import duration
 from relay_autotune.verdict import Verdict
 
@@ -69,53 +65,120 @@ class Outcome:
     against: str
 
 
-@dataclass(frozen=True)
 class _Proof:
-    """What is to be done.
+    """A step of the set-point that is to prove the gains of a tune.
 
-    :param step: of the set-point [y].
-    :param allowed: the steps that the limits allow.
-    :param expected: predicted range of the command [u].
-    :param takes: about how long all of it takes [s].
-    :param settles: how long the loop takes to settle with the gains [s].
-    :param rest: set-point and baseline of the tune.
-    :param within: range of the measurement [y].
-    :param commands: range of the command [u].
-    :param noise_std: of the measurement [y]; NaN: not known.
-    :param rate: the law that the gains are for; None: our own.
+    :param client: of the tune that has ended.
+    :param nodes: the nodes of this command.
+    :param options: of the command line, with all answers.
+    :raises RelayAutotuneError: if there is no such step.
     """
 
-    step: float
-    allowed: StepRange
-    expected: tuple[float, float]
-    takes: float
-    settles: float
-    rest: RelaySettings
-    within: Limits
-    commands: Limits
-    noise_std: float
-    rate: LawRate | None
+    def __init__(self, client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> None:
+        self._client, self._nodes, self._options = client, nodes, options
+        result, record = client.result, client.record(_RECORD_WITHIN)
+        gains = gains_from_message(result.gains)
+        model = transfer_function_from_message(result.transfer_function)
+        assert record.settings is not None, "gains come of a whole experiment"
+        self._rest = rest = record.settings
+        self._within = Limits(*options.within)
+        # Without limits the process has seen the levels of the relay.
+        self._commands = Limits(*(options.command_within or (rest.low, rest.high)))
+        limits = self._within, self._commands
+        self._noise_std = noise = noise_of(record.noise_std, result.transfer_function.residual_rms)
+        step = options.step or proving_step(record, model, *limits, noise)
+        if not step:
+            raise TuningError("the limits leave no room for a step: widen --within")
+        self._rate = rate_from(parameters_of_law(gains.law, gains.law_period))
+        wanted = plan(gains, model, Step(setpoint=step), record.mean_interval, rate=self._rate)
+        peak = wanted.peak / abs(step)
+        self.allowed = allowed_steps(record, model, *limits, peak, noise)
+        self.step: float = options.step or self.allowed.nearest(step)
+        self.allowed.require(self.step)
+        # How long the loop takes to settle with the gains, and all of it [s].
+        self._settles = gains.settling_time
+        if not math.isfinite(self._settles):
+            self._settles = wanted.duration
+        self._takes = wanted.duration + 2.0 * self._settles
+        # The predicted range of the command [u].
+        self._expected = [self._commands.clip(rest.baseline + end) for end in wanted.command]
 
-    def question(self, options: argparse.Namespace, doubt: str) -> str:
+    def question(self, doubt: str) -> str:
         """Say what will move, how far and how long."""
-        rest, (least, most) = self.rest, self.expected
+        options, commands = self._options, self._commands
+        rest, (least, most) = self._rest, self._expected
         runs = ""
-        if self.rate is not None:
-            runs = f", which runs {self.rate.law.name} every {self.rate.period:g} s,"
+        if self._rate is not None:
+            runs = f", which runs {self._rate.law.name} every {self._rate.period:g} s,"
         told = (
             f"Prove the gains now? A controller_node of this command{runs} takes the loop at "
             f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
             f"{options.measurement} by {self.step:+g} y and back, and ends at "
-            f"{rest.baseline:.6g} u after about {duration(self.takes)}. {options.command} is "
+            f"{rest.baseline:.6g} u after about {duration(self._takes)}. {options.command} is "
             f"expected from {least:.3g} to {most:.3g} u, never beyond "
-            f"{self.commands.low:g} to {self.commands.high:g} u. Ctrl-C ends it at once, likewise."
+            f"{commands.low:g} to {commands.high:g} u. Ctrl-C ends it at once, likewise."
         )
-        if abs(self.step) < LEAST_OF_NOISE * self.noise_std:
+        if abs(self.step) < LEAST_OF_NOISE * self._noise_std:
             told += (
-                f" The limits allow a step of {abs(self.step) / self.noise_std:.1f} times the "
+                f" The limits allow a step of {abs(self.step) / self._noise_std:.1f} times the "
                 f"noise, expected {LEAST_OF_NOISE:g}: it will prove little."
             )
         return told + (f" The gains are doubtful: {doubt}." if doubt else "")
+
+    def made(self, step: float, doubtful: bool) -> Any:
+        """Put the gains in force in a controller_node in front of relay_node, and make the step.
+
+        :param step: of the set-point [y].
+        :param doubtful: whether the gains are.
+        :return: the `Verify.Result`.
+        """
+        name, rate = own_node(self._options, _CONTROLLER), self._rate
+        kind = self._client.values(self._client.name, ["measurement_type"])["measurement_type"]
+        shown = StatusLine()
+        # The journal of proven and failed gains is that of this controller_node alone.
+        with (
+            tempfile.TemporaryDirectory() as journal,
+            GainsClient("", name, beside=self._client) as loop,
+        ):
+            values = {
+                "initial_setpoint": self._rest.setpoint,
+                "initial_command": self._rest.baseline,
+                "safe_command": self._rest.baseline,
+                "measurement_min": self._within.low,
+                "measurement_max": self._within.high,
+                "command_min": self._commands.low,
+                "command_max": self._commands.high,
+                "verify_step_max": abs(step),
+                "measurement_type": kind,
+                "measurement_field": self._options.field,
+                "accept_doubtful": str(doubtful).lower(),
+                "record_directory": journal,
+            }
+            if rate is not None:
+                values |= parameters_of_law(rate.law.name, rate.period)
+            topics = {"measurement": self._options.measurement}
+            self._nodes.start(
+                _CONTROLLER, ros_arguments(own_namespace(self._options), topics, values)
+            )
+            try:
+                with Working(f"starting {name}"):
+                    loop.find(START_WITHIN)
+                    self._nodes.require_alive()
+                    loop.put_in_force(self._client.result.gains)
+                patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
+                with _noted(self._nodes) as leave:
+                    found = loop.prove(step, 0.0, self._settles, patience, shown, leave)
+                    loop.let_settle(self._settles, shown, "the loop goes back", leave)
+            finally:
+                shown.clear()
+            print("\n" + "\n".join(found_lines(found, width(), self._noise_std)), flush=True)
+            if rate is not None:
+                told = (
+                    f"controller_node ran {rate.law.name} every {rate.period:g} s; what "
+                    f"your program does at a limit of the command was not tried"
+                )
+                print("\n".join(labelled("law", told, width())), flush=True)
+            return found
 
 
 def prove(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -> Outcome:
@@ -149,105 +212,22 @@ def _offered(client: TuneClient, nodes: OwnNodes, options: argparse.Namespace) -
         print()
         return unproven
     with Working("choosing the step"):
-        proof = _planned(client.record(_RECORD_WITHIN), result, options)
+        proof = _Proof(client, nodes, options)
     step = proof.step
     if asks:
-        step = agreed_step(proof.question(options, doubt), proof.step, proof.allowed)
+        step = agreed_step(proof.question(doubt), proof.step, proof.allowed)
         if not step:
             print()
             return unproven
     elif doubt:
         raise TuningError(f"doubtful gains are not proven unasked: {doubt}")
     try:
-        found = _made(client, nodes, options, proof, step, bool(doubt))
+        found = proof.made(step, bool(doubt))
     finally:
         nodes.end(_CONTROLLER)
     if found.passed:
         return Outcome(True, "")
     return Outcome(False, f"the step that was to prove them failed: {found.reason}")
-
-
-def _planned(record: Record, result: Any, options: argparse.Namespace) -> _Proof:
-    gains = gains_from_message(result.gains)
-    model: TransferFunction = transfer_function_from_message(result.transfer_function)
-    rest = record.settings
-    assert rest is not None, "gains come of a whole experiment"
-    within = Limits(*options.within)
-    # Without limits the process has seen the levels of the relay.
-    commands = Limits(*(options.command_within or (rest.low, rest.high)))
-    noise = noise_of(record.noise_std, result.transfer_function.residual_rms)
-    step = options.step or proving_step(record, model, within, commands, noise)
-    if not step:
-        raise TuningError("the limits leave no room for a step: widen --within")
-    rate = rate_from(parameters_of_law(gains.law, gains.law_period))
-    wanted = plan(gains, model, Step(setpoint=step), record.mean_interval, rate=rate)
-    peak = wanted.peak / abs(step)
-    allowed = allowed_steps(record, model, within, commands, peak, noise)
-    step = options.step or allowed.nearest(step)
-    allowed.require(step)
-    settles = gains.settling_time
-    if not math.isfinite(settles):
-        settles = wanted.duration
-    least, most = (commands.clip(rest.baseline + end) for end in wanted.command)
-    takes = wanted.duration + 2.0 * settles
-    ends = (least, most)
-    return _Proof(step, allowed, ends, takes, settles, rest, within, commands, noise, rate)
-
-
-def _made(
-    client: TuneClient,
-    nodes: OwnNodes,
-    options: argparse.Namespace,
-    proof: _Proof,
-    step: float,
-    doubtful: bool,
-) -> Any:
-    """Put the gains in force in a controller_node in front of relay_node, and make the step.
-
-    :return: the `Verify.Result`.
-    """
-    name = own_node(options, _CONTROLLER)
-    kind = client.values(client.name, ["measurement_type"])["measurement_type"]
-    shown = StatusLine()
-    # The journal of proven and failed gains is that of this controller_node alone.
-    with tempfile.TemporaryDirectory() as journal, GainsClient("", name, beside=client) as loop:
-        values = {
-            "initial_setpoint": proof.rest.setpoint,
-            "initial_command": proof.rest.baseline,
-            "safe_command": proof.rest.baseline,
-            "measurement_min": proof.within.low,
-            "measurement_max": proof.within.high,
-            "command_min": proof.commands.low,
-            "command_max": proof.commands.high,
-            "verify_step_max": abs(step),
-            "measurement_type": kind,
-            "measurement_field": options.field,
-            "accept_doubtful": str(doubtful).lower(),
-            "record_directory": journal,
-        }
-        if proof.rate is not None:
-            values |= parameters_of_law(proof.rate.law.name, proof.rate.period)
-        topics = {"measurement": options.measurement}
-        nodes.start(_CONTROLLER, ros_arguments(own_namespace(options), topics, values))
-        try:
-            with Working(f"starting {name}"):
-                loop.find(START_WITHIN)
-                nodes.require_alive()
-                loop.put_in_force(client.result.gains)
-            patience = max(_TIMES_SETTLING * proof.settles, _REST_WITHIN)
-            with _noted(nodes) as leave:
-                found = loop.prove(step, 0.0, proof.settles, patience, shown, leave)
-                loop.let_settle(proof.settles, shown, "the loop goes back", leave)
-        finally:
-            shown.clear()
-        print("\n" + "\n".join(found_lines(found, width(), proof.noise_std)), flush=True)
-        if proof.rate is not None:
-            told = (
-                f"controller_node ran {proof.rate.law.name} every {proof.rate.period:g} s; what "
-                f"your program does at a limit of the command was not tried"
-            )
-            print("\n".join(labelled("law", told, width())), flush=True)
-        return found
 
 
 @contextmanager
