@@ -201,6 +201,31 @@ class Ready:
     policy: SafePolicy
     from_small: bool
 
+    @property
+    def plan(self) -> str:
+        """A sentence on the commands of the tune."""
+        parameters, baseline = self.parameters, self.baseline
+        if parameters.finds_amplitude:
+            levels = Levels(parameters, baseline)
+            plan = (
+                f"relay between {levels.low:g} and {levels.high:g} about the baseline "
+                f"{baseline:g} at first; these grow until the oscillation is clear of the noise, "
+                f"up to {parameters.command_min:g} and {parameters.command_max:g}"
+            )
+        else:
+            middle = baseline + parameters.relay_bias
+            low, high = middle - parameters.amplitude, middle + parameters.amplitude
+            plan = f"relay between {low:g} and {high:g} about the baseline {baseline:g}"
+            if self.from_small:
+                small = Levels(parameters, baseline, from_small=True)
+                plan += (
+                    f", for the first cycle between {small.low:g} and {small.high:g}, since no "
+                    f"command_min and command_max say that the actuator goes as far"
+                )
+        if self.policy.give_back:
+            return f"{plan}, then back to controller_command"
+        return f"{plan}, then proportional control holds the process" if self.policy.hold else plan
+
 
 def require_measurement(node: Node, ends: Ends, sensor: Sensor, timeout: float) -> None:
     """Refuse a start without measurements.
@@ -374,38 +399,6 @@ def is_beyond_known(parameters: ExperimentParameters, baseline: float) -> bool:
     too_high = middle + parameters.amplitude > most and math.isinf(parameters.command_max)
     too_low = middle - parameters.amplitude < least and math.isinf(parameters.command_min)
     return too_high or too_low
-
-
-def plan_of(
-    parameters: ExperimentParameters, baseline: float, policy: SafePolicy, *, from_small: bool
-) -> str:
-    """Return a sentence on the commands of a tune.
-
-    :param parameters: the experiment's parameters.
-    :param baseline: command of the operating point [u].
-    :param policy: how the process will be left.
-    :param from_small: True if a given amplitude is not put on at once.
-    """
-    if parameters.finds_amplitude:
-        levels = Levels(parameters, baseline)
-        plan = (
-            f"relay between {levels.low:g} and {levels.high:g} about the baseline {baseline:g} "
-            f"at first; these grow until the oscillation is clear of the noise, up to "
-            f"{parameters.command_min:g} and {parameters.command_max:g}"
-        )
-    else:
-        middle = baseline + parameters.relay_bias
-        low, high = middle - parameters.amplitude, middle + parameters.amplitude
-        plan = f"relay between {low:g} and {high:g} about the baseline {baseline:g}"
-        if from_small:
-            small = Levels(parameters, baseline, from_small=True)
-            plan += (
-                f", for the first cycle between {small.low:g} and {small.high:g}, since no "
-                f"command_min and command_max say that the actuator goes as far"
-            )
-    if policy.give_back:
-        return f"{plan}, then back to controller_command"
-    return f"{plan}, then proportional control holds the process" if policy.hold else plan
 
 
 def why_not_settable(node: Node, changes: Sequence[RosParameter], running: str) -> str:

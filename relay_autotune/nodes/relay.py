@@ -46,7 +46,6 @@ from relay_autotune.nodes.readiness import (
     look_at_recording,
     look_at_rest,
     on_setpoint,
-    plan_of,
     policy_from,
     require_actuator,
     require_known_range,
@@ -59,7 +58,7 @@ from relay_autotune.nodes.results import MODEL, OwnResults
 from relay_autotune.nodes.session import Session, SetpointSession, reported_by
 from relay_autotune.nodes.signs_of_life import said_by
 from relay_autotune.nodes.silence import Counter, Sensor, losses, require_own_time
-from relay_autotune.nodes.tune_action import Started, TuneAction
+from relay_autotune.nodes.tune_action import TuneAction
 from relay_autotune.nodes.tune_parameters import (
     EXPERIMENT_PARAMETERS,
     FIXED_PARAMETERS,
@@ -228,33 +227,33 @@ class RelayNode(ServedNode):
 
     # Starting.
 
-    def _on_start(
-        self, request: StartTune.Request, response: StartTune.Response
-    ) -> StartTune.Response:
-        started = self._request(request.amplitude, request.dry_run)
-        response.accepted, response.reason = started.accepted, started.reason
-        response.experiment_id = started.experiment_id
-        response.checks = list(started.checks)
-        return response
+    def _on_start(self, request: StartTune.Request, _: StartTune.Response) -> StartTune.Response:
+        return self._request(request.amplitude, request.dry_run)
 
-    def _request(self, amplitude: float, dry_run: bool) -> Started:
+    def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:
         checks = Checklist(self._name, stops=not dry_run)
+        answer = StartTune.Response()
         try:
             ready = self._ready(amplitude, checks)
         except RelayAutotuneError as error:
             self.get_logger().warning(f"start refused: {error}")
-            return Started(False, str(error))
-        lines = tuple(checks.lines)
+            answer.reason = str(error)
+            return answer
+        if dry_run:
+            answer.checks = checks.lines
         if ready is None:
-            return Started(False, str(checks.refusal), checks=lines)
-        plan = plan_of(ready.parameters, ready.baseline, ready.policy, from_small=ready.from_small)
+            answer.reason = str(checks.refusal)
+            return answer
+        answer.accepted = True
         takes = how_long(ready.parameters, self._last_samples.interval, SETTLING_LIMIT)
         if dry_run:
-            return Started(True, f"a tune could start: {plan}; {takes}", checks=lines)
-        identity, recorded = self._start(ready)
-        reason = f"{plan}; {recorded}; {takes}"
-        self.get_logger().info(f"tune {identity} started: {reason}")
-        return Started(True, f"{reason}; watch {WATCH.format(self._name)}", identity)
+            answer.reason = f"a tune could start: {ready.plan}; {takes}"
+            return answer
+        answer.experiment_id, recorded = self._start(ready)
+        reason = f"{ready.plan}; {recorded}; {takes}"
+        self.get_logger().info(f"tune {answer.experiment_id} started: {reason}")
+        answer.reason = f"{reason}; watch {WATCH.format(self._name)}"
+        return answer
 
     def _ready(self, amplitude: float, checks: Checklist) -> Ready | None:
         """Make the checks before a start; return None where one of them failed."""
@@ -270,7 +269,7 @@ class RelayNode(ServedNode):
         ready = checks.do(
             "levels",
             partial(self._planned, values, parameters),
-            lambda r: plan_of(r.parameters, r.baseline, r.policy, from_small=r.from_small),
+            lambda found: found.plan,
         )
         ends, timeout = self._ends, values["measurement_timeout"]
         checks.do(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from relay_autotune.experiment.experiment import RelayExperiment, State
@@ -16,6 +15,7 @@ from relay_autotune.nodes.goals import OneGoal, conclude
 from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
+from relay_autotune_msgs.srv import StartTune
 
 _STATES = {
     State.SETTLING: Tune.Feedback.STATE_SETTLING,
@@ -28,34 +28,19 @@ _STATES = {
 }
 
 
-@dataclass(frozen=True)
-class Started:
-    """The answer to a request for a tune.
-
-    :param accepted: True if the tune runs, or in a dry run could start.
-    :param reason: the plan, or the reason for the refusal.
-    :param experiment_id: id of the experiment; empty if none was started.
-    :param checks: of a dry run, a line for each check.
-    """
-
-    accepted: bool
-    reason: str
-    experiment_id: str = ""
-    checks: tuple[str, ...] = ()
-
-
 class TuneAction(OneGoal):
     """Serve the action.
 
     :param node: the node.
-    :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune.
+    :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune, and
+        says what became of it.
     :param cancel: called when a client cancels the running tune.
     """
 
     def __init__(
         self,
         node: ServedNode,
-        start: Callable[[float, bool], Started],
+        start: Callable[[float, bool], StartTune.Response],
         cancel: Callable[[], None],
     ) -> None:
         super().__init__(
