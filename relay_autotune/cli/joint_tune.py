@@ -268,11 +268,7 @@ class JointTune:
         """Return the nodes that tune it."""
         loop, options = self._loop, self._options
         topics, values = self._opened_ends() if options.open else self._closed_ends()
-        values |= {
-            "amplitude": options.amplitude,
-            "measurement_min": self._within[0],
-            "measurement_max": self._within[1],
-        }
+        values["amplitude"] = options.amplitude
         nodes = {"relay_node": ros_arguments(self._space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}
@@ -280,24 +276,28 @@ class JointTune:
         return OwnNodes(nodes)
 
     def _closed_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
-        loop = self._loop
-        topics = {"measurement": loop.state_topic, "setpoint": loop.reference_topic}
-        return topics, self._of_state() | {
+        """Return topics and parameters of a relay_node that moves the reference."""
+        topics, values = self._at_controller()
+        return topics, values | {
             "relay_on": "setpoint",
-            "setpoint": loop.state.reference,
-            "command_type": COMMAND_TYPE,
-            "command_field": loop.reference_field,
-            "command_message": json.dumps(loop.reference_alone),
+            "setpoint": self._loop.state.reference,
             # The levels are references, which have the limits of the measurement.
             "command_min": self._within[0],
             "command_max": self._within[1],
         }
 
-    def _of_state(self) -> dict[str, Any]:
-        return {
+    def _at_controller(self) -> tuple[dict[str, str], dict[str, Any]]:
+        """Return topics and parameters of a node that hears the controller and moves it."""
+        loop = self._loop
+        return {"measurement": loop.state_topic, "setpoint": loop.reference_topic}, {
             "measurement_type": STATE_TYPE,
-            "measurement_field": f"{self._loop.state_field}.feedback",
-            "controller_command_field": f"{self._loop.state_field}.output",
+            "measurement_field": f"{loop.state_field}.feedback",
+            "controller_command_field": f"{loop.state_field}.output",
+            "command_type": COMMAND_TYPE,
+            "command_field": loop.reference_field,
+            "command_message": json.dumps(loop.reference_alone),
+            "measurement_min": self._within[0],
+            "measurement_max": self._within[1],
         }
 
     def _opened_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
@@ -322,6 +322,8 @@ class JointTune:
             "command_field": f"data[{place}]",
             "command_message": json.dumps(f"{{data: {held}}}"),
             "baseline": self._baseline,
+            "measurement_min": self._within[0],
+            "measurement_max": self._within[1],
             "command_min": low,
             "command_max": high,
             "use_sim_time": loop.is_simulated,
@@ -477,21 +479,16 @@ class JointTune:
         if loop.why_not_moved:
             return self._set()
         places = ",".join(map("{}:{}".format, GAINS, loop.parameters))
-        values = self._of_state() | {
+        topics, values = self._at_controller()
+        values |= {
             "apply_to": loop.node,
             "apply_parameters": places,
             "apply_feedforward": loop.feedforward,
             "initial_setpoint": loop.state.reference,
-            "command_type": COMMAND_TYPE,
-            "command_field": loop.reference_field,
-            "command_message": json.dumps(loop.reference_alone),
-            "measurement_min": self._within[0],
-            "measurement_max": self._within[1],
         }
         for name, clamp in zip(("command_min", "command_max"), loop.clamps, strict=True):
             if math.isfinite(clamp):
                 values[name] = clamp
-        topics = {"measurement": loop.state_topic, "setpoint": loop.reference_topic}
         # Not before, since relay_node refuses a second publisher of the reference.
         nodes.start("controller_node", ros_arguments(self._space, topics, values))
         return apply_at(

@@ -11,9 +11,9 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -116,7 +116,8 @@ class _LoopOnPage:
         self._live = page.lives[number]
         # Lines of several loops must not be written over each other.
         self._terminal = Shown(sys.stderr, live=len(page.lives) == 1 and sys.stderr.isatty())
-        self._begin_command: Callable[[], Callable[[], None]] | None = None
+        # The context in which commands are shown as they come.
+        self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
         self._interrupted: list[int] = []
         self._gains = GainsPage(client, self._live, page, number, self._is_to_end)
         # Of the running tune: messages of the cycles, K_u after each, signals and wishes to end
@@ -161,20 +162,11 @@ class _LoopOnPage:
     def _is_to_end(self) -> bool:
         return self._live.abort.is_set() or bool(self._interrupted)
 
-    @contextmanager
-    def _commands_shown(self) -> Iterator[None]:
-        """Show the commands as they come until the end of the block."""
-        end = self._begin_command() if self._begin_command is not None else lambda: None
-        try:
-            yield
-        finally:
-            end()
-
     def _show_signals(self) -> None:
         live = self._live
         try:
             self._client.watch_measurement(lambda value: live.sample("measurement", value))
-            self._begin_command = self._client.command_watch(
+            self._commands_shown = self._client.command_watch(
                 lambda value: live.sample("command", value),
                 self._take_cycle,
             )

@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
@@ -236,10 +236,10 @@ class TuneClient(LoopClient):
 
     def command_watch(
         self, take: Callable[[float], None], cycle: Callable[[Any], None]
-    ) -> Callable[[], Callable[[], None]]:
-        """Return what begins to hear the commands of a tune; it returns what ends it.
+    ) -> Callable[[], AbstractContextManager[None]]:
+        """Return a context in which the commands of a tune are heard.
 
-        It is to be called once the tune has begun: relay_node refuses a start where nobody hears
+        It is to be entered once the tune has begun: relay_node refuses a start where nobody hears
         its commands, and this client would count as somebody.
 
         :param take: called with each command [u].
@@ -249,29 +249,21 @@ class TuneClient(LoopClient):
         kind, field = self.values(self.name, ["command_type", "command_field"]).values()
         commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)
         name = self._topic_of(self.name, "command", commands.type_name, published=True)
+        cycles = self._resolved("relay_cycle")
 
         def hear(message: Any) -> None:
             with suppress(FieldError):
                 take(commands.value(message))
 
-        def begin() -> Callable[[], None]:
-            ears = [
-                self._node.create_subscription(commands.kind, name, hear, qos_profile_sensor_data),
-                self._node.create_subscription(
-                    RelayCycle,
-                    self._resolved("relay_cycle"),
-                    cycle,
-                    qos_profile_sensor_data,
-                ),
-            ]
+        @contextmanager
+        def heard() -> Iterator[None]:
+            with (
+                self._hearing(commands.kind, name, hear),
+                self._hearing(RelayCycle, cycles, cycle),
+            ):
+                yield
 
-            def end() -> None:
-                for ear in ears:
-                    self._node.destroy_subscription(ear)
-
-            return end
-
-        return begin
+        return heard
 
     def identifier_values(self, patience: float) -> dict[str, Any] | None:
         """Return the parameters of the identifier_node by name; None: it did not answer.
