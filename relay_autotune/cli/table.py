@@ -46,15 +46,6 @@ def table(bag: str, analyses: Sequence[Analysis], width: int = WIDEST) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def verdict_lines(judgement: Judgement, width: int = WIDEST) -> list[str]:
-    """Return the verdict on an experiment, with each check that did not pass, as lines.
-
-    :param judgement: the verdict and its checks.
-    :param width: columns that a line may have.
-    """
-    return _laid_out(_verdict(judgement), width)
-
-
 def identification_lines(found: Identification, width: int = WIDEST) -> list[str]:
     """Return an identified model with its accuracy, as lines.
 
