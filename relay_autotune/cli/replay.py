@@ -29,7 +29,6 @@ from relay_autotune.cli.report import (
 )
 from relay_autotune.cli.results import ResultsFile
 from relay_autotune.errors import SelectionError
-from relay_autotune.report.case import case_of
 
 PROGRAM = "replay"
 
@@ -134,6 +133,9 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         status = worst(status, done.status)
         analyses += [(done.name, analysis) for analysis in found]
     if analyses and (options.report or options.web):
+        # Imported here, since a table needs none of the report.
+        from relay_autotune.report.case import case_of
+
         cases = as_asked([case_of(analysis, name) for name, analysis in analyses], options)
         if options.report:
             write_report(cases, options.report)

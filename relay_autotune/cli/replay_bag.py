@@ -16,7 +16,6 @@ from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
 from relay_autotune.cli.export import Target, exported
 from relay_autotune.cli.table import table
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
-from relay_autotune.exchange.document import document, to_json
 from relay_autotune.identification.known import Known
 from relay_autotune.record.record import Record
 from relay_autotune.text import visible
@@ -191,6 +190,9 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
         if error is not None:
             return ""
         return table(job.name, analyses, job.table_width)
+    # Imported here, since a table for people does not need it.
+    from relay_autotune.exchange.document import document, to_json
+
     return to_json(document(job.name, analyses, error=error))
 
 

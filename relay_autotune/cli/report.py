@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
@@ -35,7 +35,10 @@ from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.record.record import Record
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
-from relay_autotune.report.case import Case, case_of, read_documents
+
+if TYPE_CHECKING:
+    from relay_autotune.report.case import Case
+
 
 PROGRAM = "report"
 
@@ -213,6 +216,8 @@ _Source = tuple[tuple[str, ...], Callable[[], Sequence["Case"]]]
 
 def _sources(options: argparse.Namespace) -> list[_Source]:
     """Return the names of each source, with what reads it, in the order of the command line."""
+    from relay_autotune.report.case import read_documents
+
     names = list(dict.fromkeys(options.sources))
     jobs = jobs_of(options, [name for name in names if not _is_result(name)])
     found: list[_Source] = [(job.paths, partial(_cases, job)) for job in jobs]
@@ -227,6 +232,8 @@ def _is_result(source: str) -> bool:
 
 def _cases(job: Job) -> list[Case]:
     """Read recordings and make of them what a report tells."""
+    from relay_autotune.report.case import case_of
+
     said: list[str] = []
     try:
         with Stages(ProgressLine(f"{PROGRAM}: {job.name} read")) as stages:
@@ -311,6 +318,8 @@ def report_of_tune(
     :return: a warning for the user; empty: none.
     :raises BagError: if it cannot be written.
     """
+    from relay_autotune.report.case import case_of
+
     found = analysed_as_there(record, values)
     case = replace(case_of(found, source), present=present)
     if result.bag:
