@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
+
+import yaml
 
 import relay_autotune
 from relay_autotune.bag.definitions import (
@@ -19,13 +22,6 @@ from relay_autotune.bag.definitions import (
     FLOAT64,
     Definition,
     find_definition,
-)
-from relay_autotune.bag.metadata import (
-    Qos,
-    TopicSummary,
-    metadata_file,
-    metadata_yaml,
-    qos_yaml,
 )
 from relay_autotune.errors import BagError
 
@@ -35,12 +31,59 @@ if TYPE_CHECKING:
 # Largest size of what is not flushed [bytes]: it is lost if the process is killed.
 _LARGEST_BUFFER = 1 << 20
 
+# A time without end in rmw: the largest signed 64-bit number of nanoseconds.
+_FOREVER = {"sec": 9223372036, "nsec": 854775807}
+
 _FLOAT64_CDR = struct.Struct("<4sd")
 
 
 def encode_float64(value: float) -> bytes:
     """Return a std_msgs/Float64 in CDR, as the middleware would serialize it."""
     return _FLOAT64_CDR.pack(b"\x00\x01\x00\x00", value)
+
+
+@dataclass(frozen=True)
+class Qos:
+    """The quality of service that a publisher offered, in the words of rosbag2.
+
+    :param reliability: ``reliable`` or ``best_effort``.
+    :param durability: ``volatile`` or ``transient_local``.
+    :param history: ``keep_last`` or ``keep_all``.
+    :param depth: messages kept, with keep_last.
+    """
+
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    history: str = "keep_last"
+    depth: int = 10
+
+    @property
+    def profiles(self) -> list[dict[str, Any]]:
+        """What rosbag2 keeps of a topic with one publisher."""
+        return [
+            {
+                "history": self.history,
+                "depth": self.depth,
+                "reliability": self.reliability,
+                "durability": self.durability,
+                "deadline": _FOREVER,
+                "lifespan": _FOREVER,
+                "liveliness": "automatic",
+                "liveliness_lease_duration": _FOREVER,
+                "avoid_ros_namespace_conventions": False,
+            }
+        ]
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what occurs twice twice, since readers of bags need not know references."""
+
+    def ignore_aliases(self, _data: Any) -> bool:
+        return True
+
+
+def _as_yaml(value: Any) -> str:
+    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, width=math.inf))
 
 
 @dataclass(frozen=True)
@@ -170,7 +213,7 @@ class BagWriter:
                 "cdr",
                 schemas[topic.type],
                 {
-                    "offered_qos_profiles": qos_yaml(topic.qos),
+                    "offered_qos_profiles": _as_yaml(topic.qos.profiles),
                     "topic_type_hash": self._definitions[topic.type].type_hash,
                 },
             )
@@ -249,7 +292,9 @@ class BagWriter:
             return
         try:
             self._writer.flush()
-            self._writer.add_metadata("rosbag2", {"serialized_metadata": self._information()})
+            self._writer.add_metadata(
+                "rosbag2", {"serialized_metadata": _as_yaml(self._information())}
+            )
             self._writer.finish()
             self._stream.flush()
             self._stream.close()
@@ -272,31 +317,46 @@ class BagWriter:
         )
         return BagError(self._failure)
 
-    def _information(self) -> str:
-        start = self._start_ns if self._first_ns is None else self._first_ns
-        return metadata_yaml(
-            self._file_name,
-            [
-                TopicSummary(
-                    topic.name,
-                    topic.type,
-                    topic.qos,
-                    self._definitions[topic.type].type_hash,
-                    self._counts[topic.name],
-                )
-                for topic in self._topics.values()
-            ],
-            start_ns=start,
-            duration_ns=0 if self._first_ns is None else self._last_ns - start,
-            custom=self._custom,
-            ros_distro=os.environ.get("ROS_DISTRO") or "jazzy",
-        )
+    def _information(self) -> dict[str, Any]:
+        """Return what metadata.yaml of version 9 says of the bag."""
+        start_ns = self._start_ns if self._first_ns is None else self._first_ns
+        span = {
+            "duration": {"nanoseconds": 0 if self._first_ns is None else self._last_ns - start_ns},
+            "starting_time": {"nanoseconds_since_epoch": start_ns},
+            "message_count": sum(self._counts.values()),
+        }
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": topic.name,
+                    "type": topic.type,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": topic.qos.profiles,
+                    "type_description_hash": self._definitions[topic.type].type_hash,
+                },
+                "message_count": self._counts[topic.name],
+            }
+            for topic in self._topics.values()
+        ]
+        return {
+            "version": 9,
+            "storage_identifier": "mcap",
+            **span,
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [self._file_name],
+            "files": [{"path": self._file_name, **span}],
+            "custom_data": self._custom or None,
+            "ros_distro": os.environ.get("ROS_DISTRO") or "jazzy",
+        }
 
     def _write_metadata(self) -> None:
         path = self.path / "metadata.yaml"
         new = path.with_name("metadata.yaml.tmp")
         try:
-            new.write_text(metadata_file(self._information()), encoding="utf-8")
+            information = {"rosbag2_bagfile_information": self._information()}
+            new.write_text(_as_yaml(information), encoding="utf-8")
             new.replace(path)
         except OSError:
             with contextlib.suppress(OSError):

@@ -27,7 +27,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from relay_autotune.bag.metadata import Qos
+from relay_autotune.bag.writer import Qos
 
 FLOAT64_TYPE = "std_msgs/msg/Float64"
 

@@ -21,9 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from relay_autotune.bag import writer as writer_module
 from relay_autotune.bag.definitions import Definition, find_definition
-from relay_autotune.bag.metadata import Qos
 from relay_autotune.bag.reader import read_experiments
-from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
+from relay_autotune.bag.writer import BagWriter, Qos, Topic, encode_float64
 from relay_autotune.errors import BagError
 
 FLOAT64 = "std_msgs/msg/Float64"
@@ -97,6 +96,8 @@ def test_metadata_is_version_9(tmp_path):
     assert [t["message_count"] for t in topics] == [100, 100]
     (profile,) = topics[1]["topic_metadata"]["offered_qos_profiles"]
     assert profile["durability"] == "transient_local"
+    assert profile["deadline"] == {"sec": 9223372036, "nsec": 854775807}
+    assert "&" not in text
     assert not list((tmp_path / "bag").glob("*.tmp"))
 
 
