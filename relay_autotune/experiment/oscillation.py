@@ -23,10 +23,9 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.narration import while_switching
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.relay_law import Levels, Patience, Relay, clear_swing
+from relay_autotune.experiment.relay_law import Levels, Patience, Relay, Turns, clear_swing
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import RestState
-from relay_autotune.experiment.turns import Turns
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.record.record import Cycle, Outcome
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.oscillation import MOST_BORNE
+from relay_autotune.experiment.relay_law import OVERDUE, Turns
 from relay_autotune.experiment.samples import GAP, Samples
-from relay_autotune.experiment.turns import OVERDUE, Turns
 from relay_autotune.record.record import Outcome
 
 PART = 30

@@ -21,8 +21,8 @@ import numpy as np
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.oscillation import MOST_BORNE
 from relay_autotune.experiment.procedure import KICK_LIMIT, KICK_SETTLINGS
+from relay_autotune.experiment.relay_law import OVERDUE, OVERDUE_SAMPLES
 from relay_autotune.experiment.samples import GAP
-from relay_autotune.experiment.turns import OVERDUE, OVERDUE_SAMPLES
 from relay_autotune.record.record import Outcome
 
 HAPPENINGS = (
