@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from relay_autotune.analysis import Analysis, analyse, analyse_jointly
     from relay_autotune.bag.reader import read_records
     from relay_autotune.errors import RelayAutotuneError
-    from relay_autotune.exchange.python_control import to_control
+    from relay_autotune.exchange.notebook import to_control
     from relay_autotune.experiment.experiment import RelayExperiment
     from relay_autotune.experiment.parameters import ExperimentParameters
     from relay_autotune.identification.known import Known
@@ -56,7 +56,7 @@ _HOMES = {
     "identification.result": ("Identification",),
     "process.structures": ("STRUCTURES",),
     "process.transfer_function": ("TransferFunction",),
-    "exchange.python_control": ("to_control",),
+    "exchange.notebook": ("to_control",),
     "record.record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
     "experiment.experiment": ("RelayExperiment",),
     "experiment.parameters": ("ExperimentParameters",),
