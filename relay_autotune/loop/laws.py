@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray
-from relay_autotune.errors import TuningError, look_up
+from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import UNLIMITED, Limits, filter_matrices, require_period
 
@@ -474,19 +474,20 @@ def _tracking(law: SampledLaw) -> float | None:
     return math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
 
 
-def _field(name: str) -> Setting:
-    """Return a setting that is a field of the gains."""
-    return Setting(name, lambda law: float(getattr(law.gains, name)))
+def _gains(
+    names: str, fields: str = "p i d", of: Callable[[float], float] = lambda gain: gain
+) -> tuple[Setting, ...]:
+    """Return the settings that are gains.
 
+    :param names: of the settings.
+    :param fields: which of the gains each is; default: those of the parallel form.
+    :param of: returns what is written for a gain.
+    """
 
-def _parallel(names: str, of: Callable[[float], float] = lambda gain: gain) -> tuple[Setting, ...]:
-    """Return the settings of a parallel form, by their names, from its gains."""
-    p, i, d = names.split()
-    return (
-        Setting(p, lambda law: of(law.gains.p)),
-        Setting(i, lambda law: of(law.gains.i)),
-        Setting(d, lambda law: of(law.gains.d)),
-    )
+    def setting(name: str, field: str) -> Setting:
+        return Setting(name, lambda law: of(float(getattr(law.gains, field))))
+
+    return tuple(map(setting, names.split(), fields.split()))
 
 
 def _of_255(gain: float) -> float:
@@ -503,19 +504,24 @@ _LATE = "u_k = p e_k + I_k + d (e_k - e_{k-1})/h, then I_{k+1} = I_k + i h e_k"
 _EARLY = "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d (e_k - e_{k-1})/h"
 _ON_Y = "I_k = I_{k-1} + i h e_k, then u_k = p (b r_k - y_k) + I_k - d (y_k - y_{k-1})/h"
 
-_BACK_CALCULATION = Law(
-    "control_toolbox_back_calculation",
-    _TOOLBOX,
-    _LATE,
-    Integral.AFTER,
-    Slope.ERROR,
-    _PLAIN,
+
+def _control_toolbox(
+    strategy: str,
+    limits: str,
+    *others: Setting,
+    equation: str = _LATE,
+    integral: Integral = Integral.AFTER,
+) -> Law:
+    """Return the law of control_toolbox with one of its anti-windup strategies."""
+    settings = (*_gains("p i d"), _strategy(strategy), *others)
+    name = f"control_toolbox_{strategy}"
+    return Law(name, _TOOLBOX, equation, integral, Slope.ERROR, _PLAIN, limits, settings)
+
+
+_BACK_CALCULATION = _control_toolbox(
+    "back_calculation",
     "I also gets h (u limited - u)/tracking_time_constant",
-    (
-        *_parallel("p i d"),
-        _strategy("back_calculation"),
-        Setting("tracking_time_constant", _tracking),
-    ),
+    Setting("tracking_time_constant", _tracking),
 )
 
 _ROWS = (
@@ -529,33 +535,18 @@ _ROWS = (
         Slope.MEASUREMENT,
         _ON_MEASUREMENT,
         "back-calculation with sqrt(ti td), without derivative ti",
-        tuple(_field(name) for name in ("kc", "ti", "td", "tf", "b")),
+        _gains("kc ti td tf b", "kc ti td tf b"),
         weights=(),
         form="ideal",
     ),
     _BACK_CALCULATION,
-    replace(
-        _BACK_CALCULATION,
-        name="control_toolbox_conditional_integration",
-        limits="no integration while u is limited and e u > 0",
-        settings=(
-            *_parallel("p i d"),
-            _strategy("conditional_integration"),
-        ),
-    ),
-    replace(
-        _BACK_CALCULATION,
-        name="control_toolbox_none",
-        limits="the integral winds up",
-        settings=(*_parallel("p i d"), _strategy("none")),
-    ),
-    replace(
-        _BACK_CALCULATION,
-        name="control_toolbox_legacy",
+    _control_toolbox("conditional_integration", "no integration while u is limited and e u > 0"),
+    _control_toolbox("none", "the integral winds up"),
+    _control_toolbox(
+        "legacy",
+        "I stays between i_clamp_min and i_clamp_max",
         equation=_EARLY,
         integral=Integral.BEFORE,
-        limits="I stays between i_clamp_min and i_clamp_max",
-        settings=(*_parallel("p i d"), _strategy("legacy")),
     ),
     replace(
         _BACK_CALCULATION,
@@ -573,7 +564,7 @@ _ROWS = (
         "I stays within the output limits",
         (
             # Their sign is that of ControllerDirection.
-            *_parallel("Kp Ki Kd", abs),
+            *_gains("Kp Ki Kd", of=abs),
             Setting("SampleTime", lambda law: f"{1000.0 * law.period:.10g}"),
             Setting("POn", lambda law: "P_ON_E" if law.gains.b > 0.5 else "P_ON_M"),
             Setting(
@@ -595,7 +586,7 @@ _ROWS = (
         _PLAIN,
         "I stays within output_limits",
         (
-            *_parallel("Kp Ki Kd"),
+            *_gains("Kp Ki Kd"),
             Setting("sample_time", lambda law: law.period),
             Setting("proportional_on_measurement", lambda law: str(law.gains.b < 0.5)),
         ),
@@ -613,7 +604,7 @@ _ROWS = (
         _MEAN,
         "I stays between min_integral and max_integral",
         (
-            *_parallel("kp ki kd"),
+            *_gains("kp ki kd"),
             Setting(
                 "derivative_averaging_samples",
                 lambda law: str(averaged_over(law.gains.tf, law.period)) if law.gains.td else None,
@@ -633,7 +624,7 @@ _ROWS = (
         _FIRST_ORDER,
         "the integral keeps its value while u is limited; small changes of u may be left out",
         (
-            *_parallel("pid_Kp pid_Ki pid_Kd", _of_255),
+            *_gains("pid_Kp pid_Ki pid_Kd", of=_of_255),
             Setting(
                 "smooth_time",
                 lambda law: max(law.gains.tf, law.period) if law.gains.td else None,
@@ -653,7 +644,7 @@ _ROWS = (
         _FIRST_ORDER,
         "Ki h I stays between 0 and the largest output",
         (
-            *_parallel("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", _of_255),
+            *_gains("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", of=_of_255),
             Setting(
                 "PID_K1",
                 lambda law: (
@@ -675,7 +666,7 @@ _ROWS = (
         Slope.NONE,
         _PLAIN,
         "no integration further into the limit of the allocator; I within its own limit",
-        _parallel("MC_ROLLRATE_P MC_ROLLRATE_I MC_ROLLRATE_D"),
+        _gains("MC_ROLLRATE_P MC_ROLLRATE_I MC_ROLLRATE_D"),
         command="normalised torque",
         line="param set {name} {value}",
     ),
@@ -689,7 +680,7 @@ _ROWS = (
         _FIRST_ORDER,
         "I may only shrink while the limit flag is set; I within IMAX",
         (
-            *_parallel("ATC_RAT_RLL_P ATC_RAT_RLL_I ATC_RAT_RLL_D"),
+            *_gains("ATC_RAT_RLL_P ATC_RAT_RLL_I ATC_RAT_RLL_D"),
             Setting(
                 "ATC_RAT_RLL_FLTD",
                 lambda law: (
@@ -716,8 +707,7 @@ _ROWS = (
         "none: the integral winds up",
         (
             Setting("KP", lambda law: -law.gains.kc),
-            Setting("TR", lambda law: law.gains.ti),
-            Setting("TD", lambda law: law.gains.td),
+            *_gains("TR TD", "ti td"),
             Setting("CYCLE", lambda law: f"T#{1000.0 * law.period:.10g}ms"),
         ),
         form="ideal",
@@ -740,11 +730,7 @@ _ROWS = (
         Slope.ERROR,
         _PLAIN,
         "I stays between ILIM_L and ILIM_H",
-        (
-            Setting("KP", lambda law: law.gains.kc),
-            Setting("TN", lambda law: law.gains.ti),
-            Setting("TV", lambda law: law.gains.td),
-        ),
+        _gains("KP TN TV", "kc ti td"),
         form="ideal",
         line="{name} := {value};",
         remark="//",
@@ -757,11 +743,3 @@ _ROWS = (
 
 OWN_LAW = _ROWS[0].name
 LAWS: dict[str, Law] = {law.name: law for law in _ROWS}
-
-
-def law_named(name: str) -> Law:
-    """Return a law by its name.
-
-    :raises TuningError: if the name is unknown; the message lists the known names.
-    """
-    return look_up(LAWS, name, "law", TuningError)

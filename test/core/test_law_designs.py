@@ -13,7 +13,7 @@ import pytest
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, law_named
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
 from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
@@ -57,7 +57,7 @@ def test_the_bounds_hold_on_the_exact_loop_and_one_is_met(law, process, period, 
     model = PROCESSES[process]
     options = asked(law, period, controller=kind)
     gains = tune(model, options=options)
-    loop = SampledLoop(law_named(law).at(gains, period), model)
+    loop = SampledLoop(LAWS[law].at(gains, period), model)
     assert loop.unstable == 0
     found, mt = loop.margins(), options.largest_mt(model)
     assert gains.ms == pytest.approx(max(found.ms, 1.0))
@@ -79,7 +79,7 @@ def test_no_other_gains_within_the_bounds_have_a_clearly_smaller_error(law):
             ki = gains.i * i
             kp = gains.kc * p
             other = Controller(kp, kp / ki, gains.td * d, gains.tf)
-            loop = SampledLoop(law_named(law).at(other, period), model)
+            loop = SampledLoop(LAWS[law].at(other, period), model)
             if loop.unstable or loop.margins().ms > 1.4 or loop.margins().mt > 1.4:
                 continue
             tried += 1
@@ -93,7 +93,7 @@ def test_a_named_law_matters_at_a_slow_rate():
     """The same gains on another law than theirs miss the bound by far."""
     model, period = PROCESSES["fopdt"], 0.8
     gains = tune(model, options=asked("control_toolbox_legacy", period, controller="pid"))
-    other = analyse_sampled(law_named("klipper_heater").at(gains, period), model)
+    other = analyse_sampled(LAWS["klipper_heater"].at(gains, period), model)
     assert other.ms > 1.6
 
 
@@ -107,7 +107,7 @@ def test_bounds_hold_on_the_models_around_it_too():
     )
     task = DesignTask(model=model, options=asked("simple_pid", period), models=around)
     gains = design(task, "robust")
-    ms = [SampledLoop(law_named("simple_pid").at(gains, period), m).ms() for m in around]
+    ms = [SampledLoop(LAWS["simple_pid"].at(gains, period), m).ms() for m in around]
     assert sum(value > 1.4 * 1.002 for value in ms) <= 2
     assert gains.ms_95 == pytest.approx(np.sort(ms)[-3], rel=2e-3)
     assert tune(model, options=task.options).i > 1.1 * gains.i
@@ -160,7 +160,7 @@ def test_every_law_can_be_asked_for():
 
 def test_a_pole_that_is_unstable_below_the_grid_leaves_gains():
     """Seen from the grid it is an integrator; its loop begins far left of -1."""
-    law, period, kp = law_named("simple_pid"), 0.2, 2.0
+    law, period, kp = LAWS["simple_pid"], 0.2, 2.0
     model = TransferFunction(-2148.0, (), (-22540.0, 0.82), 0, 0.79)
     grid = np.geomspace(0.01, 0.99 * math.pi / period, 3000)
     responses = SampledResponses(law, period, (model,), grid, 1.0)

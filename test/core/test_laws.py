@@ -15,7 +15,7 @@ from relay_autotune.control.controller import LawController
 from relay_autotune.control.verification import Step, compare, plan
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, LawRate, law_named
+from relay_autotune.loop.laws import LAWS, LawRate
 from relay_autotune.loop.sampled import Limits, SampledPid, simulate_closed_loop
 from relay_autotune.loop.sampled_loop import SampledLoop, analyse_sampled
 from relay_autotune.process.structures import INTEGRATOR_LAG
@@ -189,7 +189,7 @@ def test_every_law_has_its_source_here():
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("name", LAWS)
 def test_a_law_does_what_its_source_does(name, sign):
-    law = law_named(name)
+    law = LAWS[name]
     wanted = Controller(sign * WANTED.kc, WANTED.ti, WANTED.td, WANTED.tf, WANTED.b)
     if sign < 0.0 and law.only_positive:
         with pytest.raises(TuningError, match="positive gains only"):
@@ -205,7 +205,7 @@ def test_a_law_does_what_its_source_does(name, sign):
 @pytest.mark.parametrize("tf", [0.0, 0.7])
 @pytest.mark.parametrize("name", LAWS)
 def test_its_transfer_functions_are_those_of_its_source(name, tf):
-    law = law_named(name)
+    law = LAWS[name]
     gains = law.best(Controller(1.3, 2.0, 0.6, tf, 1.0), PERIOD)
     sampled = law.at(gains, PERIOD)
     # Outside of the unit circle the sum over an impulse's response ends soon.
@@ -222,7 +222,7 @@ def test_its_transfer_functions_are_those_of_its_source(name, tf):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_its_ms_is_that_of_a_sinusoidal_test_of_its_source(name):
-    law = law_named(name)
+    law = LAWS[name]
     gains = law.best(WANTED, PERIOD)
     loop = SampledLoop(law.at(gains, PERIOD), PROCESS)
     found = loop.margins()
@@ -251,7 +251,7 @@ def test_its_ms_is_that_of_a_sinusoidal_test_of_its_source(name):
     ids=["fopdt", "inverse", "integrating", "oscillating"],
 )
 def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
-    law = law_named("arduino_pid_v1")
+    law = LAWS["arduino_pid_v1"]
     sampled = law.at(Controller(0.25, ti, 0.3, 0.0, 1.0), period)
     found = analyse_sampled(sampled, model)
     count = int(200.0 / period)
@@ -271,7 +271,7 @@ def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
 
 @pytest.mark.long
 def test_noise_reaches_the_command_as_said():
-    law = law_named("marlin_heater")
+    law = LAWS["marlin_heater"]
     gains = law.best(WANTED, PERIOD)
     sampled = law.at(gains, PERIOD)
     noise = np.random.default_rng(1).standard_normal(6000)
@@ -289,7 +289,7 @@ def test_stability_is_that_of_the_roots_of_the_characteristic_polynomial():
         pole, wait = math.exp(-PERIOD / 2.0), int(rng.integers(1, 8))
         model = TransferFunction.fopdt(1.0, 2.0, (wait - 1) * PERIOD)
         gains = Controller(float(rng.uniform(0.1, 12.0)), float(rng.uniform(0.3, 5.0)))
-        loop = SampledLoop(law_named("control_toolbox_none").at(gains, PERIOD), model)
+        loop = SampledLoop(LAWS["control_toolbox_none"].at(gains, PERIOD), model)
         # (z - 1)(z - a) z^(wait - 1) + (1 - a)(p (z - 1) + i h) = 0
         roots = np.roots(
             np.polyadd(
@@ -304,17 +304,15 @@ def test_stability_is_that_of_the_roots_of_the_characteristic_polynomial():
 
 def test_gains_that_a_law_cannot_run_are_refused():
     with pytest.raises(TuningError, match="without integral action"):
-        law_named("iec_61131_3_pid").best(Controller(1.0, 0.0), PERIOD)
-    with pytest.raises(TuningError, match="unknown law 'pid'"):
-        law_named("pid")
-    wild = law_named("simple_pid").at(Controller(30.0, 1.0), PERIOD)
+        LAWS["iec_61131_3_pid"].best(Controller(1.0, 0.0), PERIOD)
+    wild = LAWS["simple_pid"].at(Controller(30.0, 1.0), PERIOD)
     with pytest.raises(TuningError, match="simple_pid runs it every"):
         analyse_sampled(wild, PROCESS)
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_the_controller_that_runs_a_law_does_what_its_source_does_about_a_rest(name):
-    rate = LawRate(law_named(name), PERIOD)
+    rate = LawRate(LAWS[name], PERIOD)
     gains = rate.of(WANTED)
     source, controller = Source(name, gains.gains), LawController(rate, WANTED, 2.0)
     assert controller.step(7.0, 40.0, 40.0) == 2.0
@@ -329,7 +327,7 @@ def test_the_controller_that_runs_a_law_does_what_its_source_does_about_a_rest(n
 
 @pytest.mark.parametrize("name", ["pid_controller", "klipper_heater", "iec_61131_3_pid"])
 def test_a_step_of_a_law_is_predicted_as_its_source_makes_it(name):
-    rate = LawRate(law_named(name), PERIOD)
+    rate = LawRate(LAWS[name], PERIOD)
     gains, step = Controller(kc=0.9, ti=2.0, td=0.2), Step(setpoint=0.5)
     wanted = plan(gains, PROCESS, step, PERIOD, rate=rate)
     plant, source = FopdtPlant(0.9, 2.0, 0.8), Source(name, rate.of(gains).gains)
@@ -347,7 +345,7 @@ def test_a_step_of_a_law_is_predicted_as_its_source_makes_it(name):
 
 
 def test_at_a_limit_the_integral_of_a_law_stops():
-    rate = LawRate(law_named("control_toolbox_none"), PERIOD)
+    rate = LawRate(LAWS["control_toolbox_none"], PERIOD)
     controller = LawController(rate, Controller(0.5, 2.0), 0.9, limits=Limits(0.0, 1.0))
     commands = [controller.step(k * PERIOD, 41.0, 40.0) for k in range(200)]
     assert commands[0] == 0.9

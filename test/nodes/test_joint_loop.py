@@ -15,8 +15,8 @@ from toolbox_pid import ToolboxPid
 
 from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.errors import LoopError
+from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import law_named
 from relay_autotune.nodes.controller_manager import (
     ManagedController,
     above,
@@ -120,7 +120,7 @@ def test_joints_that_would_go_limp_have_to_be_written_too() -> None:
 @pytest.mark.parametrize("strategy", LAWS)
 def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str) -> None:
     period, gains = 0.01, Controller(0.8, 0.4, 0.05)
-    running = law_named(LAWS[strategy]).at(gains, period).running()
+    running = laws.LAWS[LAWS[strategy]].at(gains, period).running()
     law = ToolboxPid(gains.p, gains.i, gains.d, strategy)
     measured = np.random.default_rng(3).normal(size=200)
     ours = [running.step(1.0, y) for y in measured]
@@ -144,7 +144,7 @@ def test_a_feedforward_is_a_weight_of_the_setpoint() -> None:
     found = controller_of({"p": 0.5, "i": 1.0}, 0.2)
     assert found == Controller(0.5, 0.5, b=1.4)
     for setpoint, measured in ((2.0, 1.0), (-1.0, 0.3)):
-        law = law_named("controller_node").at(found, 0.01).running()
+        law = laws.LAWS["controller_node"].at(found, 0.01).running()
         wanted = 0.5 * (setpoint - measured) + 1.0 * 0.01 * (setpoint - measured) + 0.2 * setpoint
         assert law.step(setpoint, measured) == pytest.approx(wanted)
 
