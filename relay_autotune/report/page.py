@@ -18,9 +18,6 @@ from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
     Chip,
-    NamedNumber,
-    Reason,
-    Row,
     beside_present,
     checks_of,
     doubts_of,
@@ -71,16 +68,8 @@ class _Section:
 
     case: Case
     name: str
-    verdict: str
-    tone: str
+    verdict: Chip
     facts: tuple[str, ...]
-    steps: tuple[str, ...]
-    beside: tuple[Row, ...]
-    warnings: tuple[str, ...]
-    checks: tuple[Reason, ...]
-    numbers: tuple[NamedNumber, ...]
-    doubts: tuple[str, ...]
-    repeats: tuple[NamedNumber, ...]
     plates: tuple[_Drawn, ...]
     left_out: tuple[str, ...]
 
@@ -126,6 +115,9 @@ def _environment() -> Environment:
         "process_text": process_text,
         "mathml": lambda model: Markup(process_mathml(model)),
     }
+    # What the page says of a case, each by the function that finds the words.
+    said = (steps_of, beside_present, warnings_of, checks_of, numbers_of, doubts_of, repeats_of)
+    environment.globals |= {function.__name__: function for function in said}
     return environment
 
 
@@ -138,7 +130,6 @@ def _variables(column: int) -> str:
 
 
 def _section(case: Case, number: int, many: bool) -> _Section:
-    verdict: Chip = verdict_of(case)
     present = [plate for plate in PLATES if not plate.missing(case)]
     alone = sum(not plate.wide for plate in present) == 1
     known = not case.experiment_id or case.experiment_id in case.source
@@ -146,16 +137,8 @@ def _section(case: Case, number: int, many: bool) -> _Section:
     return _Section(
         case=case,
         name=name,
-        verdict=verdict.text,
-        tone=verdict.tone,
+        verdict=verdict_of(case),
         facts=facts_of(case, with_id=not many and not known),
-        steps=steps_of(case),
-        beside=beside_present(case),
-        warnings=warnings_of(case),
-        checks=checks_of(case),
-        numbers=numbers_of(case),
-        doubts=doubts_of(case),
-        repeats=repeats_of(case),
         plates=tuple(_drawn(p, case, f"e{number}", alone=alone) for p in present),
         left_out=tuple(f"{p.title}: {why}" for p in PLATES if (why := p.missing(case))),
     )
