@@ -11,9 +11,10 @@ fixed size do, a place is one number; else it is one for each message.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,6 +35,8 @@ from relay_autotune.bag.schema import (
     Type,
 )
 from relay_autotune.errors import BagError, FieldError
+from relay_autotune.quantities import told_fields
+from relay_autotune.record.record import Cycle, RelaySettings
 from relay_autotune.text import visible
 
 _ENCAPSULATION = 4
@@ -353,16 +356,15 @@ _FORMATS = {
 
 _STAMP = {"sec": 0, "nanosec": 0}
 _HEADER: dict[str, Any] = {"stamp": _STAMP, "frame_id": ""}
-_SETTINGS: dict[str, Any] = {
-    "setpoint": 0.0,
-    "baseline": 0.0,
-    "amplitude": 0.0,
-    "bias": 0.0,
-    "hysteresis": 0.0,
-    "extra_delay": 0.0,
-    "sample_period": 0.0,
-    "reverse_acting": False,
-}
+
+
+def _told(kind: type) -> dict[str, Any]:
+    """Return the fields that a message has of one of our types, each with its default."""
+    fields = [each for each in told_fields(kind) if each.message is not None]
+    absent = {each.name: math.nan if each.nan else each.kind() for each in fields}
+    given = {each.name: each.default for each in fields if each.default is not MISSING}
+    return absent | given
+
 
 # Defaults of the fields that an older definition lacks. A field that is added to one of these
 # messages needs its default here, so that old bags can still be replayed.
@@ -372,8 +374,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "experiment_id": "",
         "outcome": 0,
         "reason": "",
-        "settings": _SETTINGS,
-        "noise_std": float("nan"),
+        "settings": _told(RelaySettings),
+        "noise_std": math.nan,
         "time": (),
         "receive_time": (),
         "command_time": (),
@@ -387,21 +389,12 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     CYCLE: {
         "header": _HEADER,
         "experiment_id": "",
-        "index": 0,
         "lead_in": 0,
-        "settings": _SETTINGS,
+        "settings": _told(RelaySettings),
         "time": (),
         "measurement": (),
         "command": (),
-        "period": float("nan"),
-        "period_high": float("nan"),
-        "period_low": float("nan"),
-        "peak_max": float("nan"),
-        "peak_min": float("nan"),
-        "time_to_peak_max": float("nan"),
-        "time_to_peak_min": float("nan"),
-        "converged": False,
-        "disturbed": False,
+        **_told(Cycle),
     },
 }
 
