@@ -81,24 +81,6 @@ class Compensator:
             1.0 / (self.model.gain * n * slow), self.model.time_constants, lags, 1
         )
 
-    def sampled(
-        self,
-        period: float,
-        *,
-        low: float = -math.inf,
-        high: float = math.inf,
-        offset: float = 0.0,
-    ) -> SampledCompensator:
-        """Return the controller as it runs.
-
-        :param period: of the samples [s].
-        :param low: least command [u].
-        :param high: largest command [u].
-        :param offset: command at which the process rests at the set-point [u].
-        :raises TuningError: if the period is not positive or the limits leave no range.
-        """
-        return SampledCompensator(self, period, low=low, high=high, offset=offset)
-
 
 class SampledCompensator:
     """A compensator that is called once for each sample.

@@ -15,7 +15,11 @@ from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, analyse_loop
-from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator
+from relay_autotune.tuning.compensators import (
+    SampledCompensator,
+    dead_time_compensator,
+    high_order_compensator,
+)
 
 FOPDT = TransferFunction.fopdt(0.8724, 1.9574, 10.8567)
 LAGS = TransferFunction.lag_n(1.5661, 10.6313, 5, 0.0)
@@ -63,7 +67,7 @@ def test_a_perfect_model_gives_the_response_of_the_filter():
     model = TransferFunction.fopdt(-1.0, 1.0, 10.0)
     found = dead_time_compensator(task(model))
     run = simulate_closed_loop(
-        found.sampled(0.05), model, period=0.05, duration=30.0, setpoint=1.0
+        SampledCompensator(found, 0.05), model, period=0.05, duration=30.0, setpoint=1.0
     )
     after = np.maximum(run.time - 10.0, 0.0)
     np.testing.assert_allclose(run.measurement, 1.0 - np.exp(-after / 2.0), atol=1e-4)
@@ -78,7 +82,7 @@ def test_higher_order_as_it_runs():
     found = high_order_compensator(task(LAGS))
     period = 0.2
     run = simulate_closed_loop(
-        found.sampled(period), LAGS, period=period, duration=120.0, setpoint=1.0
+        SampledCompensator(found, period), LAGS, period=period, duration=120.0, setpoint=1.0
     )
     x = run.time / found.closed_loop_time
     filtered = 1.0 - np.exp(-x) * sum(x**k / math.factorial(k) for k in range(5))
@@ -90,11 +94,11 @@ def test_higher_order_as_it_runs():
 def test_a_load_is_removed_and_limits_do_not_wind_up():
     found = dead_time_compensator(task(FOPDT))
     common = {"period": 0.1, "duration": 200.0, "load": 0.4, "load_time": 1.0}
-    run = simulate_closed_loop(found.sampled(0.1), FOPDT, **common)
+    run = simulate_closed_loop(SampledCompensator(found, 0.1), FOPDT, **common)
     assert abs(run.measurement[-1]) < 1e-6
     assert run.command[-1] == pytest.approx(-0.4, abs=1e-6)
     # Limited for long, the command leaves its limit as soon as the model says so.
-    limited = found.sampled(0.1, low=-0.2, high=0.2)
+    limited = SampledCompensator(found, 0.1, low=-0.2, high=0.2)
     for _ in range(2000):
         stuck = limited.step(0.0, 0.3)
     assert stuck == -0.2
@@ -104,7 +108,7 @@ def test_a_load_is_removed_and_limits_do_not_wind_up():
 
 
 def test_the_operating_point_is_an_offset():
-    first = dead_time_compensator(task(FOPDT)).sampled(0.1, offset=40.0)
+    first = SampledCompensator(dead_time_compensator(task(FOPDT)), 0.1, offset=40.0)
     assert first.step(5.0, 5.0) == pytest.approx(40.0)
 
 
@@ -125,4 +129,4 @@ def test_processes_that_they_are_not_for(make, model, message):
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"period": 0.1, "low": 1.0, "high": 1.0}])
 def test_periods_and_limits_that_cannot_be(wrong):
     with pytest.raises(TuningError):
-        dead_time_compensator(task(FOPDT)).sampled(**wrong)
+        SampledCompensator(dead_time_compensator(task(FOPDT)), **wrong)
