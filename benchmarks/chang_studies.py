@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from markdown import table
 
@@ -32,11 +34,13 @@ from relay_autotune.identification.methods.chang import (
     time_constant_from_period,
     two_time_constants,
 )
-from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import RelaySettings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+from sampled_relay import exact_limit_cycle
 
 EXAMPLE = TransferFunction.fopdt(1.65, 20.0, 10.0)
 # As the paper reads them off its chart; its amplitude of 0.26 lacks a zero.

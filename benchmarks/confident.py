@@ -39,11 +39,17 @@ from relay_autotune.quantities import NORMAL_95
 import numpy as np
 from information import relative_bounds
 from processes import true_point
+from sampled_relay import exact_limit_cycle
 
 from relay_autotune.analysis import analyse_alone
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    UNSTABLE_FOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Record, RelaySettings
@@ -101,8 +107,12 @@ CASES = (
     Case("e^-2s/(5s+1)", "Wang, table 1", _T.fopdt(1.0, 5.0, 2.0)),
     Case("e^-2s/(2s+1)^2", "Wang, table 3", _T.lag_n(1.0, 2.0, 2, 2.0)),
     Case("e^-2s/(2s+1)^5", "Wang, table 3", _T.lag_n(1.0, 2.0, 5, 2.0)),
-    Case("e^-0.5s/((s+1)(s^2+s+1))", "Wang, table 3", _T.lag_complex(1.0, 1.0, 1.0, 0.5, 0.5)),
-    Case("(1-s)e^-s/(s+1)^5", "Wang, table 3", _T.lag_n_zero(1.0, 1.0, 5, -1.0, 1.0)),
+    Case(
+        "e^-0.5s/((s+1)(s^2+s+1))", "Wang, table 3", LAG_COMPLEX.build((1.0, 1.0, 1.0, 0.5, 0.5))
+    ),
+    Case(
+        "(1-s)e^-s/(s+1)^5", "Wang, table 3", LAG_N_ZERO.of_order(5).build((1.0, 1.0, -1.0, 1.0))
+    ),
     Case("1.65e^-10s/(20s+1)", "Chang, example 1", _T.fopdt(1.65, 20.0, 10.0)),
     Case("1.65e^-s/(20s+1)", "Chang, figure 3", _T.fopdt(1.65, 20.0, 1.0)),
     Case("37.3e^-s/((7200s+1)(2s+1))", "Chang, figure 4", _T.sopdt(37.3, (7200.0, 2.0), 1.0)),
@@ -115,11 +125,11 @@ CASES = (
     Case("e^-0.6s/(6s+1)^8", "Thyagarajan, example 5", _T.lag_n(1.0, 6.0, 8, 0.6)),
     Case("e^-0.001s/(s+1)^20", "Thyagarajan, example 6", _T.lag_n(1.0, 1.0, 20, 0.001)),
     Case("e^-0.01s/(2s+1)^2", "Thyagarajan, eq 42", _T.lag_n(1.0, 2.0, 2, 0.01), tiny=True),
-    Case("e^-0.3s/(s-1)", "Thyagarajan, eqs 14-17", _T.unstable_fopdt(1.0, 1.0, 0.3)),
+    Case("e^-0.3s/(s-1)", "Thyagarajan, eqs 14-17", UNSTABLE_FOPDT.build((1.0, 1.0, 0.3))),
     Case(
         "0.547(1-0.418s)e^-0.1s/(s(1.06s+1))",
         "Luyben, example",
-        _T.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+        INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
     ),
 )
 

@@ -15,6 +15,7 @@ from reference import take_turns
 # isort: split
 import numpy as np
 
+from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.robust import robust
@@ -25,8 +26,8 @@ T = TransferFunction
 PROCESSES = {
     "1.65 e^(-10 s)/(20 s + 1)": T.fopdt(1.65, 20.0, 10.0),
     "e^(-0.6 s)/(6 s + 1)^8": T.lag_n(1.0, 6.0, 8, 0.6),
-    "0.547 (1 - 0.418 s) e^(-0.1 s)/(s (1.06 s + 1))": T.integrator_inverse(
-        0.547, 0.418, 1.06, 0.1
+    "0.547 (1 - 0.418 s) e^(-0.1 s)/(s (1.06 s + 1))": INTEGRATOR_INVERSE.build(
+        (0.547, 0.418, 1.06, 0.1)
     ),
     "e^(-0.5 s)/(s^2 + 0.8 s + 1)": T.oscillator(1.0, 1.0, 0.4, 0.5),
 }

@@ -13,6 +13,12 @@ from numpy.typing import NDArray
 from processes import true_point
 
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    UNSTABLE_FOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
@@ -79,13 +85,13 @@ def _parameters(
             return lambda v: build.lag_n(v[0], v[1], order, v[2]), np.array((gain, lags[0], delay))
         case "lag_n_zero":
             return (
-                lambda v: build.lag_n_zero(v[0], v[1], order, v[2], v[3]),
+                LAG_N_ZERO.of_order(order).build,
                 np.array((gain, lags[0], zeros[0], delay)),
             )
         case "lag_complex":
             pair = next(t for t in constants if t.imag != 0.0)
             return (
-                lambda v: build.lag_complex(v[0], v[1], v[2], v[3], v[4]),
+                LAG_COMPLEX.build,
                 np.array((gain, lags[0], 1.0 / abs(pair), pair.real / abs(pair), delay)),
             )
         case "fopdt":
@@ -97,12 +103,12 @@ def _parameters(
             )
         case "unstable_fopdt":
             return (
-                lambda v: build.unstable_fopdt(v[0], v[1], v[2]),
+                UNSTABLE_FOPDT.build,
                 np.array((abs(gain), abs(lags[0]), delay)),
             )
         case "integrator_inverse":
             return (
-                lambda v: build.integrator_inverse(v[0], v[1], v[2], v[3]),
+                INTEGRATOR_INVERSE.build,
                 np.array((gain, -zeros[0], lags[0], delay)),
             )
     raise ValueError(f"no parameters of a {model.structure} are known here")

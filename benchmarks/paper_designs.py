@@ -25,6 +25,7 @@ from markdown import table, three
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import ControlLaw
+from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import (
     RULES,
@@ -44,7 +45,7 @@ from relay_autotune.tuning.rules.step_response import two_point_fopdt
 CASES = Path(__file__).resolve().parent.parent / "test/support/data/worked_cases.json"
 
 _T = TransferFunction
-DRUM = _T.integrator_inverse(0.547, 0.418, 1.06, 0.1)
+DRUM = INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1))
 # Title, process, and how the worked cases call it.
 EXAMPLES = (
     ("e^(-10 s)/(s + 1)^3", _T.lag_n(1.0, 1.0, 3, 10.0), "ex1"),

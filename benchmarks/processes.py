@@ -16,13 +16,24 @@ from relay_autotune import threads  # noqa: F401  before numpy
 # isort: split
 import numpy as np
 
-from relay_autotune.process.simulation import RelayRun, exact_limit_cycle, simulate_relay
+from relay_autotune.process.simulation import RelayRun, simulate_relay
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_COMPLEX,
+    LAG_N_ZERO,
+    THREE_LAGS,
+    TWO_EQUAL_ONE,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
-from sampled_relay import simulate_sampled_relay
+from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 
 PER_CYCLE = 200
 
@@ -114,18 +125,18 @@ PROCESSES = (
     Process("e^(-10 s)/(s + 1)^2", _T.lag_n(1.0, 1.0, 2, 10.0)),
     Process("e^(-10 s)/(s + 1)^3", _T.lag_n(1.0, 1.0, 3, 10.0)),
     Process("e^(-0.6 s)/(6 s + 1)^8", _T.lag_n(1.0, 6.0, 8, 0.6)),
-    Process("(1 - s) e^(-s)/(2 s + 1)^3", _T.lag_n_zero(1.0, 2.0, 3, -1.0, 1.0)),
+    Process("(1 - s) e^(-s)/(2 s + 1)^3", LAG_N_ZERO.of_order(3).build((1.0, 2.0, -1.0, 1.0))),
     Process("e^(-s)/((5 s + 1)(s + 1))", _T.sopdt(1.0, (5.0, 1.0), 1.0)),
     Process("e^(-0.5 s)/(s^2 + 0.8 s + 1)", _T.oscillator(1.0, 1.0, 0.4, 0.5)),
-    Process("e^(-2 s)/((10 s + 1)^2 (3 s + 1))", _T.two_equal_one(1.0, 10.0, 3.0, 2.0)),
-    Process("e^(-2 s)/((10 s + 1)(3 s + 1)(s + 1))", _T.three_lags(1.0, (10.0, 3.0, 1.0), 2.0)),
-    Process("e^(-s)/((2 s + 1)(s^2 + 0.8 s + 1))", _T.lag_complex(1.0, 2.0, 1.0, 0.4, 1.0)),
-    Process("0.5 e^(-s)/s", _T.ipdt(0.5, 1.0)),
-    Process("0.5 e^(-s)/(s (2 s + 1))", _T.integrator_lag(0.5, 2.0, 1.0)),
+    Process("e^(-2 s)/((10 s + 1)^2 (3 s + 1))", TWO_EQUAL_ONE.build((1.0, 10.0, 3.0, 2.0))),
+    Process("e^(-2 s)/((10 s + 1)(3 s + 1)(s + 1))", THREE_LAGS.build((1.0, 10.0, 3.0, 1.0, 2.0))),
+    Process("e^(-s)/((2 s + 1)(s^2 + 0.8 s + 1))", LAG_COMPLEX.build((1.0, 2.0, 1.0, 0.4, 1.0))),
+    Process("0.5 e^(-s)/s", IPDT.build((0.5, 1.0))),
+    Process("0.5 e^(-s)/(s (2 s + 1))", INTEGRATOR_LAG.build((0.5, 2.0, 1.0))),
     Process(
         "0.547 (1 - 0.418 s) e^(-0.1 s)/(s (1.06 s + 1))",
-        _T.integrator_inverse(0.547, 0.418, 1.06, 0.1),
+        INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)),
     ),
-    Process("e^(-0.3 s)/(s - 1)", _T.unstable_fopdt(1.0, 1.0, 0.3)),
-    Process("e^(-0.2 s)/((2 s - 1)(0.2 s + 1))", _T.unstable_sopdt(1.0, 2.0, 0.2, 0.2)),
+    Process("e^(-0.3 s)/(s - 1)", UNSTABLE_FOPDT.build((1.0, 1.0, 0.3))),
+    Process("e^(-0.2 s)/((2 s - 1)(0.2 s + 1))", UNSTABLE_SOPDT.build((1.0, 2.0, 0.2, 0.2))),
 )

@@ -15,9 +15,9 @@ import math
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from relay_autotune import threads  # noqa: F401  before numpy
-from relay_autotune.process.structures import UNSTABLE_FOPDT
 
 # isort: split
 import numpy as np
@@ -37,10 +37,14 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
 )
 from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle, shape_of_record
 from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.simulation import RelayRun, exact_limit_cycle, simulate_relay
+from relay_autotune.process.simulation import RelayRun, simulate_relay
+from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+from sampled_relay import exact_limit_cycle
 
 FloatArray = NDArray[np.float64]
 Numbers = tuple[float, float, float]

@@ -298,34 +298,3 @@ def _whole_cycles(
             )
         )
     return tuple(cycles)
-
-
-def exact_limit_cycle(
-    model: TransferFunction,
-    settings: RelaySettings,
-    *,
-    tolerance: float = 1e-12,
-    most_cycles: int = 2000,
-) -> Cycle:
-    """Return the limit cycle to which an ideal relay experiment converges.
-
-    :param model: the process.
-    :param settings: the relay.
-    :param tolerance: relative change of the half periods from cycle to cycle that counts as
-        converged.
-    :param most_cycles: largest number of cycles before it must have converged.
-    :raises ModelError: if there is no limit cycle, or it does not converge.
-    """
-    count = 8
-    while True:
-        run = simulate_relay(model, settings, cycles=count, told=2)
-        a, b = run.cycles[-2], run.cycles[-1]
-        change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
-        if change <= tolerance * b.period:
-            return replace(b, converged=True)
-        if count >= most_cycles:
-            raise ModelError(
-                f"the limit cycle still changes by {change / b.period:g} of its period after "
-                f"{count} cycles"
-            )
-        count = min(4 * count, most_cycles)

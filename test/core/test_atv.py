@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 import pytest
+from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
@@ -27,7 +28,7 @@ from relay_autotune.identification.methods.atv import (
 )
 from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
-from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

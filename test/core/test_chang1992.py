@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sampled_relay import simulate_sampled_relay
+from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
@@ -28,7 +28,7 @@ from relay_autotune.identification.methods.chang import (
 )
 from relay_autotune.identification.methods.square_wave import fundamental, level, peak, slope_sign
 from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
-from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

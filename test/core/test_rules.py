@@ -12,10 +12,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampled_relay import exact_limit_cycle
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
-from relay_autotune.process.simulation import exact_limit_cycle
+from relay_autotune.process.structures import (
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_N_ZERO,
+    THREE_LAGS,
+    UNSTABLE_FOPDT,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import RelaySettings
@@ -217,7 +225,7 @@ def test_the_automatic_choice_by_the_shape(name, category, rule):
 
 def test_the_shape_of_other_structures_leads_to_the_equivalent_model():
     # The unequal lags are taken for five equal ones with the same limit cycle.
-    found, reason = thyagarajan(task(_T.three_lags(-2.0, (3.0, 2.0, 1.0), 0.5)))
+    found, reason = thyagarajan(task(THREE_LAGS.build((-2.0, 3.0, 2.0, 1.0, 0.5))))
     assert "category 3" in reason
     assert "equivalent lag_n" in reason
     assert found.kc < 0.0
@@ -262,9 +270,9 @@ def test_the_half_rule_on_its_authors_examples():
     [
         (_T.fopdt(2.0, 10.0, 1.0), 2.5, 8.0),
         (_T.fopdt(2.0, 10.0, 4.0), 0.625, 10.0),
-        (_T.ipdt(0.5, 2.0), 0.5, 16.0),
-        (_T.integrator_lag(0.5, 2.0, 1.0), 0.5, 16.0),
-        (_T.lag_n_zero(1.0, 2.0, 2, -1.0, 0.0), 3.0 / 4.0, 3.0),
+        (IPDT.build((0.5, 2.0)), 0.5, 16.0),
+        (INTEGRATOR_LAG.build((0.5, 2.0, 1.0)), 0.5, 16.0),
+        (LAG_N_ZERO.of_order(2).build((1.0, 2.0, -1.0, 0.0)), 3.0 / 4.0, 3.0),
     ],
 )
 def test_simc(model, kc, ti):
@@ -293,9 +301,9 @@ def test_amigo_meets_its_own_design():
             model = _T.fopdt(3.0, 2.0, 2.0 * ratio)
             found = amigo(task(model, controller=kind))[0]
             assert low < analyse_loop(found, model).ms < high
-    found = amigo(task(_T.ipdt(2.0, 0.5)))[0]
+    found = amigo(task(IPDT.build((2.0, 0.5))))[0]
     assert (found.kc, found.ti) == pytest.approx((0.35, 6.7))
-    pid = amigo(task(_T.ipdt(2.0, 0.5), controller="pid"))[0]
+    pid = amigo(task(IPDT.build((2.0, 0.5)), controller="pid"))[0]
     assert (pid.kc, pid.ti, pid.td, pid.b) == pytest.approx((0.45, 4.0, 0.25, 0.0))
     found = amigo(task(_T.fopdt(2.0, 3.0, 1.0)))[0]
     assert found.kc == pytest.approx((0.15 + (0.35 - 3.0 / 16.0) * 3.0) / 2.0)
@@ -309,7 +317,7 @@ def test_the_step_response_that_amigo_reads():
     assert found.delay == pytest.approx(1.0 + 3.0 * (1.0 - math.e + 2.0), rel=1e-3)
     at = found.lag + found.delay - 1.0
     assert 1.0 - (1.0 + at / 3.0) * math.exp(-at / 3.0) == pytest.approx(1.0 - math.exp(-1.0))
-    late = step_response(_T.integrator_inverse(0.547, 0.418, 1.06, 0.1))
+    late = step_response(INTEGRATOR_INVERSE.build((0.547, 0.418, 1.06, 0.1)))
     assert late.delay == pytest.approx(0.1 + 0.418 + 1.06)
 
 
@@ -323,7 +331,7 @@ def test_the_fopdt_of_two_points_of_the_step_response():
         assert risen == pytest.approx(1.0 - math.exp((delay - at) / tau), rel=1e-9)
     assert found.gain == -2.0
     with pytest.raises(TuningError, match="stable process"):
-        two_point_fopdt(_T.ipdt(1.0, 1.0))
+        two_point_fopdt(IPDT.build((1.0, 1.0)))
 
 
 @pytest.mark.long
@@ -333,7 +341,7 @@ def test_the_fopdt_of_two_points_of_the_step_response():
     [("pi", {0.22: 1.61, 0.3: 1.97, 0.5: 3.55}), ("pid", {0.22: 1.35, 0.3: 1.52, 0.5: 2.08})],
 )
 def test_unstable_processes_are_held_nearly_as_well_as_any_gains_could(ratio, kind, least):
-    model = _T.unstable_fopdt(-2.0, 10.0, 10.0 * ratio)
+    model = UNSTABLE_FOPDT.build((-2.0, 10.0, 10.0 * ratio))
     given = task(model, controller=kind)
     found, reason = unstable(given)
     ms = analyse_loop(found, model).ms
@@ -348,34 +356,34 @@ def test_unstable_processes_are_held_nearly_as_well_as_any_gains_could(ratio, ki
 @pytest.mark.long
 def test_an_unstable_process_beyond_reach_is_refused():
     with pytest.raises(TuningError, match="1 is the limit"):
-        unstable(task(_T.unstable_fopdt(1.0, 1.0, 1.2), controller="pi"))
+        unstable(task(UNSTABLE_FOPDT.build((1.0, 1.0, 1.2)), controller="pi"))
     with pytest.raises(TuningError, match="2 is the limit"):
-        unstable(task(_T.unstable_fopdt(1.0, 1.0, 2.5), controller="pid"))
-    assert unstable(task(_T.unstable_fopdt(1.0, 1.0, 0.05)))[0].td == 0.0
-    assert unstable(task(_T.unstable_fopdt(1.0, 1.0, 0.3)))[0].td > 0.0
+        unstable(task(UNSTABLE_FOPDT.build((1.0, 1.0, 2.5)), controller="pid"))
+    assert unstable(task(UNSTABLE_FOPDT.build((1.0, 1.0, 0.05))))[0].td == 0.0
+    assert unstable(task(UNSTABLE_FOPDT.build((1.0, 1.0, 0.3))))[0].td > 0.0
 
 
 REFUSED = [
     ("itae", _T.lag_n(1.0, 1.0, 3, 1.0), "FOPDT"),
     ("itae", _T.fopdt(1.0, 1.0, 3.0), r"0\.1 <= D/tau"),
-    ("imc", _T.unstable_fopdt(1.0, 1.0, 0.1), "unstable"),
+    ("imc", UNSTABLE_FOPDT.build((1.0, 1.0, 0.1)), "unstable"),
     ("tyreus_luyben", _T.fopdt(1.0, 1.0, 0.0), "ultimate point"),
-    ("ziegler_nichols", _T.unstable_fopdt(1.0, 1.0, 0.1), "unstable"),
+    ("ziegler_nichols", UNSTABLE_FOPDT.build((1.0, 1.0, 0.1)), "unstable"),
     ("phase_margin", _T.lag_n(1.0, 1.0, 3, 1.0), "two real lags"),
     ("phase_margin", _T.oscillator(1.0, 1.0, 0.5, 0.1), "two real lags"),
     ("lcmax", _T.lag_n(1.0, 1.0, 2, 1.0), "3 or more equal lags"),
-    ("lcmax", _T.three_lags(1.0, (1.0, 2.0, 3.0), 1.0), "3 or more equal lags"),
-    ("thyagarajan", _T.ipdt(1.0, 1.0), "stable processes"),
+    ("lcmax", THREE_LAGS.build((1.0, 1.0, 2.0, 3.0, 1.0)), "3 or more equal lags"),
+    ("thyagarajan", IPDT.build((1.0, 1.0)), "stable processes"),
     ("thyagarajan", _T.sopdt(1.0, (1.0, 2.0), 0.0), "limit cycle"),
     ("luyben2003", _T.fopdt(1.0, 1.0, 1.0), "one integrator"),
-    ("luyben2003", _T.ipdt(1.0, 0.0), "limits the gain"),
+    ("luyben2003", IPDT.build((1.0, 0.0)), "limits the gain"),
     ("luyben2003_p", _T.fopdt(1.0, 1.0, 1.0), "one integrator"),
     ("simc", _T.oscillator(1.0, 1.0, 0.5, 0.1), "real lags"),
     ("simc", _T.fopdt(1.0, 1.0, 0.0), "give tau_c"),
     ("amigo", _T.oscillator(1.0, 1.0, 0.2, 0.1), "rise steadily"),
     ("amigo", _T.fopdt(1.0, 1.0, 0.0), "apparent delay"),
     ("unstable", _T.fopdt(1.0, 1.0, 1.0), "tau s - 1"),
-    ("unstable", _T.unstable_fopdt(1.0, 1.0, 0.0), "give the closed-loop time"),
+    ("unstable", UNSTABLE_FOPDT.build((1.0, 1.0, 0.0)), "give the closed-loop time"),
 ]
 
 
@@ -390,7 +398,7 @@ def test_rules_without_derivative_action_say_so(rule):
     model = {
         "phase_margin": _T.lag_n(1.0, 1.0, 2, 0.01),
         "lcmax": _T.lag_n(1.0, 1.0, 5, 0.0),
-        "luyben2003_p": _T.ipdt(1.0, 1.0),
+        "luyben2003_p": IPDT.build((1.0, 1.0)),
     }[rule]
     with pytest.raises(TuningError, match=r"no PID gains|proportional action only"):
         RULES[rule](task(model, controller="pid"))
@@ -414,10 +422,10 @@ ANY = {
     "fopdt": lambda k, t, r: _T.fopdt(k, t, r * t),
     "lag_n": lambda k, t, r: _T.lag_n(k, t, 4, r * t),
     "sopdt": lambda k, t, r: _T.sopdt(k, (t, 0.3 * t), r * t),
-    "ipdt": lambda k, t, r: _T.ipdt(k / t, r * t),
-    "integrator_lag": lambda k, t, r: _T.integrator_lag(k / t, t, r * t),
-    "integrator_inverse": lambda k, t, r: _T.integrator_inverse(k / t, 0.4 * t, t, r * t),
-    "unstable_fopdt": lambda k, t, r: _T.unstable_fopdt(k, t, 0.05 * r * t),
+    "ipdt": lambda k, t, r: IPDT.build((k / t, r * t)),
+    "integrator_lag": lambda k, t, r: INTEGRATOR_LAG.build((k / t, t, r * t)),
+    "integrator_inverse": lambda k, t, r: INTEGRATOR_INVERSE.build((k / t, 0.4 * t, t, r * t)),
+    "unstable_fopdt": lambda k, t, r: UNSTABLE_FOPDT.build((k, t, 0.05 * r * t)),
 }
 
 
@@ -455,4 +463,4 @@ def test_a_lag_that_stands_for_an_integrator_is_no_fopdt(rule):
     """Its time constant is that of the record, and lambda with it: a loop that never settles."""
     stands = _T.fopdt(3e4, 6e5, 7.5)
     with pytest.raises(TuningError, match="found ipdt"):
-        design(task(_T.ipdt(0.05, 7.5), stands), rule)
+        design(task(IPDT.build((0.05, 7.5)), stands), rule)

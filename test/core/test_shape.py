@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sampled_relay import simulate_sampled_relay
+from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
@@ -28,7 +28,7 @@ from relay_autotune.identification.shown.shape import (
     shape_of_record,
 )
 from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.simulation import exact_limit_cycle, simulate_relay
+from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings

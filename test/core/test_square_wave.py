@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 import pytest
+from sampled_relay import exact_limit_cycle
 from scipy.special import gammaincc
 
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.methods.square_wave import fundamental, level, peak, peak_part
-from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

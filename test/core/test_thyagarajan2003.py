@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
@@ -29,7 +30,6 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
 )
 from relay_autotune.identification.shown.shape import shape_of_half_cycle
 from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.simulation import exact_limit_cycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

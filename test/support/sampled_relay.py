@@ -1,17 +1,20 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A relay that acts at its samples only, on a process simulated exactly between them."""
+"""Relay tests beside the exact one: a relay that acts at its samples, and where any relay ends."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
+from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
-from relay_autotune.record.record import Outcome, Record, RelaySettings
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 
 def simulate_sampled_relay(
@@ -76,3 +79,34 @@ def simulate_sampled_relay(
         cycle_start=tuple(starts),
         outcome=Outcome.COMPLETED,
     )
+
+
+def exact_limit_cycle(
+    model: TransferFunction,
+    settings: RelaySettings,
+    *,
+    tolerance: float = 1e-12,
+    most_cycles: int = 2000,
+) -> Cycle:
+    """Return the limit cycle to which an ideal relay experiment converges.
+
+    :param model: the process.
+    :param settings: the relay.
+    :param tolerance: relative change of the half periods from cycle to cycle that counts as
+        converged.
+    :param most_cycles: largest number of cycles before it must have converged.
+    :raises ModelError: if there is no limit cycle, or it does not converge.
+    """
+    count = 8
+    while True:
+        run = simulate_relay(model, settings, cycles=count, told=2)
+        a, b = run.cycles[-2], run.cycles[-1]
+        change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
+        if change <= tolerance * b.period:
+            return replace(b, converged=True)
+        if count >= most_cycles:
+            raise ModelError(
+                f"the limit cycle still changes by {change / b.period:g} of its period after "
+                f"{count} cycles"
+            )
+        count = min(4 * count, most_cycles)
