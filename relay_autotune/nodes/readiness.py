@@ -1,41 +1,44 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a tune can start: the checks before it, what each found, and what to type if it failed.
-
-What begins with `require_` refuses a start; what begins with `look_at_` tells something to know.
-"""
+"""Whether a tune can start: the checks before it, what each found, and what to type if it failed."""
 
 from __future__ import annotations
 
 import math
 import os
 import shutil
-import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
-from relay_autotune.experiment.narration import motion
+from relay_autotune.experiment.narration import how_long, motion
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.experiment.relay_law import Levels
-from relay_autotune.experiment.settling import CONSTANT_SAMPLES, RestState, rest_state
 from relay_autotune.nodes.ends import Ends
-from relay_autotune.nodes.parameters import merged
-from relay_autotune.nodes.quality import who, why_no_publisher, why_no_subscriber
-from relay_autotune.nodes.silence import Sensor
+from relay_autotune.nodes.parameters import merged, values_of
+from relay_autotune.nodes.quality import (
+    described,
+    who,
+    why_no_publisher,
+    why_no_subscriber,
+)
+from relay_autotune.nodes.silence import LastSamples, Sensor, require_own_time
 from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
+
+if TYPE_CHECKING:
+    from relay_autotune.nodes.loop_ends import LoopEnds
 
 _T = TypeVar("_T")
 
@@ -44,8 +47,6 @@ _FAR = 10.0
 # Free space below which a recording is said to be at risk [bytes].
 _LITTLE = 100_000_000
 _NAME_WIDTH = 12
-# The last samples that are kept, and the time that they may cover [s].
-_KEPT, _WINDOW = 2000, 10.0
 
 
 class NotReadyError(RelayAutotuneError):
@@ -141,51 +142,6 @@ class Checklist:
         self.checks.append(ChecklistLine(mark, name, found))
 
 
-class LastSamples:
-    """Keep the last measurements with their time of arrival."""
-
-    def __init__(self) -> None:
-        self._kept: deque[tuple[float, float]] = deque(maxlen=_KEPT)
-
-    def add(self, value: float) -> None:
-        """Take a measurement [y] that has arrived now."""
-        self._kept.append((time.monotonic(), value))
-
-    def forget(self) -> None:
-        """Start again, since the command will change."""
-        self._kept.clear()
-
-    @property
-    def interval(self) -> float:
-        """Mean interval of the samples [s]; 0: not known."""
-        if len(self._kept) < 2:
-            return 0.0
-        return (self._kept[-1][0] - self._kept[0][0]) / (len(self._kept) - 1)
-
-    @property
-    def newest(self) -> float | None:
-        """The newest measurement [y]; None: none has come."""
-        return self._kept[-1][1] if self._kept else None
-
-    def _recent(self) -> list[tuple[float, float]]:
-        since = time.monotonic() - _WINDOW
-        return [sample for sample in self._kept if sample[0] >= since]
-
-    def before(self) -> list[float]:
-        """Return the measurements of the last seconds, or the last 20 of a slow sensor [y]."""
-        recent = self._recent()
-        if len(recent) < CONSTANT_SAMPLES:
-            recent = list(self._kept)[-CONSTANT_SAMPLES:]
-        return [value for _, value in recent]
-
-    def rest(self) -> RestState | None:
-        """Return how the measurement rested over the last seconds; None: there are too few."""
-        recent = np.array(self._recent())
-        if len(recent) < CONSTANT_SAMPLES:
-            return None
-        return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))
-
-
 @dataclass(frozen=True)
 class Ready:
     """What a tune will do.
@@ -227,46 +183,132 @@ class Ready:
         return f"{plan}, then proportional control holds the process" if self.policy.hold else plan
 
 
-def require_measurement(node: Node, ends: Ends, sensor: Sensor, timeout: float) -> None:
-    """Refuse a start without measurements.
+class Readiness:
+    """Make the checks before a tune of relay_node.
 
-    :param node: the node that would tune.
+    :param node: relay_node.
     :param ends: its topics.
     :param sensor: gives the age of the last measurement.
-    :param timeout: largest age of the last measurement that counts as "arriving" [s].
-    :raises NotReadyError: with the reason, as far as the graph shows it.
+    :param loop: the other nodes of the loop.
+    :param samples: the last measurements.
     """
-    if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
-        raise NotReadyError("use_sim_time is true, but no time has come on /clock")
-    if dead := sensor.why_dead():
-        raise NotReadyError(dead)
-    if (age := sensor.age) > timeout:
-        when = "yet" if math.isinf(age) else f"for {age:.3g} s"
-        why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
-        raise NotReadyError(f"no measurement has come {when}: {why}")
 
+    def __init__(
+        self, node: Node, ends: Ends, sensor: Sensor, loop: LoopEnds, samples: LastSamples
+    ) -> None:
+        self._node, self._ends, self._sensor = node, ends, sensor
+        self._loop, self._samples = loop, samples
 
-def require_actuator(node: Node, ends: Ends) -> None:
-    """Refuse a start without a subscriber to the commands.
+    def of(
+        self,
+        amplitude: float,
+        checks: Checklist,
+        held: float | None,
+        last: tuple[float, Cycle] | None,
+    ) -> Ready | None:
+        """Make the checks, and return what a tune would do; None where one of them failed.
 
-    :param node: the node that would tune.
-    :param ends: its topics.
-    :raises NotReadyError: with the reason, as far as the graph shows it.
-    """
-    # In takeover one of the subscriptions is the node's own.
-    messages, sent = ends.own.messages, ends.own.publisher
-    own = sum(s.topic_name == sent.topic_name for s in node.subscriptions)
-    if sent.get_subscription_count() <= own:
-        why = why_no_subscriber(node, sent.topic_name, messages.type_name)
-        raise NotReadyError(f"no command would arrive: {why}")
-    if unknown := messages.why_unknown:
-        raise NotReadyError(
-            f"the other elements of the command are not known: {unknown}; publish there, or give "
-            f"command_message"
+        :param amplitude: half the distance of the two levels [u]; 0: the parameter.
+        :param checks: get a line each.
+        :param held: the command that the node holds now [u]; None: it has not sent a command.
+        :param last: amplitude of the last tune [u], and its last cycle; None: there is none.
+        :raises RelayAutotuneError: the reason not to start, if the checks stop there.
+        """
+        values = values_of(self._node, TUNE_PARAMETERS)
+        chosen = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
+        if amplitude != 0.0:
+            chosen["amplitude"] = amplitude
+        parameters = ExperimentParameters(**chosen)
+        planned = partial(self._planned, values, parameters, held)
+        ready = checks.do("levels", planned, lambda found: found.plan)
+        measures = partial(self._require_measurement, values["measurement_timeout"])
+        checks.do("measurement", measures, lambda _: self._heard())
+        checks.do("command", self._require_actuator, lambda _: self._served())
+        checks.do(
+            "alone",
+            partial(self._require_alone, values["sample_period"]),
+            lambda _: "no other node commands, measures, or has this name",
         )
+        checks.do(
+            "present",
+            partial(_require_within_limits, parameters, self._samples.newest),
+            lambda _: "the measurement is within its limits",
+        )
+        if checks.stops:
+            return ready
+        _look_at_limits(checks, parameters)
+        _look_at_rest(checks, self._samples)
+        _look_at_recording(checks, values["record_directory"])
+        _look_at_identifier(checks, self._node, self._ends.gains.topic_name)
+        checks.tell("expected", _expected(parameters, last))
+        checks.tell("time", how_long(parameters, self._samples.interval, SETTLING_LIMIT))
+        return ready if checks.refusal is None else None
+
+    def _planned(
+        self, values: Mapping[str, Any], parameters: ExperimentParameters, held: float | None
+    ) -> Ready:
+        """Return what a tune would do; raise the reason where that is not possible."""
+        parameters.validate()
+        moves_setpoint = self._ends.setpoint is not None
+        if moves_setpoint:
+            parameters, baseline = _on_setpoint(parameters)
+        else:
+            baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
+            _require_known_range(parameters, values["baseline"])
+        parameters.validate(baseline)
+        policy = _policy_from(values, connected=self._loop.is_connected)
+        # Who tells where the actuator is, tells of its ends, too.
+        told = moves_setpoint or self._node.count_publishers("command_feedback") > 0
+        from_small = not told and _is_beyond_known(parameters, baseline)
+        return Ready(parameters, baseline, policy, from_small)
+
+    def _require_measurement(self, timeout: float) -> None:
+        """Refuse a start without measurements, with the reason as far as the graph shows it."""
+        node, ends = self._node, self._ends
+        if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
+            raise NotReadyError("use_sim_time is true, but no time has come on /clock")
+        if dead := self._sensor.why_dead():
+            raise NotReadyError(dead)
+        if (age := self._sensor.age) > timeout:
+            when = "yet" if math.isinf(age) else f"for {age:.3g} s"
+            why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
+            raise NotReadyError(f"no measurement has come {when}: {why}")
+
+    def _heard(self) -> str:
+        """Say who measures, and how."""
+        topic, last = self._ends.measurement.topic_name, self._samples
+        rate = f"{1.0 / last.interval:.3g} per second" if last.interval > 0.0 else "rate not known"
+        newest = "" if last.newest is None else f", newest {last.newest:.6g} y"
+        sources = ", ".join(map(described, self._node.get_publishers_info_by_topic(topic)))
+        return f"{topic} from {sources}, {rate}{newest}"
+
+    def _require_actuator(self) -> None:
+        """Refuse a start without a subscriber to the commands, with the reason."""
+        # In takeover one of the subscriptions is the node's own.
+        messages, sent = self._ends.own.messages, self._ends.own.publisher
+        own = sum(s.topic_name == sent.topic_name for s in self._node.subscriptions)
+        if sent.get_subscription_count() <= own:
+            why = why_no_subscriber(self._node, sent.topic_name, messages.type_name)
+            raise NotReadyError(f"no command would arrive: {why}")
+        if unknown := messages.why_unknown:
+            raise NotReadyError(
+                f"the other elements of the command are not known: {unknown}; publish there, or "
+                f"give command_message"
+            )
+
+    def _served(self) -> str:
+        """Say who takes the commands."""
+        own, mine = self._ends.own, self._node.get_fully_qualified_name()
+        there = self._node.get_subscriptions_info_by_topic(own.topic)
+        takers = ", ".join(described(e) for e in there if who(e) != mine)
+        return f"{own.messages.described} on {own.topic} to {takers}"
+
+    def _require_alone(self, sample_period: float) -> None:
+        require_own_time(sample_period, self._sensor.repeat_period, self._loop.repeat_period)
+        self._loop.require_alone()
 
 
-def require_within_limits(parameters: ExperimentParameters, newest: float | None) -> None:
+def _require_within_limits(parameters: ExperimentParameters, newest: float | None) -> None:
     """Refuse a start whose first sample would end the tune.
 
     :param parameters: the experiment's parameters.
@@ -284,7 +326,7 @@ def require_within_limits(parameters: ExperimentParameters, newest: float | None
     )
 
 
-def baseline_from(parameter: float, mean: float, held: float | None) -> float:
+def _baseline_from(parameter: float, mean: float, held: float | None) -> float:
     """Return the command of the operating point.
 
     :param parameter: the parameter ``baseline`` [u]; NaN: not given.
@@ -305,7 +347,7 @@ def baseline_from(parameter: float, mean: float, held: float | None) -> float:
     return held
 
 
-def on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters, float]:
+def _on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters, float]:
     """Return the parameters of a relay on the set-point, and its baseline.
 
     The levels are set-points. So the limits of the measurement apply to them, and a higher level
@@ -327,7 +369,7 @@ def on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters,
     return changed, parameters.setpoint
 
 
-def policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
+def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
     """Return how the process is left at the end of a tune.
 
     :param values: the node's parameters.
@@ -355,7 +397,7 @@ def policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
     return SafePolicy(command=safe, hold=True, gain=gain)
 
 
-def require_known_range(parameters: ExperimentParameters, baseline: float) -> None:
+def _require_known_range(parameters: ExperimentParameters, baseline: float) -> None:
     """Refuse levels far beyond the baseline if no command limit confirms such a range.
 
     A saturated actuator moves less than its command, and a record of two levels need not show it.
@@ -383,7 +425,7 @@ def require_known_range(parameters: ExperimentParameters, baseline: float) -> No
             )
 
 
-def is_beyond_known(parameters: ExperimentParameters, baseline: float) -> bool:
+def _is_beyond_known(parameters: ExperimentParameters, baseline: float) -> bool:
     """Return True if nothing says that the actuator goes as far as the levels.
 
     That is a level on the other side of zero than the baseline, or more than twice as far from it,
@@ -425,7 +467,7 @@ def why_not_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     return ""
 
 
-def look_at_rest(checks: Checklist, samples: LastSamples) -> None:
+def _look_at_rest(checks: Checklist, samples: LastSamples) -> None:
     """Say whether the measurement is at rest.
 
     :param checks: where it is told.
@@ -448,7 +490,7 @@ def look_at_rest(checks: Checklist, samples: LastSamples) -> None:
         )
 
 
-def look_at_limits(checks: Checklist, parameters: ExperimentParameters) -> None:
+def _look_at_limits(checks: Checklist, parameters: ExperimentParameters) -> None:
     """Say which limits of the measurement are missing.
 
     :param checks: where it is told.
@@ -477,7 +519,7 @@ def look_at_limits(checks: Checklist, parameters: ExperimentParameters) -> None:
         )
 
 
-def look_at_recording(checks: Checklist, directory: str) -> None:
+def _look_at_recording(checks: Checklist, directory: str) -> None:
     """Say whether a recording can be written.
 
     :param checks: where it is told.
@@ -495,7 +537,7 @@ def look_at_recording(checks: Checklist, directory: str) -> None:
     checks.tell("recording", found, good=free > _LITTLE, typed=typed)
 
 
-def look_at_identifier(checks: Checklist, node: Node, topic: str) -> None:
+def _look_at_identifier(checks: Checklist, node: Node, topic: str) -> None:
     """Say whether model and gains will come.
 
     :param checks: where it is told.
@@ -516,7 +558,7 @@ def look_at_identifier(checks: Checklist, node: Node, topic: str) -> None:
     )
 
 
-def expected(parameters: ExperimentParameters, last: tuple[float, Cycle] | None) -> str:
+def _expected(parameters: ExperimentParameters, last: tuple[float, Cycle] | None) -> str:
     """Say how far the measurement will swing, by the last tune of the node.
 
     :param parameters: the experiment's parameters.

@@ -23,7 +23,6 @@ from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.narration import how_long
-from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.nodes.ends import Ends
 from relay_autotune.nodes.goals import Narrator
@@ -32,35 +31,21 @@ from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import LoopEnds
 from relay_autotune.nodes.parameters import declare, values_of
-from relay_autotune.nodes.quality import FOLLOW_EVERY, described, who, why_no_publisher
+from relay_autotune.nodes.quality import FOLLOW_EVERY, why_no_publisher
 from relay_autotune.nodes.readiness import (
     Checklist,
-    LastSamples,
     NotReadyError,
+    Readiness,
     Ready,
-    baseline_from,
-    expected,
-    is_beyond_known,
-    look_at_identifier,
-    look_at_limits,
-    look_at_recording,
-    look_at_rest,
-    on_setpoint,
-    policy_from,
-    require_actuator,
-    require_known_range,
-    require_measurement,
-    require_within_limits,
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
 from relay_autotune.nodes.results import MODEL, OwnResults
 from relay_autotune.nodes.session import Session, SetpointSession, reported_by
 from relay_autotune.nodes.signs_of_life import said_by
-from relay_autotune.nodes.silence import Counter, Sensor, losses, require_own_time
+from relay_autotune.nodes.silence import Counter, LastSamples, Sensor, losses
 from relay_autotune.nodes.tune_action import TuneAction
 from relay_autotune.nodes.tune_parameters import (
-    EXPERIMENT_PARAMETERS,
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )
@@ -129,6 +114,7 @@ class RelayNode(ServedNode):
         self._sensor = Sensor(
             self, self._reader, self._counter, repeat=self._on_silence, stop=self._stop_now
         )
+        self._readiness = Readiness(self, self._ends, self._sensor, self._loop, self._last_samples)
         self._hear = self._sensor.hear
         self._topic = self._ends.measurement.topic_name
         if not self._simulated:
@@ -234,7 +220,12 @@ class RelayNode(ServedNode):
         checks = Checklist(self._name, stops=not dry_run)
         answer = StartTune.Response()
         try:
-            ready = self._ready(amplitude, checks)
+            if self._session is not None:
+                raise NotReadyError(
+                    f"tune {self._session.id} is running; wait for its end or call "
+                    f"{self._name}/abort"
+                )
+            ready = self._readiness.of(amplitude, checks, self._held, self._last_cycle)
         except RelayAutotuneError as error:
             self.get_logger().warning(f"start refused: {error}")
             answer.reason = str(error)
@@ -254,86 +245,6 @@ class RelayNode(ServedNode):
         self.get_logger().info(f"tune {answer.experiment_id} started: {reason}")
         answer.reason = f"{reason}; watch {WATCH.format(self._name)}"
         return answer
-
-    def _ready(self, amplitude: float, checks: Checklist) -> Ready | None:
-        """Make the checks before a start; return None where one of them failed."""
-        if self._session is not None:
-            raise NotReadyError(
-                f"tune {self._session.id} is running; wait for its end or call {self._name}/abort"
-            )
-        values = values_of(self, TUNE_PARAMETERS)
-        chosen = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
-        if amplitude != 0.0:
-            chosen["amplitude"] = amplitude
-        parameters = ExperimentParameters(**chosen)
-        ready = checks.do(
-            "levels",
-            partial(self._planned, values, parameters),
-            lambda found: found.plan,
-        )
-        ends, timeout = self._ends, values["measurement_timeout"]
-        checks.do(
-            "measurement",
-            partial(require_measurement, self, ends, self._sensor, timeout),
-            lambda _: self._heard(),
-        )
-        checks.do("command", partial(require_actuator, self, ends), lambda _: self._served())
-        checks.do(
-            "alone",
-            partial(self._require_alone, values["sample_period"]),
-            lambda _: "no other node commands, measures, or has this name",
-        )
-        checks.do(
-            "present",
-            partial(require_within_limits, parameters, self._last_samples.newest),
-            lambda _: "the measurement is within its limits",
-        )
-        if checks.stops:
-            return ready
-        look_at_limits(checks, parameters)
-        look_at_rest(checks, self._last_samples)
-        look_at_recording(checks, values["record_directory"])
-        look_at_identifier(checks, self, self._ends.gains.topic_name)
-        checks.tell("expected", expected(parameters, self._last_cycle))
-        checks.tell("time", how_long(parameters, self._last_samples.interval, SETTLING_LIMIT))
-        return ready if checks.refusal is None else None
-
-    def _planned(self, values: dict[str, Any], parameters: ExperimentParameters) -> Ready:
-        """Return what a tune would do; raise the reason where that is not possible."""
-        parameters.validate()
-        if self._on_setpoint:
-            parameters, baseline = on_setpoint(parameters)
-        else:
-            mean = self._loop.mean_command()
-            baseline = baseline_from(values["baseline"], mean, self._held)
-            require_known_range(parameters, values["baseline"])
-        parameters.validate(baseline)
-        policy = policy_from(values, connected=self._loop.is_connected)
-        return Ready(parameters, baseline, policy, self._from_small(parameters, baseline))
-
-    def _require_alone(self, sample_period: float) -> None:
-        require_own_time(sample_period, self._sensor.repeat_period, self._loop.repeat_period)
-        self._loop.require_alone()
-
-    def _heard(self) -> str:
-        """Say who measures, and how."""
-        topic, last = self._ends.measurement.topic_name, self._last_samples
-        rate = f"{1.0 / last.interval:.3g} per second" if last.interval > 0.0 else "rate not known"
-        newest = "" if last.newest is None else f", newest {last.newest:.6g} y"
-        who = ", ".join(map(described, self.get_publishers_info_by_topic(topic)))
-        return f"{topic} from {who}, {rate}{newest}"
-
-    def _served(self) -> str:
-        """Say who takes the commands."""
-        own = self._ends.own
-        there = self.get_subscriptions_info_by_topic(own.topic)
-        takers = ", ".join(described(e) for e in there if who(e) != self._name)
-        return f"{own.messages.described} on {own.topic} to {takers}"
-
-    def _from_small(self, parameters: ExperimentParameters, baseline: float) -> bool:
-        # Who tells where the actuator is, tells of its ends, too.
-        told = self._on_setpoint or self.count_publishers("command_feedback") > 0
-        return not told and is_beyond_known(parameters, baseline)
 
     def _start(self, ready: Ready) -> tuple[str, str]:
         parameters, policy = ready.parameters, ready.policy

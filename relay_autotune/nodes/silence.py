@@ -1,21 +1,27 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Silence of the measurement: a fault, or a sensor that publishes only on change."""
+"""The measurement as it arrives: its last samples, losses, and silence.
+
+Silence is a fault, or a sensor that publishes only on change.
+"""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.experiment.faults import Repetition
+from relay_autotune.experiment.settling import CONSTANT_SAMPLES, RestState, rest_state
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import Reader
@@ -23,6 +29,8 @@ from relay_autotune.nodes.live_types import Reader
 # Shortest period of a timer, and interval of the graph checks during a tune [s].
 _LEAST_WAIT = 1e-3
 _LOOK_EVERY = 0.2
+# The last samples that are kept, and the time that they may cover [s].
+_KEPT, _WINDOW = 2000, 10.0
 # Rounding of equal times as floats of seconds since 1970 [s].
 _ROUNDING = 1e-6
 
@@ -176,6 +184,51 @@ class Counter:
         count = self._arrivals - self._arrivals_before
         self._arrivals_before = self._arrivals
         return count
+
+
+class LastSamples:
+    """Keep the last measurements with their time of arrival."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+
+    def add(self, value: float) -> None:
+        """Take a measurement [y] that has arrived now."""
+        self._kept.append((time.monotonic(), value))
+
+    def forget(self) -> None:
+        """Start again, since the command will change."""
+        self._kept.clear()
+
+    @property
+    def interval(self) -> float:
+        """Mean interval of the samples [s]; 0: not known."""
+        if len(self._kept) < 2:
+            return 0.0
+        return (self._kept[-1][0] - self._kept[0][0]) / (len(self._kept) - 1)
+
+    @property
+    def newest(self) -> float | None:
+        """The newest measurement [y]; None: none has come."""
+        return self._kept[-1][1] if self._kept else None
+
+    def _recent(self) -> list[tuple[float, float]]:
+        since = time.monotonic() - _WINDOW
+        return [sample for sample in self._kept if sample[0] >= since]
+
+    def before(self) -> list[float]:
+        """Return the measurements of the last seconds, or the last 20 of a slow sensor [y]."""
+        recent = self._recent()
+        if len(recent) < CONSTANT_SAMPLES:
+            recent = list(self._kept)[-CONSTANT_SAMPLES:]
+        return [value for _, value in recent]
+
+    def rest(self) -> RestState | None:
+        """Return how the measurement rested over the last seconds; None: there are too few."""
+        recent = np.array(self._recent())
+        if len(recent) < CONSTANT_SAMPLES:
+            return None
+        return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))
 
 
 def losses(count: int) -> str:
