@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.analysis import Analysis, analyse
 from relay_autotune.bag.reader import read_experiments
-from relay_autotune.cli.new_loop import ros_arguments
-from relay_autotune.cli.own_nodes import OwnNodes
+from relay_autotune.cli.own_nodes import OwnNodes, ros_arguments
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.models import model_fields

@@ -11,18 +11,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import re
 import sys
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.arguments import finite
 from relay_autotune.cli.asking import asked, number_of, pair_of
-from relay_autotune.cli.export import number
 from relay_autotune.cli.layout import broken, width
-from relay_autotune.cli.own_nodes import OwnNodes
+from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.laws import LAWS
@@ -198,27 +195,6 @@ def is_of_joint(options: argparse.Namespace) -> bool:
     return True
 
 
-def own_namespace(options: argparse.Namespace) -> str:
-    """Return the namespace of the nodes: that of the flag, else one of this process alone.
-
-    For a joint it is the same each time, so that the next tune of it puts right what a loss of
-    power has left of a verification.
-    """
-    if options.namespace:
-        return str(options.namespace)
-    if options.joint:
-        return re.sub(r"\W", "_", f"tune_{options.controller}_{options.joint}")
-    return f"tune_loop_{os.getpid()}"
-
-
-def own_node(options: argparse.Namespace, name: str) -> str:
-    """Return the full name of a node of this command.
-
-    :param name: its name in their namespace.
-    """
-    return f"/{own_namespace(options).strip('/')}/{name}"
-
-
 def nodes_for(client: TuneClient, options: argparse.Namespace) -> OwnNodes:
     """Look at the loop, ask for what is not given, and return the nodes to start.
 
@@ -305,26 +281,6 @@ def _choose_field(kind: str, options: argparse.Namespace) -> None:
         print("\n".join(broken(told, width())), file=sys.stderr)
         what = "the number that measures"
         options.field = asked(what, "--field", first, first, lambda text: text or None)
-
-
-def ros_arguments(
-    namespace: str,
-    topics: Mapping[str, str] | None = None,
-    values: Mapping[str, Any] | None = None,
-) -> list[str]:
-    """Return the arguments for ROS of a node.
-
-    :param namespace: of the node; empty: the root.
-    :param topics: the names of its topics.
-    :param values: of its parameters.
-    """
-    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else []
-    for name, topic in (topics or {}).items():
-        arguments += ["-r", f"{name}:={topic}"]
-    for name, value in (values or {}).items():
-        shown = number(value) if isinstance(value, float) else value
-        arguments += ["-p", f"{name}:={shown}"]
-    return arguments
 
 
 def with_flags(check: str) -> str:

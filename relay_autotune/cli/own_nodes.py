@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +16,9 @@ import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
+from relay_autotune.cli.export import number
 from relay_autotune.cli.progress import Working
 from relay_autotune.errors import LoopError
 
@@ -22,6 +26,47 @@ from relay_autotune.errors import LoopError
 _END_WITHIN = 8.0
 # prctl's request that a process gets a signal when its parent ends.
 _PR_SET_PDEATHSIG = 1
+
+
+def own_namespace(options: argparse.Namespace) -> str:
+    """Return the namespace of the nodes: that of the flag, else one of this process alone.
+
+    For a joint it is the same each time, so that the next tune of it puts right what a loss of
+    power has left of a verification.
+    """
+    if options.namespace:
+        return str(options.namespace)
+    if options.joint:
+        return re.sub(r"\W", "_", f"tune_{options.controller}_{options.joint}")
+    return f"tune_loop_{os.getpid()}"
+
+
+def own_node(options: argparse.Namespace, name: str) -> str:
+    """Return the full name of a node of this command.
+
+    :param name: its name in their namespace.
+    """
+    return f"/{own_namespace(options).strip('/')}/{name}"
+
+
+def ros_arguments(
+    namespace: str,
+    topics: Mapping[str, str] | None = None,
+    values: Mapping[str, Any] | None = None,
+) -> list[str]:
+    """Return the arguments for ROS of a node.
+
+    :param namespace: of the node; empty: the root.
+    :param topics: the names of its topics.
+    :param values: of its parameters.
+    """
+    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else []
+    for name, topic in (topics or {}).items():
+        arguments += ["-r", f"{name}:={topic}"]
+    for name, value in (values or {}).items():
+        shown = number(value) if isinstance(value, float) else value
+        arguments += ["-p", f"{name}:={shown}"]
+    return arguments
 
 
 class OwnNodes:

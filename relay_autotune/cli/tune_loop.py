@@ -55,9 +55,9 @@ from relay_autotune.cli.new_loop import (
     is_new_loop,
     is_of_joint,
     nodes_for,
-    own_namespace,
     with_flags,
 )
+from relay_autotune.cli.own_nodes import own_namespace
 from relay_autotune.cli.page import add_web, check_web
 from relay_autotune.cli.progress import Working
 from relay_autotune.cli.tune_view import (

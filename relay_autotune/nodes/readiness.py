@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a tune can start: the checks before it, what each found, and what to type if it failed."""
+"""Whether a tune can start: the checks before it, and what to type if one of them failed."""
 
 from __future__ import annotations
 
