@@ -33,6 +33,7 @@ from relay_autotune.cli.progress import ProgressLine, Stages
 from relay_autotune.cli.replay_bag import Job, analysed
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
+from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.record.record import Record
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 
@@ -257,8 +258,6 @@ def flags_of(values: Mapping[str, Any]) -> str:
     :param values: of its parameters, by name.
     :return: the flags of those that are not the default.
     """
-    from relay_autotune.nodes.identifier_parameters import PARAMETERS
-
     found = []
     for entry in PARAMETERS:
         value = values[entry.name]
@@ -280,22 +279,11 @@ def analysed_as_there(
     :param values: of its parameters, by name.
     :param tell: called with what begins.
     """
-    from relay_autotune.nodes.identifier_parameters import known_from, options_from
-
-    return analyse(
-        record,
-        method=values["method"],
-        rule=values["rule"],
-        known=known_from(values),
-        options=options_from(values),
-        tell=tell,
-    )
+    return analyse(record, **vars(task_from(values)), tell=tell)
 
 
 def defaults() -> dict[str, Any]:
     """Return the default parameters of identifier_node, by name."""
-    from relay_autotune.nodes.identifier_parameters import PARAMETERS
-
     return {entry.name: entry.default for entry in PARAMETERS}
 
 

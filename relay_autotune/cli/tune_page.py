@@ -39,6 +39,7 @@ from relay_autotune.exchange.messages import identification_from_message, record
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Gains
+from relay_autotune.nodes.identifier_parameters import options_from
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.report.case import EstimatedQuantity, case_of, model_case
 from relay_autotune.text import process_text
@@ -308,8 +309,6 @@ class _LoopOnPage:
 
     def _add_subject(self, result: Any) -> None:
         """Show the model of the tune, and let its gains be shaped."""
-        from relay_autotune.nodes.identifier_parameters import options_from
-
         try:
             record = self._client.record(_PATIENCE)
             values = self._client.identifier_values(_PATIENCE) or defaults()

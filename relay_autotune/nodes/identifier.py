@@ -30,7 +30,7 @@ from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.identifier_parameters import PARAMETERS, known_from, options_from
+from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.results import Refusals
@@ -146,14 +146,9 @@ class IdentifierNode(ServedNode):
             return response
         try:
             record = record_from_message(request.experiment)
-            work = partial(
-                analyse,
-                record,
-                method=request.method or values["method"],
-                rule=request.rule or values["rule"],
-                known=known_from(values),
-                options=options_from(values),
-            )
+            values["method"] = request.method or values["method"]
+            values["rule"] = request.rule or values["rule"]
+            work = partial(analyse, record, **vars(task_from(values)))
         except RelayAutotuneError as error:
             response.reason = str(error)
             return response
@@ -276,8 +271,7 @@ class IdentifierNode(ServedNode):
         return None
 
     def _task(self) -> Task:
-        values = values_of(self, PARAMETERS)
-        return Task(values["method"], values["rule"], known_from(values), options_from(values))
+        return task_from(values_of(self, PARAMETERS))
 
     def _publish_model(self, analysis: Analysis, *, final: bool) -> None:
         identification, finding = analysis.model, None if final else analysis.finding
@@ -293,10 +287,8 @@ class IdentifierNode(ServedNode):
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            values = merged(self, PARAMETERS, changes)
-            check_names(values["method"], values["rule"])
-            known_from(values)
-            options_from(values)
+            task = task_from(merged(self, PARAMETERS, changes))
+            check_names(task.method, task.rule)
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

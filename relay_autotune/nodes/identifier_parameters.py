@@ -12,6 +12,7 @@ from typing import Any
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import DEFAULT_METHOD, METHODS
 from relay_autotune.quantities import Quantity, declared
+from relay_autotune.running_fit import Task
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune.tuning.task import DesignOptions
 
@@ -55,3 +56,12 @@ def options_from(values: Mapping[str, Any]) -> DesignOptions:
     :raises TuningError: if a value is out of its range.
     """
     return DesignOptions(**{each.name: values[each.name] for each in DESIGN})
+
+
+def task_from(values: Mapping[str, Any]) -> Task:
+    """Return how a record is to be identified and a controller to be designed.
+
+    :param values: of the parameters, by name.
+    :raises RelayAutotuneError: if a value is out of its range.
+    """
+    return Task(values["method"], values["rule"], known_from(values), options_from(values))
