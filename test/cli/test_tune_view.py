@@ -286,7 +286,7 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
 
 def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_path) -> None:
     only(monkeypatch, "uncertainty")
-    monkeypatch.setattr("relay_autotune.analysis.analyse", lambda record, **_: analysed())
+    monkeypatch.setattr("relay_autotune.cli.report.analyse", lambda record, **_: analysed())
     page = str(tmp_path / "page.html")
     tune = completed()
     tune.gains.kc = analysed().best_gains.kc
