@@ -28,7 +28,7 @@ from relay_autotune.bag.field_path import (
 )
 from relay_autotune.bag.schema import numeric_paths
 from relay_autotune.bag.signals import Selection, Signal
-from relay_autotune.bag.topics import Topics
+from relay_autotune.bag.topics import Topics, split_name
 from relay_autotune.errors import FieldError, SelectionError
 from relay_autotune.text import visible
 
@@ -95,6 +95,75 @@ def role_by_name(name: str) -> str | None:
         if words & set(known.split()) or (role == "set-point" and {"set", "point"} <= words):
             return role
     return None
+
+
+def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[str]]:
+    """Return ``TOPIC[:FIELD]`` of measurement and command, and notes on how they were found.
+
+    :param topics: the bag.
+    :param wanted: the topics, as far as they are named, or the joint that they are of.
+    :raises SelectionError: if the names do not fit, or more than one pair does.
+    """
+    notes: list[str] = []
+    measurement, command = wanted.measurement, wanted.command
+    if wanted.joint:
+        measurement, command, why = named_pair(topics, wanted)
+        flags = " ".join(
+            f"--{role} {shlex.quote(name)}"
+            for role, name in (("measurement", measurement), ("command", command))
+        )
+        notes = [f"using {flags}: {why}"]
+    if measurement is not None and command is not None:
+        names = (
+            _checked(topics, "measurement", measurement),
+            _checked(topics, "command", command),
+        )
+        if names[0] == names[1]:
+            raise SelectionError(
+                f"{names[0]} was named as measurement and as command; expected two topics"
+            )
+        return names, notes
+    role, named = ("command", command) if measurement is None else ("measurement", measurement)
+    given = None if named is None else _checked(topics, role, named)
+    signals = [timed.signal for timed in topics.signals().values()]
+    pairs = plausible_pairs(signals, given)
+    return _only(topics, [p for p in pairs if given in (None, getattr(p, role).name)])
+
+
+def _checked(topics: Topics, role: str, wanted: str) -> str:
+    types = topics.types()
+    topic, part = split_name(wanted)
+    if topic not in types and f"/{topic}" in types:
+        topic = f"/{topic}"
+    if topic not in types:
+        raise SelectionError(
+            f"{topics.path} has no topic {topic!r} for the {role}; it has {topics.listing()}"
+        )
+    return topics.field_of(topic, part)
+
+
+def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[str]]:
+    if len(pairs) == 1:
+        pair = pairs[0]
+        names = f"--measurement {pair.measurement.name} --command {pair.command.name}"
+        return (pair.measurement.name, pair.command.name), [f"using {names}: {pair.reason}"]
+    if pairs:
+        listed = "".join(
+            f"\n  --measurement {pair.measurement.name} --command {pair.command.name}"
+            f"  ({pair.reason})"
+            for pair in pairs
+        )
+        raise SelectionError(
+            f"{topics.path} holds {len(pairs)} pairs of topics that may be measurement and "
+            f"command; choose one:{listed}"
+        )
+    looks = {name: characterise(t.signal).text for name, t in topics.signals().items()}
+    raise SelectionError(
+        f"{topics.path} holds no recorded experiment and no pair of topics that looks like "
+        f"measurement and command; it has {topics.listing(looks)}; name two "
+        f"with --measurement TOPIC[:FIELD] --command TOPIC[:FIELD]"
+        + ("; or name a joint with --joint" if has_joints(topics) else "")
+    )
 
 
 def plausible_pairs(signals: Sequence[Signal], given: str | None = None) -> list[Pair]:

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -182,16 +182,75 @@ def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[st
     return records, [*topics.notes, *notes]
 
 
-def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
-    # Our own recordings need neither the search for a pair nor that for experiments.
-    from relay_autotune.bag.foreign import experiments_of_pair
+# Least number of samples of a record that is split into experiments.
+_FEWEST_SAMPLES = 12
 
-    return experiments_of_pair(topics, wanted)
+# Difference of two topics' lags to the recorder beyond which their clocks differ [ns].
+_CLOCK_DIFFERENCE_NS = 100_000_000
+
+
+def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
+    """Return the experiments in two topics of any program, and notes about them."""
+    # Our own recordings need neither the search for a pair nor that for experiments.
+    from relay_autotune.bag.pairing import pair_of
+
+    names, notes = pair_of(topics, wanted)
+    measured, commanded = topics.signals(names).values()
+    notes = [*notes, *measured.notes, *commanded.notes]
+    signals = [measured.signal, commanded.signal]
+    difference = abs(measured.lag_ns - commanded.lag_ns)
+    if difference > _CLOCK_DIFFERENCE_NS:
+        # The publishers' clocks disagree: both are put on the recorder's.
+        signals = [
+            replace(timed.signal, time_ns=timed.signal.time_ns + timed.lag_ns)
+            for timed in (measured, commanded)
+        ]
+        notes.append(
+            f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
+            f"they are aligned by the recorder's clock"
+        )
+    record = join(signals[0], preceded(signals[1], wanted.command_before))
+    records, found = _taken_apart(record, whole=wanted.is_part)
+    return records, [*notes, *found]
+
+
+def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str]]:
+    """Return the experiments in a record of unknown origin, and notes about them.
+
+    :param record: the record.
+    :param whole: whether it is one experiment, whatever it looks like.
+    :raises BagError: if nothing stands out of the noise.
+    """
+    from relay_autotune.record.excitation import find_experiments
+
+    if whole or len(record) < _FEWEST_SAMPLES:
+        return [record], []
+    stretches = find_experiments(record)
+    if not stretches:
+        if np.ptp(record.measurement) == 0.0 or np.ptp(record.command) == 0.0:
+            # The identification then tells why nothing can be learned from it.
+            return [record], []
+        raise BagError(
+            "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
+            "a controller's command only follows the noise of the measurement, which would give "
+            "a wrong model; record an experiment, or name a part to be used all the same with "
+            "--start and --end"
+        )
+    records = [record.part(stretch.first, stretch.last + 1) for stretch in stretches]
+    if len(stretches) == 1 and len(records[0]) == len(record):
+        return records, []
+    begins = record.time[[stretch.first for stretch in stretches]]
+    ends = record.time[[stretch.last for stretch in stretches]]
+    return records, [
+        f"experiment {number} of {len(records)}, {begin:g} s to {end:g} s: {stretch.reason}"
+        for number, (begin, end, stretch) in enumerate(
+            zip(begins, ends, stretches, strict=True), start=1
+        )
+    ]
 
 
 def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
     from relay_autotune.bag.csv_file import read_csv
-    from relay_autotune.bag.foreign import take_apart
 
     records: list[Record] = []
     notes: list[str] = []
@@ -201,7 +260,7 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
         try:
             command = preceded(log.command, wanted.command_before)
             record = join(log.measurement, command, dated=log.dated)
-            found, said = take_apart(record, whole=wanted.is_part)
+            found, said = _taken_apart(record, whole=wanted.is_part)
         except BagError as fault:
             faults.append(fault)
             continue
