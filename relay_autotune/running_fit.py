@@ -21,12 +21,12 @@ _CHOSEN_ANEW = 1.1
 
 @dataclass(frozen=True)
 class Task:
-    """Settings of the fits.
+    """How to identify a record and to design a controller for it.
 
     :param method: the method of the selected model.
-    :param rule: the rule of the gains for the predicted Ms.
+    :param rule: the rule whose gains count.
     :param known: known values of the process.
-    :param options: design options of the controller.
+    :param options: design options of the controller; None: the defaults.
     """
 
     method: str = DEFAULT_METHOD

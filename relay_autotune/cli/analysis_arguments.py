@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 
 from relay_autotune.analysis import check_names
@@ -21,6 +22,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
+from relay_autotune.running_fit import Task
 from relay_autotune.text import visible
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
 
@@ -141,7 +143,7 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
         help="take all experiments as tests of one process, with one model",
     )  # fmt: skip
     taken.add_argument(
-        "--max-chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
+        "--max-chunk", dest="largest_chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
         help="leave out chunks that declare more than SIZE, such as 64M or 2G "
         f"({LARGEST_CHUNK >> 20}M)",
     )  # fmt: skip
@@ -186,7 +188,7 @@ def jobs_of(
     try:
         check_names(options.method, options.rule)
         known = Known(**given_quantities(options, declared(Known)))
-        asked = design_options(options)
+        task = Task(options.method, options.rule, known, design_options(options))
     except RelayAutotuneError as error:
         raise SelectionError(str(error)) from error
     start, end = options.start, options.end
@@ -200,32 +202,17 @@ def jobs_of(
     )
     _check_joints(joints, order)
     jointly = options.jointly or options.method in ONLY_JOINT
+    taken = {each.name: getattr(options, each.name) for each in fields(Selection)}
     names = list(dict.fromkeys(recordings))
     groups = [tuple(names)] if jointly or options.join else [(name,) for name in names]
     return [
         Job(
             name=visible(", ".join(group) + (f" {joint}" if joint else "")),
             paths=group,
-            selection=Selection(
-                options.measurement,
-                options.command,
-                options.time,
-                start,
-                end,
-                options.clock,
-                options.max_chunk,
-                joint,
-                order,
-                options.time_unit,
-                options.period,
-                options.command_before,
-            ),
-            method=options.method,
-            rule=options.rule,
-            known=known,
+            selection=Selection(**taken | {"joint": joint, "joint_order": order}),
+            task=task,
             jointly=jointly,
             table_width=table_width,
-            options=asked,
         )
         for group in groups
         for joint in joints

@@ -16,10 +16,9 @@ from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
 from relay_autotune.cli.export import Target, exported
 from relay_autotune.cli.table import table
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
-from relay_autotune.identification.known import Known
 from relay_autotune.record.record import Record
+from relay_autotune.running_fit import Task
 from relay_autotune.text import visible
-from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
 
 Progress = Callable[[int, int], None]
@@ -33,12 +32,9 @@ class Job:
     :param name: how results call it.
     :param paths: the recordings; several are one timeline, or tests of one process.
     :param selection: what of them is wanted.
-    :param method: whose model counts.
-    :param rule: whose gains count.
-    :param known: what is known of the process.
+    :param task: how to identify, and what is asked of the controller.
     :param jointly: whether the experiments of all recordings give one model.
     :param table_width: columns of the table for people; None: the document is wanted instead.
-    :param options: what is asked of the controller; None: the defaults.
     :param export: the kind of file that is wanted instead, and where its gains go; None: none.
     :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
     """
@@ -46,12 +42,9 @@ class Job:
     name: str
     paths: tuple[str, ...]
     selection: Selection
-    method: str
-    rule: str
-    known: Known
+    task: Task
     jointly: bool = False
     table_width: int | None = None
-    options: DesignOptions | None = None
     export: tuple[str, Target] | None = None
     accept_doubtful: bool = False
 
@@ -141,23 +134,10 @@ def analysed(
             recording = read_experiments(path, job.selection, progress)
             said += [f"{path}: {note}" for note in recording.notes]
             records += recording.experiments
-        found = analyse_jointly(
-            records, method=job.method, rule=job.rule, known=job.known, options=job.options
-        )
-        return (found,)
+        return (analyse_jointly(records, **vars(job.task)),)
     recording = read_experiments(job.paths, job.selection, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
-    return tuple(
-        analyse(
-            record,
-            method=job.method,
-            rule=job.rule,
-            known=job.known,
-            options=job.options,
-            tell=tell,
-        )
-        for record in recording.experiments
-    )
+    return tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
 
 
 def _exported(

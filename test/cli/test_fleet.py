@@ -27,7 +27,7 @@ from relay_autotune.cli.fleet import in_processes, on_cluster
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.cli.results import COLUMNS, ResultsFile, rows
 from relay_autotune.errors import BagError
-from relay_autotune.identification.known import Known
+from relay_autotune.running_fit import Task
 
 STEP = REPOSITORY / "bags" / "step_test"
 # A method that finds nothing in a step test leaves the time to what is tested here.
@@ -42,8 +42,7 @@ def run(capsys, *arguments):
 
 def jobs(count, folder=None):
     return [
-        Job(f"bag{k}", (str(folder),), Selection(), "waveform", "imc", Known())
-        for k in range(count)
+        Job(f"bag{k}", (str(folder),), Selection(), Task("waveform", "imc")) for k in range(count)
     ]
 
 

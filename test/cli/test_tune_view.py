@@ -34,6 +34,7 @@ from relay_autotune.cli.tune_view import (
 )
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.identifier_parameters import known_from, options_from
+from relay_autotune.running_fit import Task
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
@@ -279,9 +280,7 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
     parser = ArgumentParser()
     add_analysis(parser)
     (job,) = jobs_of(parser.parse_args(shlex.split(flags_of(values))), ["bag"])
-    assert (job.method, job.rule) == ("chang", "imc")
-    assert job.known == known_from(values)
-    assert job.options == options_from(values)
+    assert job.task == Task("chang", "imc", known_from(values), options_from(values))
 
 
 def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_path) -> None:
