@@ -31,8 +31,12 @@ _FEWEST_CHANGES = 20
 _BREAK_S = 60.0
 _BREAK_INTERVALS = 1000.0
 
-# Number of equal samples at an end of the measurement's range that means saturation.
+# Number of equal samples at an end of the measurement's range that means saturation, if the
+# measurement was a share of its range away within twice the time in which it crossed another
+# share fastest. Before a rest it has slowed down.
 _SATURATED = 20
+_AWAY, _CROSSED = 0.04, 0.2
+_MOST_FOR_SPEED = 2000
 
 # The measurement moves if it leaves its rest by this many standard deviations of its noise, and by
 # a share of its range.
@@ -92,17 +96,27 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
 
 
 def _saturated(y: FloatArray) -> np.ndarray:
-    """Return which samples are constant at an end of the measurement's range."""
+    """Return which samples are constant at an end of the measurement's range, but not at rest.
+
+    A sensor or a process at its end stops the measurement in mid-movement. One at rest, as an
+    encoder at standstill, has slowed down before, or has not moved yet.
+    """
     low, high = float(np.min(y)), float(np.max(y))
     still = np.zeros(y.size, dtype=np.bool_)
     equal = np.diff(y) == 0.0
     if low == high or float(np.mean(equal)) > 0.5:
         # A coarsely quantised measurement, or one without noise at rest, is often constant.
         return still
+    step = max(y.size // _MOST_FOR_SPEED, 1)
+    few, coarse = 1, y[::step]
+    while np.max(np.abs(coarse[few:] - coarse[:-few])) < _CROSSED * (high - low):
+        few += 1
+    few *= step
     for end in (low, high):
         edges = np.flatnonzero(np.diff(np.concatenate(([0], (y == end).astype(np.int8), [0]))))
         for begin, stop in zip(edges[::2], edges[1::2], strict=True):
-            if stop - begin >= _SATURATED:
+            away = np.abs(y[max(begin - 2 * few, 0) : begin] - end)
+            if stop - begin >= _SATURATED and np.any(away > _AWAY * (high - low)):
                 still[begin:stop] = True
     return still
 

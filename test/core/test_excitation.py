@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -159,6 +160,18 @@ def test_a_saturated_stretch_is_left_out():
     for _, begin, end in spans(clipped):
         inside = (record.time >= begin) & (record.time <= end)
         assert np.count_nonzero(clipped.measurement[inside] == 51.2) < 20
+
+
+@pytest.mark.parametrize("tau", [0.1, 0.5])
+def test_a_motor_at_standstill_is_no_saturated_sensor(tau):
+    # An encoder shows 0 before the step, for some samples after it, and after the motor stopped.
+    time = np.arange(0.0, 6.0, 0.02)
+    u = PiecewiseConstant(np.array([1.0, 3.0]), np.array([0.5, 0.0]), 0.0)
+    speed = response(TransferFunction.fopdt(400.0, tau, 0.04), time, u)
+    record = Record(time=time, measurement=np.round(speed / 2.0) * 2.0 + 0.0, command=u(time))
+    record = replace(record, measurement=record.measurement + (speed > 1.0) * 1e-3 * time)
+    (found,) = find_experiments(record)
+    assert (found.first, found.last) == (0, time.size - 1)
 
 
 def test_all_of_a_short_test_is_one_experiment():

@@ -33,8 +33,8 @@ _SHARES = (0.25, 0.5, 0.75)
 # Relative difference up to which curves count as the same.
 _ALIKE = 1e-6
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
-# Least range of the levels on one side, as a share of the command's range.
-_OWN = 0.2
+# Least range of the command on one side but for few samples [%], as a share of the whole range.
+_BUT_FEW, _OWN = (1.0, 99.0), 0.2
 # Largest share left unexplained at the same instant, relative to that left one sample away.
 _AT_ONCE = 0.5
 
@@ -112,11 +112,14 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
         cycle_start=(),
     )
     inner = levels[0] + np.array(_SHARES) * np.ptp(levels)
+    held = u(record.time)
     found = []
     for level in (*inner, u.initial):
         if not levels[0] < level < levels[-1]:
             continue
-        own = max(float(np.ptp(levels[side])) for side in (levels >= level, levels <= level))
+        # A level of a single sample is no move.
+        sides = [held[side] for side in (held >= level, held <= level) if np.any(side)]
+        own = max(float(np.ptp(np.percentile(side, _BUT_FEW))) for side in sides)
         if own < _OWN * float(np.ptp(levels)):
             # Where no side has moves of its own, each part is the other one scaled and shifted.
             continue

@@ -358,7 +358,6 @@ MODEL_CHECKS = (
         "they act the other way there",
         unit="",
         doubtful=0.6,
-        failed=1.0,
         sentence="commands on one side of {detail} lose {value} of the effect that those on the "
         "other side have",
         remedy="keep the command where the actuator is not at its end, and give its ends as "

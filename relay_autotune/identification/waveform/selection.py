@@ -79,12 +79,9 @@ _BEYOND_HOPE = 4.0
 _NO_PROMISE = 6.0
 _CLEAN = 1e-6
 # Order in which structures are fitted: first those that show which others are hopeless.
-_TRIED = tuple(
-    s.name
-    for s in (
-        *(FOPDT, LAG_N, SOPDT, THREE_LAGS, TWO_EQUAL_ONE, LAG_N_ZERO, SOPDT_ZERO),
-        *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
-    )
+_TRIED = (
+    *(FOPDT, LAG_N, SOPDT, THREE_LAGS, TWO_EQUAL_ONE, LAG_N_ZERO, SOPDT_ZERO),
+    *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
 )
 _SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
 # Structures that are fitted to the end, whatever residual they leave.
@@ -356,7 +353,9 @@ def _sorted(ground: Ground, ready: Sequence[Candidate]) -> list[Candidate]:
     Where even the best residual is correlated, by jitter or by what no structure explains, each
     sample counts less.
     """
-    found = sorted(ground.fit(_TRIED, ready=ready), key=lambda c: c.criterion)
+    # What runs away by itself is not recorded, except where a relay held it.
+    names = [s.name for s in _TRIED if ground.sign or not s.unstable]
+    found = sorted(ground.fit(names, ready=ready), key=lambda c: c.criterion)
     if not found or found[0].state.cost <= ground.floor:
         return found
     n = found[0].problem.time.size
