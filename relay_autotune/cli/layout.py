@@ -91,7 +91,8 @@ def labelled(
     :param columns: that a line may have.
     :param indent: column at which the text begins.
     """
-    head = f"{_INDENT}{label}"
+    # A label that fills its column still has a space after it.
+    head = f"{_INDENT}{label} "
     parts = broken(text, max(columns - indent, NARROWEST // 2))
     return [f"{head if i == 0 else '':<{indent}}{part}".rstrip() for i, part in enumerate(parts)]
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
@@ -26,6 +27,7 @@ _STEPS = (1e-7, 1e-2)
 _SHARE = 1e-3
 # Largest change of a logarithm in a model that is drawn.
 _FARTHEST_DRAWN = 20.0
+_MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,9 @@ class Estimate:
 
         return deviation(gain_changes), deviation(frequency_changes)
 
-    def draws(self, count: int, rng: np.random.Generator) -> Iterator[TransferFunction]:
+    def draws(
+        self, count: int, rng: np.random.Generator, sure: NDArray[np.bool_] | None = None
+    ) -> Iterator[TransferFunction]:
         """Draw models from the uncertainty.
 
         Correlations are kept, which matters: a gain and a time constant that are each uncertain
@@ -234,14 +238,24 @@ class Estimate:
 
         :param count: models to draw.
         :param rng: the source.
+        :param sure: which values have a known sign, shape (p,), for which a draw of the other
+            sign is drawn again; None: no more than what the structure says.
         """
-        changes = rng.multivariate_normal(
-            np.zeros(self.values.size),
-            self._spread,
-            count,
-            # Undetermined parameters have variances so large that their rounding is not small.
-            check_valid="ignore",
-            method="eigh",
-        )
-        for change in changes:
-            yield self.structure.build(self._moved(change, _FARTHEST_DRAWN))
+        sure = np.zeros(self.values.size, dtype=np.bool_) if sure is None else sure
+        drawn = 0
+        # Where most draws have the other sign, the covariance says nothing of the sign.
+        for _ in range(_MOST_ROUNDS):
+            changes = rng.multivariate_normal(
+                np.zeros(self.values.size),
+                self._spread,
+                count,
+                # Undetermined parameters have variances so large that their rounding is not small.
+                check_valid="ignore",
+                method="eigh",
+            )
+            moved = [self._moved(change, _FARTHEST_DRAWN) for change in changes]
+            kept = [v for v in moved if np.all((v * self.values)[sure] > 0.0)][: count - drawn]
+            drawn += len(kept)
+            yield from map(self.structure.build, kept)
+            if drawn == count:
+                return

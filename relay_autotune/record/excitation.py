@@ -324,14 +324,22 @@ def _steps(
 # --- a command that a controller changes all the time
 
 
+def _span(y: FloatArray) -> float:
+    """Return the range of a measurement without single outliers [y]."""
+    if y.size < 3:
+        return float(np.ptp(y))
+    return float(np.ptp(np.median(np.lib.stride_tricks.sliding_window_view(y, 3), axis=1)))
+
+
 def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, float, str, str]]:
     """Return the parts in which the set-point or a load moved the measurement."""
     time, y = record.time[first : last + 1], record.measurement[first : last + 1]
     edges = np.unique(np.linspace(0, y.size, min(_BLOCKS, max(y.size // 5, 1)) + 1).astype(int))
     means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
     noise = roughness(y)
-    reach = max(_NOISE * noise, _SHARE * float(np.ptp(y)))
-    if float(np.ptp(y)) < 2.5 * reach:
+    span = _span(y)
+    reach = max(_NOISE * noise, _SHARE * span)
+    if span < 2.5 * reach:
         return []
     window = 5
     padded = np.pad(means, window // 2, mode="edge")

@@ -59,7 +59,9 @@ def ensemble(
         if part.process_sign == identification.model.process_sign
     ]
     others = (*rivals, *parts)
-    return (*identification.estimate.draws(count - len(others), rng), *others)
+    # To first order a zero that is poorly known may lie on the other side, against its interval.
+    sure = np.sign(identification.ci95_low) * np.sign(identification.ci95_high) > 0.0
+    return (*identification.estimate.draws(count - len(others), rng, sure), *others)
 
 
 @dataclass(frozen=True)

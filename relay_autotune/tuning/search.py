@@ -502,6 +502,8 @@ class Search:
         tf = self._filters(kp, td)
         usable = np.isfinite(tf)
         ki = np.full(kp.size, -math.inf)
+        if not usable.any():
+            return Candidates(kp, ki, td, tf)
         share = np.exp(points[usable, -1])
         upper, lower = self._limits(
             bounds, kp[usable], td[usable], tf[usable], 1.0 / (share * iae)

@@ -14,6 +14,7 @@ import pytest
 from analysed import completed
 
 from relay_autotune.cli import arguments, layout, tune
+from relay_autotune.cli.layout import labelled
 from relay_autotune.cli.table import table
 
 COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag", "tune_loop", "apply_gains")
@@ -73,3 +74,8 @@ def test_quantities_on_a_line_stay_with_their_units():
     text = "kc 0.6488 u/y   ti 14.99 s   td 4.140 s   tf 0.4140 s"
     assert layout.broken(text, 99) == [text]
     assert layout.broken(text, 30) == ["kc 0.6488 u/y   ti 14.99 s", "td 4.140 s   tf 0.4140 s"]
+
+
+def test_a_label_that_fills_its_column_has_a_space_after_it():
+    for label in ("gain", "experiment 1 of 12"):
+        assert labelled(label, "2.067e+04 s", 80)[0].split(label)[1].startswith(" ")

@@ -15,15 +15,16 @@ from scipy.signal import lfilter
 
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.identification.waveform.colour import colour_of, slow_colour
-from relay_autotune.identification.waveform.coloured import in_colour
+from relay_autotune.identification.waveform.coloured import _simulates, in_colour
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.selection import (
     Ground,
     fit_all,
+    fit_one,
     nuisances_of,
     support,
 )
-from relay_autotune.identification.waveform.separable import problem_of
+from relay_autotune.identification.waveform.separable import evaluate, problem_of
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
@@ -260,3 +261,19 @@ def test_where_no_structure_fits_in_any_colour_the_noise_counts_as_white():
     time = PERIOD * np.arange(count)
     found = identify_waveform(Record(time=time, measurement=walk, command=command))
     assert np.all(np.isfinite(found.values))
+
+
+def test_a_model_whose_response_the_colour_explains_does_not_simulate():
+    time = PERIOD * np.arange(600)
+    u = PiecewiseConstant(np.array([6.0, 30.0]), np.array([1.0, 0.3]), 0.0)
+    noise = 0.02 * np.random.default_rng(3).standard_normal(time.size)
+    problem = problem_of([(time, response(PROCESS, time, u) + noise, u)], FOPDT)
+    ground = Ground.of(problem, 0.0, 1)
+    right = fit_one(ground, "fopdt")
+    assert right is not None
+    bent = replace(
+        right, state=evaluate(problem, right.state.theta + np.array((math.log(3.0), 0.0)))
+    )
+    assert _simulates([right], [right])
+    assert not _simulates([bent], [right])
+    assert not _simulates([], [right])

@@ -174,6 +174,18 @@ def test_a_motor_at_standstill_is_no_saturated_sensor(tau):
     assert (found.first, found.last) == (0, time.size - 1)
 
 
+def test_one_sample_far_out_hides_no_closed_loop():
+    time = np.arange(0.0, 600.0, 0.5)
+    rng = np.random.default_rng(6)
+    levels = 1.0 + np.sin(0.05 * time) + 0.01 * rng.standard_normal(time.size)
+    u = PiecewiseConstant(time, levels, 1.0)
+    y = response(MODEL, time, u) + rng.normal(0.0, 0.01, time.size)
+    record = Record(time=time, measurement=y, command=u(time), held_input=u)
+    spiked = replace(record, measurement=np.where(time == 300.0, 100.0, y))
+    assert find_experiments(spiked)[0].kind == "closed loop"
+    assert spans(spiked) == spans(record)
+
+
 def test_all_of_a_short_test_is_one_experiment():
     record = commanded([20.0, 75.0], [0, 1, 0.5], time=np.arange(0.0, 120.0, 0.1))
     (found,) = find_experiments(record)

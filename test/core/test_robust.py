@@ -18,7 +18,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.robust import robust
-from relay_autotune.tuning.search import Search
+from relay_autotune.tuning.search import NoiseLimit, Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 DESIGNS = cases("design.")
@@ -207,3 +207,10 @@ def test_gains_carry_what_the_user_must_know():
     assert gains.warnings == ()
     # The noise of a controller whose sampling period is not known cannot be told.
     assert gains.noise_gain >= gains.kc
+
+
+def test_gains_that_no_filter_makes_quiet_enough_are_no_candidates():
+    process = TransferFunction.fopdt(1.0, 10.0, 1.0)
+    search = Search(process, (), 10.0, NoiseLimit(1e-6, 1.0))
+    found = search._at(Bounds(1.4, 1.4), np.zeros((3, 2)))
+    assert np.all(np.isinf(found.tf)) and np.all(found.ki == -math.inf)

@@ -6,14 +6,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import identified
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.structures import SOPDT_ZERO
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import Controller, analyse_loop, ensemble, is_stable, tune
@@ -83,6 +87,19 @@ def test_the_ensemble_has_the_spread_of_the_uncertainty():
     assert np.std(np.log(gains)) == pytest.approx(found.std[0] / found.values[0], rel=0.1)
     again = ensemble(found, 2000, rng=np.random.default_rng(1))
     assert models == again
+
+
+def test_no_model_is_drawn_with_a_zero_on_the_side_that_its_interval_excludes():
+    values = np.array([2.0, 10.0, 3.0, 4.0, 0.5])
+    std = np.array([0.1, 0.5, 0.2, 3.0, 0.1])
+    found = identified("waveform", Estimate.of(SOPDT_ZERO, values, np.diag(std**2)))
+    low = np.where(values == 4.0, 1.0, found.ci95_low)
+    either, one = (
+        [m.zeros[0].real for m in ensemble(f, rng=np.random.default_rng(0))]
+        for f in (found, replace(found, ci95_low=low))
+    )
+    assert min(either) < 0.0 < min(one)
+    assert len(one) == len(either) == 100
 
 
 @pytest.mark.long

@@ -32,7 +32,7 @@ from relay_autotune.identification.waveform.selection import (
     nuisances_of,
     of_shown_direction,
 )
-from relay_autotune.identification.waveform.separable import Problem, Trial, refine
+from relay_autotune.identification.waveform.separable import Problem, Trial, left_of, refine
 from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
 from relay_autotune.identification.waveform.theta import unit_steps
 
@@ -67,6 +67,9 @@ _EARNED = 10.0
 _LASTING = 2.0
 # Largest standard deviation of a parameter that the samples determine, relative to its size.
 _TOLD = 1.0
+# Largest share of the sum of squares that a simulation leaves which explains the record, and how
+# many times as much a model in colour may leave.
+_EXPLAINS, _WORSE = 0.05, 9.0
 # Probability as white noise, and worth of a sample, below which one flexible structure's residual
 # is clearly coloured.
 _CLEAR = 1e-12
@@ -222,7 +225,7 @@ def _compared(
     once = _in_its_own(simulated, asked)
     slow = slow_colour(1.0 - _SLOWEST / problem.time.size)
     ends = [_converged(once, asked), _converged(_in(slow, simulated, asked), asked)]
-    chosen = min(ends, key=_joint)
+    chosen = min((e for e in ends if _simulates(e, simulated)), key=_joint, default=once)
     return _ordered(chosen if sign or names else of_shown_direction(chosen))
 
 
@@ -308,6 +311,35 @@ def _earned(candidate: Candidate, length: float) -> Candidate:
     if model.is_stable and all(abs(t) <= _LASTING * length for t in model.time_constants):
         return candidate
     return replace(candidate, criterion=candidate.criterion + _EARNED)
+
+
+def _simulates(found: list[Candidate], simulated: list[Candidate]) -> bool:
+    """Return whether a model simulates the record about as well as the best simulation does.
+
+    A colour near a random walk lets the noise explain the whole response but its quick changes.
+
+    :param found: fitted in a colour, the best first.
+    :param simulated: fitted to the measurement itself.
+    """
+    if not found:
+        return False
+    problem = replace(found[0].problem, colour=None)
+    own, y = len(problem.structure.powers), problem.seen(problem.y)
+    columns = problem.seen(problem.columns(found[0].state.theta)[0])
+    beside = columns[own:]
+    left = left_of(y - found[0].state.coefficients[:own] @ columns[:own], beside)
+    best = min(_left_by(c) for c in simulated)
+    total = left_of(y, beside)
+    explained = best <= _EXPLAINS * float(total @ total)
+    return not explained or float(left @ left) <= _WORSE * best
+
+
+def _left_by(candidate: Candidate) -> float:
+    """Return the sum of squares that a simulation leaves of its problem's samples."""
+    problem = candidate.problem
+    columns = problem.seen(problem.columns(candidate.state.theta)[0])
+    left = left_of(problem.seen(problem.y), columns)
+    return float(left @ left)
 
 
 def _ordered(found: list[Candidate]) -> list[Candidate]:
