@@ -67,9 +67,9 @@ _EARNED = 10.0
 _LASTING = 2.0
 # Largest standard deviation of a parameter that the samples determine, relative to its size.
 _TOLD = 1.0
-# Largest share of the sum of squares that a simulation leaves which explains the record, and how
-# many times as much a model in colour may leave.
-_EXPLAINS, _WORSE = 0.05, 9.0
+# Share of the sum of squares that a model in colour may always leave, and how many times that of
+# the best simulation it may leave.
+_EXPLAINS, _WORSE = 0.05, 25.0
 # Probability as white noise, and worth of a sample, below which one flexible structure's residual
 # is clearly coloured.
 _CLEAR = 1e-12
@@ -328,10 +328,9 @@ def _simulates(found: list[Candidate], simulated: list[Candidate]) -> bool:
     columns = problem.seen(problem.columns(found[0].state.theta)[0])
     beside = columns[own:]
     left = left_of(y - found[0].state.coefficients[:own] @ columns[:own], beside)
-    best = min(_left_by(c) for c in simulated)
     total = left_of(y, beside)
-    explained = best <= _EXPLAINS * float(total @ total)
-    return not explained or float(left @ left) <= _WORSE * best
+    most = max(_EXPLAINS * float(total @ total), _WORSE * min(_left_by(c) for c in simulated))
+    return float(left @ left) <= most
 
 
 def _left_by(candidate: Candidate) -> float:
