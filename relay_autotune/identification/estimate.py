@@ -27,7 +27,6 @@ _STEPS = (1e-7, 1e-2)
 _SHARE = 1e-3
 # Largest change of a logarithm in a model that is drawn.
 _FARTHEST_DRAWN = 20.0
-_MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -129,15 +128,15 @@ class Estimate:
         cut = ~logarithmic & np.isfinite(low)
         return np.where(cut, np.maximum(low, least), low), high
 
-    @cached_property
-    def _spread(self) -> FloatArray:
-        """Covariance of the values, or of logarithms of those that cannot change sign, (p, p)."""
-        size = np.where(self.structure.logarithmic, self.values, 1.0)
+    def _spread(self, logarithmic: NDArray[np.bool_]) -> FloatArray:
+        """Return the covariance of the values, or of the logarithms of some, shape (p, p)."""
+        size = np.where(logarithmic, self.values, 1.0)
         return np.asarray(self.covariance / np.outer(size, size))
 
-    def _moved(self, change: FloatArray, farthest: float) -> FloatArray:
-        """Return the values after a change, of logarithms where a value cannot change sign."""
-        logarithmic = self.structure.logarithmic
+    def _moved(
+        self, change: FloatArray, farthest: float, logarithmic: NDArray[np.bool_]
+    ) -> FloatArray:
+        """Return the values after a change, of the logarithms of some."""
         with np.errstate(over="ignore"):
             factors = np.exp(np.clip(change, -farthest, farthest))
         moved = np.where(logarithmic, self.values * factors, self.values + change)
@@ -162,11 +161,14 @@ class Estimate:
         value = float(function(self.model))
         if not math.isfinite(value) or not self.known:
             return Uncertain(value)
-        spread, structure = self._spread, self.structure
+        structure = self.structure
+        spread = self._spread(structure.logarithmic)
 
         def at(change: FloatArray) -> float:
             try:
-                return float(function(structure.build(self._moved(change, _FAR))))
+                return float(
+                    function(structure.build(self._moved(change, _FAR, structure.logarithmic)))
+                )
             except (ModelError, OverflowError):
                 return math.nan
 
@@ -229,7 +231,7 @@ class Estimate:
         return deviation(gain_changes), deviation(frequency_changes)
 
     def draws(
-        self, count: int, rng: np.random.Generator, sure: NDArray[np.bool_] | None = None
+        self, count: int, rng: np.random.Generator, logarithmic: NDArray[np.bool_] | None = None
     ) -> Iterator[TransferFunction]:
         """Draw models from the uncertainty.
 
@@ -238,24 +240,18 @@ class Estimate:
 
         :param count: models to draw.
         :param rng: the source.
-        :param sure: which values have a known sign, shape (p,), for which a draw of the other
-            sign is drawn again; None: no more than what the structure says.
+        :param logarithmic: which values are drawn by their logarithms, shape (p,); None: those
+            that cannot change sign.
         """
-        sure = np.zeros(self.values.size, dtype=np.bool_) if sure is None else sure
-        drawn = 0
-        # Where most draws have the other sign, the covariance says nothing of the sign.
-        for _ in range(_MOST_ROUNDS):
-            changes = rng.multivariate_normal(
-                np.zeros(self.values.size),
-                self._spread,
-                count,
-                # Undetermined parameters have variances so large that their rounding is not small.
-                check_valid="ignore",
-                method="eigh",
-            )
-            moved = [self._moved(change, _FARTHEST_DRAWN) for change in changes]
-            kept = [v for v in moved if np.all((v * self.values)[sure] > 0.0)][: count - drawn]
-            drawn += len(kept)
-            yield from map(self.structure.build, kept)
-            if drawn == count:
-                return
+        if logarithmic is None:
+            logarithmic = self.structure.logarithmic
+        changes = rng.multivariate_normal(
+            np.zeros(self.values.size),
+            self._spread(logarithmic),
+            count,
+            # Undetermined parameters have variances so large that their rounding is not small.
+            check_valid="ignore",
+            method="eigh",
+        )
+        for change in changes:
+            yield self.structure.build(self._moved(change, _FARTHEST_DRAWN, logarithmic))

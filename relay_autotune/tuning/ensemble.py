@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.margins import frequencies
@@ -30,6 +31,8 @@ from relay_autotune.tuning.task import DesignTask
 _MODELS = 100
 # One model in this number is one of another structure on which the gains have to hold.
 _PART = 10
+# Correlation from which two values count as coupled.
+_COUPLED = 0.9
 
 
 def ensemble(
@@ -59,9 +62,28 @@ def ensemble(
         if part.process_sign == identification.model.process_sign
     ]
     others = (*rivals, *parts)
-    # To first order a zero that is poorly known may lie on the other side, against its interval.
+    estimate = identification.estimate
     sure = np.sign(identification.ci95_low) * np.sign(identification.ci95_high) > 0.0
-    return (*identification.estimate.draws(count - len(others), rng, sure), *others)
+    zeros = np.isinf(estimate.structure.least) & ~estimate.structure.logarithmic
+    logarithmic = estimate.structure.logarithmic | (zeros & (sure | _coupled(estimate)))
+    return (*estimate.draws(count - len(others), rng, logarithmic), *others)
+
+
+def _coupled(estimate: Estimate) -> NDArray[np.bool_]:
+    """Return which values have a product with a gain or a lag that is known better, shape (p,).
+
+    Of a slow lag with a zero the data show the ratio. To first order the zero would lie on the
+    other side in many draws, with a fast response that the data exclude.
+    """
+    std = estimate.std
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.abs(estimate.covariance / np.outer(std, std))
+    others = estimate.structure.logarithmic & (std > 0.0)
+    if not others.any():
+        return np.zeros(std.size, dtype=np.bool_)
+    return np.asarray(
+        (correlation[:, others].max(axis=1) > _COUPLED) & (np.abs(estimate.values) > std)
+    )
 
 
 @dataclass(frozen=True)

@@ -89,17 +89,24 @@ def test_the_ensemble_has_the_spread_of_the_uncertainty():
     assert models == again
 
 
-def test_no_model_is_drawn_with_a_zero_on_the_side_that_its_interval_excludes():
+@pytest.mark.parametrize("coupled", [True, False])
+def test_a_zero_that_is_known_as_poorly_as_its_gain_is_drawn_with_it(coupled):
+    # Gain and zero are known to a half; where they are coupled, their product to a hundredth.
     values = np.array([2.0, 10.0, 3.0, 4.0, 0.5])
-    std = np.array([0.1, 0.5, 0.2, 3.0, 0.1])
-    found = identified("waveform", Estimate.of(SOPDT_ZERO, values, np.diag(std**2)))
-    low = np.where(values == 4.0, 1.0, found.ci95_low)
-    either, one = (
-        [m.zeros[0].real for m in ensemble(f, rng=np.random.default_rng(0))]
-        for f in (found, replace(found, ci95_low=low))
-    )
-    assert min(either) < 0.0 < min(one)
-    assert len(one) == len(either) == 100
+    root = np.diag(0.01 * values)
+    root[:, 1] = [1.0, 0.0, 0.0, -2.0, 0.0]
+    if not coupled:
+        root = np.diag([0.02, 0.1, 0.03, 2.5, 0.005])
+    found = identified("waveform", Estimate.of_root(SOPDT_ZERO, values, root))
+    models = ensemble(found, 500, rng=np.random.default_rng(0))
+    products = [m.gain * m.zeros[0].real for m in models]
+    if coupled:
+        assert products == pytest.approx([8.0] * 500, rel=0.1)
+    else:
+        assert min(products) < 0.0
+        sure = replace(found, ci95_low=np.where(values == 4.0, 1.0, found.ci95_low))
+        models = ensemble(sure, 500, rng=np.random.default_rng(0))
+        assert min(m.zeros[0].real for m in models) > 0.0
 
 
 @pytest.mark.long
