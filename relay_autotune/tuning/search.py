@@ -158,6 +158,8 @@ _EXCESS_TOLERANCE, _ROUGH_TOLERANCE = 0.01, 0.03
 _MARGIN = 1.2
 # Integral gains have to be above the lower end of their range by this factor.
 _CLEAR = 1.02
+# Ratio of a model's dead time to the process's from which lower frequencies are looked at.
+_FAR_LATER = 3.0
 # A bound counts as kept up to this factor; frequencies are added to the grid at most so often.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
@@ -211,8 +213,12 @@ class Search:
         """The models within the uncertainty of the process."""
         if not self.models:
             return None
+        # A loop with a model of a far longer dead time is closed at lower frequencies.
+        longest = max(m.dead_time for m in self.models)
+        later = min(1.0, _FAR_LATER * self.model.dead_time / longest) if longest > 0.0 else 1.0
         grid = self.responses.grid
-        return Surroundings(self._responses_of_models(grid[grid > 0.03 * self.frequency][::2]))
+        few = grid[grid > 0.03 * later * self.frequency][::2]
+        return Surroundings(self._responses_of_models(few))
 
     def _responses_of_models(self, grid: FloatArray) -> Responses:
         # Single precision is twice as fast and more than an ensemble needs.

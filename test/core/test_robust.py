@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -214,3 +215,11 @@ def test_gains_that_no_filter_makes_quiet_enough_are_no_candidates():
     search = Search(process, (), 10.0, NoiseLimit(1e-6, 1.0))
     found = search._at(Bounds(1.4, 1.4), np.zeros((3, 2)))
     assert np.all(np.isinf(found.tf)) and np.all(found.ki == -math.inf)
+
+
+def test_models_of_a_far_longer_dead_time_slow_the_loop_down():
+    # Of the process alone next to nothing limits the gain; on the others a tenth of it would do.
+    process = TransferFunction(40.0, (4900.0,), (20000.0, 3300.0), 0, 2.5)
+    others = tuple(replace(process, dead_time=80.0 + 0.2 * k) for k in range(20))
+    gains = robust(DesignTask(model=process, models=others, options=DesignOptions()))[0]
+    assert max(analyse_loop(gains, m).ms for m in others) == pytest.approx(1.4, rel=0.02)
