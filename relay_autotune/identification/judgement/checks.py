@@ -83,7 +83,9 @@ def unequal_gains(
     )
 
 
-def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] | None:
+def lost_effect(
+    record: Record, model: TransferFunction, fitted: FloatArray | None = None
+) -> tuple[float, float] | None:
     """Return how much of their effect commands lose on one side of a level, and that level.
 
     The parts of the command above and below a level get a gain each, a and b, in the least-squares
@@ -92,6 +94,8 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
 
     :param record: any record.
     :param model: the model fitted to it.
+    :param fitted: the fitted measurement [y], shape (n,), NaN where there is none. What of it is
+        no response, as a way back to rest, has a size of its own. None: offset and drift alone.
     :return: None where the command has two levels alone, samples are few, or the process grows
         by itself.
     """
@@ -111,6 +115,9 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
         command_time=np.empty(0),
         cycle_start=(),
     )
+    beside = []
+    if fitted is not None and len(fitted) == len(record):
+        beside.append((fitted - response(model, record.time, u))[few])
     inner = levels[0] + np.array(_SHARES) * np.ptp(levels)
     held = u(record.time)
     found = []
@@ -133,7 +140,7 @@ def lost_effect(record: Record, model: TransferFunction) -> tuple[float, float] 
             )
             for keep in (np.maximum, np.minimum)
         ]
-        (above, below), covariance = _factors(part, parts, correlated=True)
+        (above, below), covariance = _factors(part, parts, beside, correlated=True)
         contrast = np.array((1.0, -1.0))
         sigma = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
         largest = max(abs(above), abs(below))

@@ -11,6 +11,7 @@ part that determines nothing gives models all around that of the whole, and cont
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -57,11 +58,13 @@ class Part:
     :param begin: its first time [s].
     :param end: its last time [s].
     :param models: drawn from their posterior.
+    :param worse: residual that the best of them leaves of the whole record, over the least one.
     """
 
     begin: float
     end: float
     models: tuple[TransferFunction, ...]
+    worse: float = 1.0
 
     @property
     def span(self) -> str:
@@ -92,9 +95,11 @@ def halves(found: Identification, record: Record) -> tuple[Part, ...]:
     gain = whole.coefficients[: len(structure.powers)]
     parts = []
     for part in (halved[0], _with_free_state(halved[1])):
-        models = _allowed(part, gain, theta, scale)
+        best, models = _allowed(part, gain, theta, scale)
         if models:
-            parts.append(Part(float(part.time[0]), float(part.time[-1]), models))
+            left, _ = _linearised(problem, best, gain.size)
+            worse = math.sqrt(float(left @ left) / max(whole.cost, 1e-300))
+            parts.append(Part(float(part.time[0]), float(part.time[-1]), models, worse))
     return tuple(parts)
 
 
@@ -125,8 +130,8 @@ def _begins_at_rest(problem: Problem, found: Identification, record: Record) -> 
 
 def _allowed(
     problem: Problem, gain: FloatArray, theta: FloatArray, scale: float
-) -> tuple[TransferFunction, ...]:
-    """Draw models from the posterior that some samples give to a known model.
+) -> tuple[FloatArray, tuple[TransferFunction, ...]]:
+    """Return the best point, and models drawn from the posterior that some samples give.
 
     :param problem: the samples.
     :param gain: coefficients of the known model's numerator, shape (k,).
@@ -140,7 +145,7 @@ def _allowed(
     weak = _GAIN * np.abs(gain[0]) * slow ** np.arange(gain.size)
     deviation = np.concatenate((weak, np.full(theta.size - 1, _TIMES), [_DEAD_TIME * slow]))
     if not np.all(deviation > 0.0):
-        return ()
+        return known, ()
     precision = 1.0 / deviation**2
     at = known
     left, jacobian = _linearised(problem, at, gain.size)
@@ -178,7 +183,7 @@ def _allowed(
             model = None
         if model is not None:
             models.append(model)
-    return tuple(models)
+    return at, tuple(models)
 
 
 def _bounded(point: FloatArray) -> FloatArray:

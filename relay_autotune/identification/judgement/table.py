@@ -31,6 +31,9 @@ _FREQUENCIES = 300
 _BUT_FEW = 0.1
 # Half width of the interval of K_u, relative to K_u, up to which K_u is known.
 _KNOWN = 0.2
+# Residual of a half's best model on the whole record, over the least one, from which the whole
+# overrules the half; the share that then counts is doubtful.
+_FAR_WORSE, _OVERRULED = 3.0, 0.8
 
 
 def _direction(evidence: Evidence) -> Measured | None:
@@ -172,7 +175,11 @@ def _halves(evidence: Evidence) -> Measured | None:
 
 def _halves_direction(evidence: Evidence) -> Measured | None:
     sign = evidence.found.model.process_sign
-    found = [(other_sign(part.models, sign), part) for part in evidence.halves]
+    found = []
+    for part in evidence.halves:
+        share = other_sign(part.models, sign)
+        # Feedback or a disturbance in one half does not overrule the whole record.
+        found.append((min(share, _OVERRULED) if part.worse > _FAR_WORSE else share, part))
     if not found:
         return None
     share, part = max(found, key=lambda pair: pair[0])
@@ -205,7 +212,8 @@ def _left_out(evidence: Evidence) -> Measured | None:
 
 
 def _clipped(evidence: Evidence) -> Measured | None:
-    found = lost_effect(evidence.driven or evidence.record, evidence.found.model)
+    model, fitted = evidence.found.model, evidence.found.fitted
+    found = lost_effect(evidence.driven or evidence.record, model, fitted)
     return None if found is None else Measured(found[0], f"{found[1]:.4g}")
 
 
