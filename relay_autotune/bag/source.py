@@ -38,6 +38,11 @@ _OTHERS = (
     (b"SQLite format 3", "an SQLite file; expected a name that ends with .db3"),
     (b"#ROSBAG", "a ROS 1 bag; convert it with: rosbags-convert"),
 )
+# Tables of other programs, which are no recordings.
+_TABLES = (
+    (b"PK\x03\x04", "a zip archive, as workbooks are; save the table as CSV"),
+    (b"MATLAB ", "a MATLAB file; save time, measurement and command as CSV"),
+)
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -168,7 +173,8 @@ class Source:
                 f"the recorder was ended before it wrote anything"
             )
         if start[: len(self._magic)] != self._magic[: len(start)]:
-            told = next((what for head, what in _OTHERS if start.startswith(head)), None)
+            known = (*_OTHERS, *_TABLES)
+            told = next((what for head, what in known if start.startswith(head)), None)
             found = f"it is {told}" if told else f"it begins with {start[:8]!r}"
             raise BagError(f"{self.path} is not {self._kind}: {found}")
         if len(start) < len(self._magic):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -42,6 +43,7 @@ _MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--")
 _SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0}
 _QUANTITY = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(%|[^\W\d_/]{1,4}|\u00b0\w?)")
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
+_DAY = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}")
 _DATE = re.compile(
     r"(?:(\d{1,4})([-/.])(\d{1,2})\2(\d{1,4})(?:T|,?\s+))?"
     r"(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?\s*([AaPp][Mm])?\s*(Z|[+-]\d\d:?\d\d)?"
@@ -86,6 +88,9 @@ class TextTable:
         self._waiting: list[tuple[int, list[str]]] = []
         self.units: dict[str, str] = {}
         self.names = self._header()
+        self._day = self._day_before_its_time()
+        if self._day is not None:
+            self.names = self._joined(self.names)
 
     def _encoding(self, first: bytes) -> str:
         if first[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -137,6 +142,24 @@ class TextTable:
         self.units = {name: unit for name, unit in zip(names, units, strict=False) if unit}
         return names
 
+    def _day_before_its_time(self) -> int | None:
+        """Return the place of a column of dates just before one of times of day; None: no such."""
+        cells = self._waiting[0][1] if self._waiting else []
+        for at, (day, time) in enumerate(itertools.pairwise(cells)):
+            clock = _date(time)
+            if _DAY.fullmatch(day) and clock is not None and not clock[1]:
+                named = listed(self.names[at : at + 2])
+                self.notes.append(f"the columns {named} are read as one, of date and time")
+                return at
+        return None
+
+    def _joined(self, cells: list[str]) -> list[str]:
+        """Return cells with a date and the time of day behind it as one."""
+        at = self._day
+        if at is None or len(cells) < at + 2:
+            return cells
+        return [*cells[:at], " ".join(cells[at : at + 2]), *cells[at + 2 :]]
+
     def _is_header(self, cells: Sequence[str], width: int) -> bool:
         # Names with spaces in them make more cells than there are columns.
         fits = len(cells) == width if self._separator == " " else len(cells) >= max(width, 2)
@@ -153,7 +176,7 @@ class TextTable:
             if cells[0].startswith(_REMARKS) or (self._head and cells == self._head):
                 left_out += 1
                 continue
-            yield line, cells
+            yield line, self._joined(cells)
         if left_out:
             self.notes.append(f"{left_out} lines between the rows hold remarks and are left out")
 

@@ -313,6 +313,14 @@ WAYS = {
     "names without cells": ("# t,y,u,P,I,D\n", "{},{},{}".format),
     "units behind numbers": ("t,y,u\n", lambda t, y, u: f"{t},{y} \u00b0C,{u}%"),
     "units below names": ("t,y,u\nms,degC,%\n", lambda t, y, u: f"{float(t) * 1e3:g},{y},{u}"),
+    "date and time apart": (
+        "Date,Time,y,u\n",
+        lambda t, y, u: f"2026.02.22, 23:20:{float(t):06.3f}, {y}, {u}",
+    ),
+    "date and time apart, no names": (
+        "",
+        lambda t, y, u: f"22/02/2026 23:20:{float(t):06.3f} {y} {u}",
+    ),
     "an indent": ("\t\tt\ty\tu\n", "{}\t{}\t{}".format),
     "no number": ("t,y,u\n0.25,nan,0.5\n0.3,null,0.5\n", "{},{},{}".format),
 }

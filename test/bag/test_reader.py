@@ -353,6 +353,8 @@ def test_flipped_bytes_never_break_the_reader(data, tmp_path_factory):
         (b"hello, world, this is text", r"not an MCAP file: it begins with b'hello, w'"),
         (b"SQLite format 3\0" + bytes(100), "not an MCAP file: it is an SQLite file"),
         (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
+        (b"PK\x03\x04\x14\0", "a zip archive, as workbooks are; save the table as CSV"),
+        (b"MATLAB 5.0 MAT-file", "a MATLAB file; save time, measurement and command as CSV"),
         (b"\x28\xb5\x2f\xfd0000000", r"is not a recording: bag\.mcap cannot be expanded"),
     ],
 )
