@@ -38,9 +38,9 @@ test-core: setup
 ONCE_MORE = || { echo "$@: what failed runs once more, by itself"; \
 	python3 -m pytest -q --last-failed --last-failed-no-failures=none
 
-# running nodes, over real DDS; most of the time they wait, so two files at a time
+# running nodes, over real DDS; half of the time they wait, so three files at a time
 test-system: setup
-	@$(ENTER) && { python3 -m pytest -q --numprocesses=2 --dist=loadfile test/system \
+	@$(ENTER) && { python3 -m pytest -q --numprocesses=3 --dist=loadfile test/system \
 		$(ONCE_MORE) test/system; }; }
 
 test-rest: setup
