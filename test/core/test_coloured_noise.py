@@ -277,3 +277,20 @@ def test_a_model_whose_response_the_colour_explains_does_not_simulate():
     assert _simulates([right], [right])
     assert not _simulates([bent], [right])
     assert not _simulates([], [right])
+
+
+@pytest.mark.parametrize("sign", [0, 1])
+def test_a_growing_mode_is_tried_where_a_relay_held_the_process(sign):
+    record = relay_test(0.01 * np.random.default_rng(4).standard_normal(1400), np.zeros(1400), 3)
+    problem = problem_of([(record.time, record.measurement, record.drive())], FOPDT).thinned(150)
+    tried = []
+
+    class Watched(Ground):
+        def fit(self, names, order=0, ready=()):
+            names = list(names)
+            tried.extend(names)
+            return super().fit(names, order, ready)
+
+    ground = Ground.of(problem, 0.0, sign)
+    fit_all(Watched(ground.problem, ground.fopdt, ground.starts, ground.floor, sign))
+    assert ("unstable_fopdt" in tried) is bool(sign)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from relay_autotune.experiment.experiment import ExperimentParameters, RelayExpe
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import followed_share, lost_effect
 from relay_autotune.identification.judgement.evidence import Evidence, Loop, visible_error
-from relay_autotune.identification.judgement.refits import halves, plain_models
+from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
@@ -294,7 +295,26 @@ def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
     assert loss < 0.05
     # Between two levels alone there is nothing to compare.
     two = PiecewiseConstant(np.array([20.0, 80.0]), np.array([1.0, 0.0]), 0.0)
-    assert lost_effect(replace(clipped_steps(9.0), held_input=two), PROCESS) is None
+    plain = clipped_steps(9.0)
+    assert lost_effect(replace(plain, held_input=two), PROCESS) is None
+    # A third level that stood for one sample tells no more.
+    times = np.array([0.25, 80.0, 160.0])
+    three = PiecewiseConstant(times, np.array([1.0, -1.0, 1.0]), 0.0)
+    assert lost_effect(replace(plain, held_input=three), PROCESS) is None
+
+
+@pytest.mark.parametrize(("worse", "share"), [(1.2, 1.0), (5.0, 0.8)])
+def test_a_half_that_explains_the_whole_far_worse_makes_its_direction_no_more_than_doubtful(
+    worse, share
+):
+    other = TransferFunction.fopdt(-2.0, 10.0, 3.0)
+    part = Part(0.0, 60.0, (other,) * 5, worse)
+    evidence = SimpleNamespace(
+        found=SimpleNamespace(model=PROCESS), halves=(Part(0.0, 60.0, (PROCESS,) * 5), part)
+    )
+    (check,) = [c for c in CHECKS if c.name == "halves_direction"]
+    assert check.measure(evidence).value == share
+    assert (share >= check.failed) is (worse < 3.0)
 
 
 @pytest.mark.long
