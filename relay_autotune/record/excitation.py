@@ -107,17 +107,24 @@ def _saturated(y: FloatArray) -> np.ndarray:
     if low == high or float(np.mean(equal)) > 0.5:
         # A coarsely quantised measurement, or one without noise at rest, is often constant.
         return still
-    step = max(y.size // _MOST_FOR_SPEED, 1)
-    few, coarse = 1, y[::step]
-    while np.max(np.abs(coarse[few:] - coarse[:-few])) < _CROSSED * (high - low):
-        few += 1
-    few *= step
+    runs = []
     for end in (low, high):
         edges = np.flatnonzero(np.diff(np.concatenate(([0], (y == end).astype(np.int8), [0]))))
-        for begin, stop in zip(edges[::2], edges[1::2], strict=True):
-            away = np.abs(y[max(begin - 2 * few, 0) : begin] - end)
-            if stop - begin >= _SATURATED and np.any(away > _AWAY * (high - low)):
-                still[begin:stop] = True
+        pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        runs += [(begin, stop, end) for begin, stop in pairs if stop - begin >= _SATURATED]
+    if not runs:
+        return still
+    step = max(y.size // _MOST_FOR_SPEED, 1)
+    few, coarse = 1, y[::step]
+    # A spike between the samples that are looked at may be all of the range.
+    while few < coarse.size - 1 and (
+        np.max(np.abs(coarse[few:] - coarse[:-few])) < _CROSSED * (high - low)
+    ):
+        few += 1
+    for begin, stop, end in runs:
+        away = np.abs(y[max(begin - 2 * few * step, 0) : begin] - end)
+        if np.any(away > _AWAY * (high - low)):
+            still[begin:stop] = True
     return still
 
 

@@ -174,6 +174,17 @@ def test_a_motor_at_standstill_is_no_saturated_sensor(tau):
     assert (found.first, found.last) == (0, time.size - 1)
 
 
+def test_a_spike_that_is_all_of_the_range_is_no_error():
+    time = np.arange(0.0, 3000.0, 0.25)
+    u = PiecewiseConstant(np.array([1000.0]), np.array([1.0]), 0.0)
+    y = np.maximum(response(MODEL, time, u), 0.0)
+    y += 0.001 * np.random.default_rng(2).standard_normal(time.size) * (y > 0.0)
+    y[:3900] = 0.0
+    y[8001] = 1e4
+    record = Record(time=time, measurement=np.maximum(y, 0.0), command=u(time), held_input=u)
+    assert isinstance(find_experiments(record), tuple)
+
+
 def test_one_sample_far_out_hides_no_closed_loop():
     time = np.arange(0.0, 600.0, 0.5)
     rng = np.random.default_rng(6)
