@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta, timezone
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
@@ -43,7 +42,6 @@ _MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--")
 _SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0}
 _QUANTITY = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(%|[^\W\d_/]{1,4}|\u00b0\w?)")
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
-_DAY = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}")
 _DATE = re.compile(
     r"(?:(\d{1,4})([-/.])(\d{1,2})\2(\d{1,4})(?:T|,?\s+))?"
     r"(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?\s*([AaPp][Mm])?\s*(Z|[+-]\d\d:?\d\d)?"
@@ -89,8 +87,7 @@ class TextTable:
         self.units: dict[str, str] = {}
         self.names = self._header()
         self._day = self._day_before_its_time()
-        if self._day is not None:
-            self.names = self._joined(self.names)
+        self.names = self._joined(self.names)
 
     def _encoding(self, first: bytes) -> str:
         if first[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -145,9 +142,9 @@ class TextTable:
     def _day_before_its_time(self) -> int | None:
         """Return the place of a column of dates just before one of times of day; None: no such."""
         cells = self._waiting[0][1] if self._waiting else []
-        for at, (day, time) in enumerate(itertools.pairwise(cells)):
-            clock = _date(time)
-            if _DAY.fullmatch(day) and clock is not None and not clock[1]:
+        for at, (day, time) in enumerate(pairwise(cells)):
+            both = _date(f"{day} {time}")
+            if both is not None and both[1] and _date(day) is None:
                 named = listed(self.names[at : at + 2])
                 self.notes.append(f"the columns {named} are read as one, of date and time")
                 return at

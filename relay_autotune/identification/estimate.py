@@ -231,7 +231,7 @@ class Estimate:
         return deviation(gain_changes), deviation(frequency_changes)
 
     def draws(
-        self, count: int, rng: np.random.Generator, logarithmic: NDArray[np.bool_] | None = None
+        self, count: int, rng: np.random.Generator, logarithmic: NDArray[np.bool_]
     ) -> Iterator[TransferFunction]:
         """Draw models from the uncertainty.
 
@@ -240,11 +240,9 @@ class Estimate:
 
         :param count: models to draw.
         :param rng: the source.
-        :param logarithmic: which values are drawn by their logarithms, shape (p,); None: those
+        :param logarithmic: which values are drawn by their logarithms, shape (p,): at least those
             that cannot change sign.
         """
-        if logarithmic is None:
-            logarithmic = self.structure.logarithmic
         changes = rng.multivariate_normal(
             np.zeros(self.values.size),
             self._spread(logarithmic),

@@ -32,7 +32,13 @@ from relay_autotune.identification.waveform.selection import (
     nuisances_of,
     of_shown_direction,
 )
-from relay_autotune.identification.waveform.separable import Problem, Trial, left_of, refine
+from relay_autotune.identification.waveform.separable import (
+    Problem,
+    Trial,
+    left_beside,
+    left_of,
+    refine,
+)
 from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
 from relay_autotune.identification.waveform.theta import unit_steps
 
@@ -323,14 +329,11 @@ def _simulates(found: list[Candidate], simulated: list[Candidate]) -> bool:
     """
     if not found:
         return False
-    problem = replace(found[0].problem, colour=None)
-    own, y = len(problem.structure.powers), problem.seen(problem.y)
-    columns = problem.seen(problem.columns(found[0].state.theta)[0])
-    beside = columns[own:]
-    left = left_of(y - found[0].state.coefficients[:own] @ columns[:own], beside)
-    total = left_of(y, beside)
-    most = max(_EXPLAINS * float(total @ total), _WORSE * min(_left_by(c) for c in simulated))
-    return float(left @ left) <= most
+    left, total = left_beside(replace(found[0].problem, colour=None), found[0].state)
+    square = float(left @ left)
+    if square <= _EXPLAINS * float(total @ total):
+        return True
+    return square <= _WORSE * min(_left_by(c) for c in simulated)
 
 
 def _left_by(candidate: Candidate) -> float:

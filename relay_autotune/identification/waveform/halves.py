@@ -13,7 +13,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
-from relay_autotune.identification.waveform.separable import Problem, Trial, left_of, refine
+from relay_autotune.identification.waveform.separable import Problem, Trial, left_beside, refine
 from relay_autotune.process.transfer_function import TransferFunction
 
 _TRIAL = 1e-6
@@ -110,9 +110,7 @@ def _evidence(half: Problem, own: Trial, whole: Trial) -> float:
     :param own: their fit.
     :param whole: the fit to all samples; the half has an offset, drift and past of its own.
     """
-    k = len(half.structure.powers)
-    columns = half.seen(half.columns(whole.theta)[0])
-    left = left_of(half.seen(half.y) - whole.coefficients[:k] @ columns[:k], columns[k:])
+    left, _ = left_beside(half, whole)
     return half.time.size * math.log(max(float(left @ left) / max(own.cost, 1e-300), 1.0))
 
 
