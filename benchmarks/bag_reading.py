@@ -31,7 +31,7 @@ from made_recordings import (
 )
 from markdown import table, three
 
-from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.topics import Topics
 
 TOPICS = ("/measurement", "/command")

@@ -26,7 +26,7 @@ import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.methods import identify
-from relay_autotune.loop.margins import frequencies, sensitivity_peaks
+from relay_autotune.loop.stability import frequencies, sensitivity_peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.tuning import ensemble, is_stable

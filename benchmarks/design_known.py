@@ -24,8 +24,8 @@ from markdown import table, three
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.margins import frequencies, margins, sensitivity_peaks
-from relay_autotune.loop.responses import step_figures
+from relay_autotune.loop.analysis import step_figures
+from relay_autotune.loop.stability import frequencies, margins, sensitivity_peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning import RULES, Controller, is_stable

@@ -25,8 +25,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.definitions import find_definition
-from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.pairing import named_pair
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.topics import Topics

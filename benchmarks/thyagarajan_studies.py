@@ -36,8 +36,7 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     unstable_fopdt,
 )
 from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle, shape_of_record
-from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.simulation import RelayRun, simulate_relay
+from relay_autotune.process.simulation import HalfCycle, RelayRun, simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

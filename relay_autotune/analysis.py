@@ -13,11 +13,10 @@ import numpy as np
 
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError, defect
 from relay_autotune.experiment.early_end import FitProgress
-from relay_autotune.identification.judgement.assessment import assess
+from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
 from relay_autotune.identification.judgement.evidence import Evidence
-from relay_autotune.identification.judgement.quality import is_far_off
 from relay_autotune.identification.judgement.table import MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods import (

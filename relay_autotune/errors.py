@@ -63,6 +63,18 @@ class LoopError(RelayAutotuneError, RuntimeError):
     """The nodes of a running loop are missing, or do not answer."""
 
 
+class NotReadyError(RelayAutotuneError):
+    """A tune that cannot start.
+
+    :param message: the reason.
+    :param typed: the parameter to set, and a value or what it stands for; empty: another remedy.
+    """
+
+    def __init__(self, message: str, typed: str = "") -> None:
+        super().__init__(message)
+        self.typed = typed
+
+
 def defect(error: BaseException) -> str:
     """Return the message for an unexpected error: a request to report it, with its place.
 

@@ -25,8 +25,7 @@ from relay_autotune.arrays import IntArray
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, first_line, message_type
 from relay_autotune.bag.field_path import Element, Step, reading, written
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
-from relay_autotune.bag.locate import Content, every_byte
-from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.mcap_records import Channel, Content, every_byte
 from relay_autotune.bag.schema import (
     Number,
     Repeated,

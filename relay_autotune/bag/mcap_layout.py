@@ -19,14 +19,6 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
 from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW
-from relay_autotune.bag.locate import (
-    Content,
-    every_byte,
-    indexed_offsets,
-    nanoseconds,
-    record_offsets,
-    sorted_records,
-)
 from relay_autotune.bag.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -40,8 +32,14 @@ from relay_autotune.bag.mcap_records import (
     RECORD,
     SCHEMA,
     STATISTICS,
+    Content,
     DamageError,
     Declarations,
+    every_byte,
+    indexed_offsets,
+    nanoseconds,
+    record_offsets,
+    sorted_records,
     text,
     unsigned,
 )

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.bag_file import BagFile
+from relay_autotune.bag.bag_file import BagFile, McapFile
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
-from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.signals import Selection, join, preceded, window
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.topics import Progress, Topics
@@ -134,7 +133,7 @@ def _named_so(path: Path) -> bool:
 def _opened(path: Path, largest: int) -> BagFile:
     if ".db3" in path.suffixes[-2:]:
         # Imported here: most recordings need no database.
-        from relay_autotune.bag.sqlite_file import SqliteFile
+        from relay_autotune.bag.bag_file import SqliteFile
 
         return SqliteFile(path, largest)
     return McapFile(path, largest)

@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, as_typed, say
-from relay_autotune.cli.asking import asked, asked_for_file, number_of
 from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of, write
-from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.new_loop import PROGRAM, is_new_loop
 from relay_autotune.cli.own_nodes import ros_arguments
-from relay_autotune.cli.progress import Working
+from relay_autotune.cli.terminal import Working, asked, asked_for_file, labelled, number_of, width
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.experiment.settling import NO_REST_AT

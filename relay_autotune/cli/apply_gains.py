@@ -23,9 +23,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
-from relay_autotune.cli.asking import agreed_step, agrees
-from relay_autotune.cli.layout import Help, in_columns, labelled, width
-from relay_autotune.cli.progress import StatusLine, Working
+from relay_autotune.cli.terminal import (
+    Help,
+    StatusLine,
+    Working,
+    agreed_step,
+    agrees,
+    in_columns,
+    labelled,
+    width,
+)
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.text import digits, duration
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from relay_autotune.cli.layout import broken, width
+from relay_autotune.cli.terminal import broken, width
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.quantities import Quantity
 from relay_autotune.text import visible

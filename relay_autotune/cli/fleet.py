@@ -1,10 +1,16 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many bags, on the processors of this machine or on a Dask cluster; each is done once."""
+"""Many bags: on the processors of this machine or a Dask cluster, each of them once.
+
+Results go into a file as they come; a run that was cut short goes on from it.
+"""
 
 from __future__ import annotations
 
+import csv
+import fcntl
+import json
 import logging
 import multiprocessing
 import os
@@ -14,10 +20,213 @@ from asyncio import CancelledError as TaskCancelledError
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
+from relay_autotune.cli.arguments import DONE, deserved, worst
 from relay_autotune.cli.replay_bag import Done, Job, died, work
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.exchange.fields import columns
+from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
+from relay_autotune.identification.result import FitReport, Identification
+from relay_autotune.loop.gains import Gains
+from relay_autotune.quantities import told_fields
+from relay_autotune.text import cell
+
+ENDINGS = (".jsonl", ".csv", ".parquet")
+
+_OF_EXPERIMENT = (
+    *("start", "duration", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
+)
+# Columns of the selected model and its fit, and of the gains.
+_METHOD, *_ACCURACY = columns(Identification)
+_OF_MODEL = (_METHOD, *OF_PROCESS, *_ACCURACY)
+_OF_FIT = columns(FitReport)
+_OF_GAINS = columns(Gains)
+COLUMNS = (
+    *("bag", "experiment", "error"),
+    *(*_OF_EXPERIMENT, *_OF_MODEL, *_OF_FIT, *_OF_GAINS),
+)
+_TEXTS = {
+    *("bag", "error", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
+    *("structure", "zeros", "time_constants"),
+    *(f.name for kind in (Identification, Gains) for f in told_fields(kind) if f.kind is str),
+}
+
+
+class ResultsFile:
+    """A file of results, one document a line; a table is made of it at the end.
+
+    :param output: the file: ``.jsonl`` holds the documents; ``.csv`` and ``.parquet`` a table
+        with a row for each experiment, and the documents are in the same name with ``.jsonl``
+        added.
+    :raises SelectionError: if the ending is another one.
+    :raises BagError: if the file cannot be written, is in use, or may hold something else.
+    """
+
+    def __init__(self, output: str) -> None:
+        self._table = Path(output)
+        kind = self._table.suffix.lower()
+        if kind not in ENDINGS:
+            raise SelectionError(
+                f"--output {output!r} does not say what to write; expected an ending "
+                f"{', '.join(ENDINGS)}"
+            )
+        if kind == ".parquet":
+            _pyarrow()
+        self.path = self._table if kind == ".jsonl" else Path(f"{output}.jsonl")
+        if self._table.exists() and not self.path.exists():
+            raise BagError(
+                f"{self._table} exists, and there is no {self.path} that it was made of; name "
+                "another file, or remove it"
+            )
+        self.done: set[str] = set()
+        self.status = DONE
+        try:
+            self._file = self.path.open("a+b")
+        except OSError as error:
+            raise BagError(f"cannot write {self.path}: {error.strerror or error}") from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._take_up()
+        except BlockingIOError:
+            self._file.close()
+            raise BagError(f"{self.path} is being written by another process") from None
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            if self._table != self.path:
+                self._write_table()
+        finally:
+            self._file.close()
+
+    def add(self, name: str, document: str) -> None:
+        """Add the document of a bag, in one piece; it outlives this process.
+
+        :param name: of the bag.
+        :param document: on one line.
+        :raises BagError: if the file system refuses.
+        """
+        try:
+            self._file.write(document.encode() + b"\n")
+            self._file.flush()
+        except OSError as error:
+            raise BagError(f"cannot write {self.path}: {error.strerror or error}") from error
+        self.done.add(name)
+
+    def _take_up(self) -> None:
+        """Find what is done; a last line that was cut is taken away."""
+        self._file.seek(0)
+        end = 0
+        for line in self._file:
+            if not line.endswith(b"\n"):
+                os.ftruncate(self._file.fileno(), end)
+                break
+            document = self._document(line)
+            self.done.add(document["bag"])
+            self.status = worst(self.status, _status(document))
+            end += len(line)
+
+    def _document(self, line: bytes) -> dict[str, Any]:
+        try:
+            document = json.loads(line)
+        except ValueError:
+            document = None
+        if isinstance(document, dict) and isinstance(document.get("bag"), str):
+            return document
+        raise BagError(
+            f"{self.path} exists and holds something else than results of replay; "
+            f"name another file, or remove it"
+        )
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        self._file.seek(0)
+        for line in self._file:
+            yield from rows(self._document(line))
+
+    def _write_table(self) -> None:
+        new = self._table.with_name(self._table.name + ".tmp")
+        try:
+            if self._table.suffix.lower() == ".csv":
+                with new.open("w", newline="", encoding="utf-8") as file:
+                    writer = csv.DictWriter(file, COLUMNS)
+                    writer.writeheader()
+                    writer.writerows(map(_for_spreadsheets, self._rows()))
+            else:
+                pyarrow = _pyarrow()
+                text, number = pyarrow.string(), pyarrow.float64()
+                schema = pyarrow.schema(
+                    (name, text if name in _TEXTS else number) for name in COLUMNS
+                )
+                table = pyarrow.Table.from_pylist(list(self._rows()), schema=schema)
+                pyarrow.parquet.write_table(table, new)
+            new.replace(self._table)
+        except OSError as error:
+            raise BagError(f"cannot write {self._table}: {error.strerror or error}") from error
+
+
+def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield a row for each experiment of a bag; one with the error alone where there is none.
+
+    :param document: as `replay --json` prints it.
+    """
+    base = dict.fromkeys(COLUMNS) | {
+        "bag": document["bag"],
+        "error": document.get("error"),
+    }
+    experiments = document.get("experiments", [])
+    if not experiments:
+        yield base
+    for number, experiment in enumerate(experiments, start=1):
+        row = base | {"experiment": number} | {n: experiment.get(n) for n in _OF_EXPERIMENT}
+        if experiment["selected"] is not None:
+            model = experiment["models"][experiment["selected"]]
+            row |= {name: _cell(model[name]) for name in _OF_MODEL}
+            row |= {name: model["fit"][name] for name in _OF_FIT}
+        if experiment["recommended"] is not None:
+            gains = experiment["gains"][experiment["recommended"]]
+            row |= {name: gains[name] for name in _OF_GAINS}
+        yield row
+
+
+def _cell(value: Any) -> Any:
+    return json.dumps(value) if isinstance(value, list) else value
+
+
+def _for_spreadsheets(row: dict[str, Any]) -> dict[str, Any]:
+    return {n: cell(value) if isinstance(value, str) else value for n, value in row.items()}
+
+
+def _status(document: dict[str, Any]) -> int:
+    """Return the exit status that a bag deserves, as when it was done."""
+    found = document.get("experiments", [])
+    return deserved(
+        found=any(e.get("models") and not _contradicted(e) for e in found),
+        doubtful=any(e.get("verdict") == "doubtful" for e in found),
+    )
+
+
+def _contradicted(experiment: dict[str, Any]) -> bool:
+    return any(check["result"] == "failed" for check in experiment.get("checks", ()))
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow  # type: ignore[import-untyped]
+        import pyarrow.parquet  # type: ignore[import-untyped]
+    except ImportError:
+        raise BagError(
+            "a .parquet file needs the Python package pyarrow; install it with: "
+            "pip install pyarrow, or choose .csv"
+        ) from None
+    return pyarrow
+
 
 _CONNECT_S = 10.0
 _PRELOADED = [

@@ -17,8 +17,8 @@ from functools import cached_property
 import numpy as np
 
 from relay_autotune.cli.arguments import DONE, finite, guarded
-from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.table import identification_lines
+from relay_autotune.cli.terminal import labelled, width
 from relay_autotune.errors import ParameterError, SelectionError, look_up
 from relay_autotune.exchange.document import to_json
 from relay_autotune.exchange.fields import to_document
@@ -35,8 +35,8 @@ from relay_autotune.identification.methods.wang import (
     fopdt_with_gain,
 )
 from relay_autotune.identification.result import Identification, identified
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.identification.shown.shape import Shape
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
 from relay_autotune.process.structures import FOPDT
 
 PROGRAM = "identify"

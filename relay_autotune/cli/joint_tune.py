@@ -18,12 +18,10 @@ import yaml
 
 from relay_autotune.cli.apply_gains import apply_at, beside
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
-from relay_autotune.cli.asking import agrees, asked, number_of, pair_of
 from relay_autotune.cli.export import Target
-from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.new_loop import PROGRAM, START_WITHIN
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, own_node, ros_arguments
-from relay_autotune.cli.progress import Working
+from relay_autotune.cli.terminal import Working, agrees, asked, labelled, number_of, pair_of, width
 from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message

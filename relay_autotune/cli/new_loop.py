@@ -17,10 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.arguments import finite
-from relay_autotune.cli.asking import asked, number_of, pair_of
-from relay_autotune.cli.layout import broken, width
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
-from relay_autotune.cli.progress import Working
+from relay_autotune.cli.terminal import Working, asked, broken, number_of, pair_of, width
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.laws import LAWS
 

@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import Any
 
 from relay_autotune.cli.export import number
-from relay_autotune.cli.progress import Working
+from relay_autotune.cli.terminal import Working
 from relay_autotune.errors import LoopError
 
 # How long a node may take to end: relay_node sends its last command first [s].

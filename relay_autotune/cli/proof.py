@@ -17,11 +17,9 @@ from typing import Any
 
 from relay_autotune.cli.apply_gains import found_lines
 from relay_autotune.cli.arguments import say
-from relay_autotune.cli.asking import agreed_step
-from relay_autotune.cli.layout import labelled, width
 from relay_autotune.cli.new_loop import PROGRAM, START_WITHIN
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, own_node, ros_arguments
-from relay_autotune.cli.progress import StatusLine, Working
+from relay_autotune.cli.terminal import StatusLine, Working, agreed_step, labelled, width
 from relay_autotune.control.verification import (
     LEAST_OF_NOISE,
     Step,

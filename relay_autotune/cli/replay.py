@@ -16,9 +16,7 @@ from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.analysis_arguments import add_analysis, add_export, export_target, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
 from relay_autotune.cli.export import write
-from relay_autotune.cli.layout import width
 from relay_autotune.cli.page import add_web, check_web, show
-from relay_autotune.cli.progress import ProgressLine, Stages
 from relay_autotune.cli.replay_bag import Done, Job, replay
 from relay_autotune.cli.report import (
     add_present,
@@ -27,7 +25,7 @@ from relay_autotune.cli.report import (
     command_line,
     write_report,
 )
-from relay_autotune.cli.results import ResultsFile
+from relay_autotune.cli.terminal import ProgressLine, Stages, width
 from relay_autotune.errors import SelectionError
 
 PROGRAM = "replay"
@@ -184,6 +182,8 @@ def _recordings(given: Sequence[str]) -> list[str]:
 
 def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
     """Write results to a file as they come."""
+    from relay_autotune.cli.fleet import ResultsFile
+
     with ResultsFile(options.output) as results:
         left = [job for job in jobs if job.name not in results.done]
         status = results.status

@@ -29,8 +29,8 @@ from relay_autotune.cli.arguments import (
     say,
     typed_as,
 )
-from relay_autotune.cli.progress import ProgressLine, Stages
 from relay_autotune.cli.replay_bag import Job, analysed
+from relay_autotune.cli.terminal import ProgressLine, Stages
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from

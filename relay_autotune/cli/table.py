@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relay_autotune.cli.layout import WIDEST, labelled
+from relay_autotune.cli.terminal import WIDEST, labelled
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record

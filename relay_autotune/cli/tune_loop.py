@@ -44,9 +44,7 @@ from relay_autotune.cli.arguments import (
     guarded,
     say,
 )
-from relay_autotune.cli.asking import agrees
 from relay_autotune.cli.export import EXPORTS
-from relay_autotune.cli.layout import Help, width
 from relay_autotune.cli.new_loop import (
     PROGRAM,
     START_WITHIN,
@@ -59,7 +57,7 @@ from relay_autotune.cli.new_loop import (
 )
 from relay_autotune.cli.own_nodes import own_namespace
 from relay_autotune.cli.page import add_web, check_web
-from relay_autotune.cli.progress import Working
+from relay_autotune.cli.terminal import Help, Working, agrees, width
 from relay_autotune.cli.tune_view import (
     TICK,
     Paint,

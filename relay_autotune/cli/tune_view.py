@@ -20,8 +20,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
-from relay_autotune.cli.layout import WIDEST, labelled
 from relay_autotune.cli.table import gains_lines
+from relay_autotune.cli.terminal import WIDEST, labelled
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.quantities import NORMAL_95

@@ -25,12 +25,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from relay_autotune.experiment.faults import count_cycles
-from relay_autotune.experiment.kick import (
-    LAST_LOOK,
-    LAST_LOOK_SAMPLES,
-    DirectionWatch,
-    ResponseDetector,
-)
 from relay_autotune.experiment.narration import (
     while_finding_direction,
     while_settling,
@@ -41,8 +35,12 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Levels, Relay
 from relay_autotune.experiment.samples import Samples
 from relay_autotune.experiment.settling import (
+    LAST_LOOK,
+    LAST_LOOK_SAMPLES,
     NOISE_SAMPLES,
     NOT_SETTLED,
+    DirectionWatch,
+    ResponseDetector,
     RestState,
     RestWatch,
     Settling,

@@ -18,18 +18,18 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import performance_of
-from relay_autotune.loop.gains import Controller, Performance, StepFigures
-from relay_autotune.loop.laws import SampledLaw
-from relay_autotune.loop.margins import LoopMargins, margins, peaks
-from relay_autotune.loop.responses import (
+from relay_autotune.loop.analysis import (
     LONGEST,
     NO_OFFSET,
     StepResponse,
     figures_of,
     has_settled,
     horizon,
+    performance_of,
 )
+from relay_autotune.loop.gains import Controller, Performance, StepFigures
+from relay_autotune.loop.laws import SampledLaw
+from relay_autotune.loop.stability import LoopMargins, margins, peaks
 from relay_autotune.process.response import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 

@@ -43,8 +43,8 @@ from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
-from relay_autotune.nodes.silence import Repeater, require_own_time
 from relay_autotune.nodes.verifier import NotVerifiable, Predictors, Verifiable, Verifier
+from relay_autotune.nodes.watch import Repeater, require_own_time
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage

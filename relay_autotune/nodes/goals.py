@@ -1,17 +1,23 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""An action that runs: one goal at a time, what it tells each second, and its end."""
+"""Actions that run: one goal at a time, what it tells, its end; the action ~/tune."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
 
+from relay_autotune.experiment.experiment import RelayExperiment, State
+from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.text import TOLD_EVERY
+from relay_autotune_msgs.action import Tune
+from relay_autotune_msgs.msg import TransferFunction
+from relay_autotune_msgs.srv import StartTune
 
 
 class Narrator:
@@ -102,3 +108,122 @@ def conclude(goal: Any, result: Any, *, succeeded: bool) -> None:
         return result
 
     goal.execute(finish)
+
+
+_STATES = {
+    State.SETTLING: Tune.Feedback.STATE_SETTLING,
+    State.KICK: Tune.Feedback.STATE_KICK,
+    State.PROBE: Tune.Feedback.STATE_KICK,
+    State.RELAY: Tune.Feedback.STATE_RELAY,
+    State.COMPLETED: Tune.Feedback.STATE_COMPLETED,
+    State.ABORTED: Tune.Feedback.STATE_ABORTED,
+    State.FAILED: Tune.Feedback.STATE_FAILED,
+}
+
+
+class TuneAction(OneGoal):
+    """Serve the action.
+
+    :param node: the node.
+    :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune, and
+        says what became of it.
+    :param cancel: called when a client cancels the running tune.
+    """
+
+    def __init__(
+        self,
+        node: ServedNode,
+        start: Callable[[float, bool], StartTune.Response],
+        cancel: Callable[[], None],
+    ) -> None:
+        super().__init__(
+            node, Tune, "~/tune", self._accept, cancel, status_pub_qos_profile=quality.STATUS
+        )
+        self._start = start
+        self._forget("")
+
+    def _forget(self, experiment_id: str) -> None:
+        """Begin an experiment without results."""
+        self._id = experiment_id
+        self._result = Tune.Result()
+        self._newest = TransferFunction()
+        self._ultimate_gain = self._ultimate_gain_std = math.nan
+
+    def _accept(self, goal: Any) -> None:
+        request = goal.request
+        started = self._start(request.amplitude, request.dry_run)
+        if started.experiment_id:
+            self.running = goal
+            self._forget(started.experiment_id)
+            return
+        result = Tune.Result(reason=started.reason, checks=started.checks)
+        conclude(goal, result, succeeded=started.accepted)
+
+    def tell(self, experiment: RelayExperiment, status: str) -> None:
+        """Publish feedback, if a goal is active.
+
+        :param experiment: the running experiment.
+        :param status: what it waits for and what it sees, a sentence.
+        """
+        if self.running is None:
+            return
+        feedback = Tune.Feedback(
+            state=_STATES[experiment.state],
+            cycle=experiment.cycle_count,
+            progress=experiment.progress,
+            elapsed=experiment.elapsed,
+            remaining=experiment.remaining,
+            period=math.nan,
+            amplitude=math.nan,
+            ultimate_gain=self._ultimate_gain,
+            ultimate_gain_std=self._ultimate_gain_std,
+            transfer_function=self._newest,
+            status=status,
+        )
+        if experiment.cycle_count:
+            last = experiment.cycles[-1]
+            feedback.period = last.period
+            feedback.amplitude = 0.5 * (last.peak_max - last.peak_min)
+        self.running.publish_feedback(feedback)
+        # Each model is told once, since it is long.
+        self._newest = TransferFunction()
+
+    def note(self, name: str, message: Any) -> None:
+        """Keep a model or gains for the result.
+
+        :param name: unresolved name of its topic.
+        :param message: the message.
+        """
+        if self.running is None or message.experiment_id != self._id:
+            return
+        if name == "transfer_function":
+            self._newest = message
+            self._ultimate_gain = message.ultimate_gain
+            self._ultimate_gain_std = message.ultimate_gain_std
+            if message.final:
+                self._result.transfer_function = message
+        elif message.final:
+            self._result.gains = message
+
+    def end(self, experiment_id: str, summary: Any, bag: str, missing: str) -> None:
+        """Answer the goal of an experiment; do nothing if it has no goal.
+
+        :param experiment_id: the id of the experiment.
+        :param summary: its message, without arrays.
+        :param bag: folder of the recording; empty: no recording.
+        :param missing: a sentence on samples or results that are missing; empty: none are.
+        """
+        goal = self.running
+        if goal is None or experiment_id != self._id:
+            return
+        result = self._result
+        result.experiment = summary
+        result.bag = bag
+        result.outcome = summary.outcome
+        result.reason = "; ".join(filter(None, (summary.reason, missing)))
+        given = bool(result.gains.experiment_id)
+        told = result.gains if given else result.transfer_function
+        result.verdict = told.verdict if given else Tune.Result.VERDICT_NONE
+        result.verdict_reason = told.verdict_reason or ("" if given else result.reason)
+        self.running = None
+        conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)

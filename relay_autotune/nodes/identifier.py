@@ -33,8 +33,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import declare, merged, values_of
-from relay_autotune.nodes.results import Refusals
-from relay_autotune.nodes.signs_of_life import SignsOfLife
+from relay_autotune.nodes.results import Refusals, SignsOfLife
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.verdict import Judgement

@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from relay_autotune.errors import ParameterError, RelayAutotuneError
+from relay_autotune.errors import NotReadyError, ParameterError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
 from relay_autotune.experiment.narration import how_long, motion
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.experiment.relay_law import Levels
-from relay_autotune.nodes.ends import Ends
+from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import (
     described,
@@ -32,13 +32,10 @@ from relay_autotune.nodes.quality import (
     why_no_publisher,
     why_no_subscriber,
 )
-from relay_autotune.nodes.silence import LastSamples, Sensor, require_own_time
 from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
+from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
-
-if TYPE_CHECKING:
-    from relay_autotune.nodes.loop_ends import LoopEnds
 
 _T = TypeVar("_T")
 
@@ -47,18 +44,6 @@ _FAR = 10.0
 # Free space below which a recording is said to be at risk [bytes].
 _LITTLE = 100_000_000
 _NAME_WIDTH = 12
-
-
-class NotReadyError(RelayAutotuneError):
-    """A tune that cannot start.
-
-    :param message: the reason.
-    :param typed: the parameter to set, and a value or what it stands for; empty: another remedy.
-    """
-
-    def __init__(self, message: str, typed: str = "") -> None:
-        super().__init__(message)
-        self.typed = typed
 
 
 class Mark(Enum):

@@ -18,37 +18,33 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from relay_autotune.errors import FieldError, RelayAutotuneError
+from relay_autotune.errors import FieldError, NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.narration import how_long
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
-from relay_autotune.nodes.ends import Ends
-from relay_autotune.nodes.goals import Narrator
+from relay_autotune.nodes.goals import Narrator, TuneAction
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
-from relay_autotune.nodes.loop_ends import LoopEnds
+from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import declare, values_of
 from relay_autotune.nodes.quality import FOLLOW_EVERY, why_no_publisher
 from relay_autotune.nodes.readiness import (
     Checklist,
-    NotReadyError,
     Readiness,
     Ready,
     why_not_settable,
 )
 from relay_autotune.nodes.recordings import Recordings
-from relay_autotune.nodes.results import MODEL, OwnResults
+from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Session, SetpointSession, reported_by
-from relay_autotune.nodes.signs_of_life import said_by
-from relay_autotune.nodes.silence import Counter, LastSamples, Sensor, losses
-from relay_autotune.nodes.tune_action import TuneAction
 from relay_autotune.nodes.tune_parameters import (
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )
+from relay_autotune.nodes.watch import Counter, LastSamples, Sensor, losses
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Check records, models and gains from topics, or refuse them with a reason.
+"""Results from topics: records, models and gains, checked; and whether identifier_node lives.
 
 Any node of the network can publish them. Here each message becomes a checked object of the core
 and is compared with the known facts of its experiment, before it has any effect.
@@ -14,12 +14,10 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from relay_autotune.errors import ModelError, RelayAutotuneError, TuningError
-
-# Loaded now, though it is needed only for the first model: that comes in a tune, and loading takes
-# most of a second, in which no measurement would be answered.
 from relay_autotune.exchange import models  # noqa: F401
 from relay_autotune.exchange.evidence import ExperimentFacts, check_finding
 from relay_autotune.exchange.messages import (
@@ -30,9 +28,92 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.loop.gains import Gains
+from relay_autotune.nodes import quality
+from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.verdict import Verdict
+
+SIGNS_OF_LIFE = "identifier_status"
+# Interval of the signs of life during a computation [s].
+EVERY = 1.0
+
+_EXPERIMENT, _STATE = "experiment", "state"
+_WORKING, _DONE = "working", "done"
+
+
+class SignsOfLife:
+    """Publish which experiments are in work.
+
+    :param node: identifier_node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._name = node.get_fully_qualified_name().lstrip("/")
+        self._publisher = quality.publisher(node, DiagnosticStatus, SIGNS_OF_LIFE, quality.RESULT)
+        self._working: list[str] = []
+        self._stage = _WORKING
+        self._timer = node.create_timer(EVERY, self._tell, clock=STEADY, autostart=False)
+
+    def work_on(self, experiment_id: str) -> None:
+        """Give signs of life until the work is done.
+
+        :param experiment_id: the experiment in work.
+        """
+        self._working.append(experiment_id)
+        self._publish(experiment_id, _WORKING, "")
+        self._timer.reset()
+
+    def at(self, stage: str) -> None:
+        """Note what the work is at; any thread may call it.
+
+        :param stage: such as ``comparing structures``.
+        """
+        self._stage = stage
+
+    def _tell(self) -> None:
+        for experiment_id in self._working:
+            self._publish(experiment_id, _WORKING, "")
+
+    def done(self, experiment_id: str, lacking: str) -> None:
+        """Publish that all results of an experiment are out.
+
+        :param experiment_id: its id.
+        :param lacking: why model or gains are missing; empty: both were published.
+        """
+        if experiment_id in self._working:
+            self._working.remove(experiment_id)
+        if not self._working:
+            self._timer.cancel()
+        self._publish(experiment_id, _DONE, lacking)
+
+    def _publish(self, experiment_id: str, state: str, reason: str) -> None:
+        values = {_EXPERIMENT: experiment_id, _STATE: state}
+        self._publisher.publish(
+            DiagnosticStatus(
+                level=DiagnosticStatus.WARN if reason else DiagnosticStatus.OK,
+                name=self._name,
+                message=reason or (self._stage if state == _WORKING else state),
+                values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            )
+        )
+
+
+def said_by(message: Any) -> tuple[str, bool, str]:
+    """Return experiment id, whether it is still in work, and a text.
+
+    That is what the work is at, or after it why results are missing; empty: neither is told.
+
+    :param message: the `DiagnosticStatus`.
+    """
+    values = {pair.key: pair.value for pair in message.values}
+    working = values.get(_STATE) == _WORKING
+    told = message.message != _WORKING if working else message.level != DiagnosticStatus.OK
+    return values.get(_EXPERIMENT, ""), working, message.message if told else ""
+
+
+# Loaded now, though it is needed only for the first model: that comes in a tune, and loading takes
+# most of a second, in which no measurement would be answered.
 
 # Limits on remembered experiments and logged reasons, since a node may send any number.
 _MOST = 8

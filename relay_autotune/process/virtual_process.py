@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.errors import ModelError, ParameterError
-from relay_autotune.process.modes import Modes
+from relay_autotune.process.response import Modes
 from relay_autotune.process.transfer_function import TransferFunction
 
 

@@ -15,16 +15,14 @@ import numpy as np
 from relay_autotune.report.case import Case
 from relay_autotune.report.experiment import draw_experiment, draw_fit, draw_phase_plane
 from relay_autotune.report.frequency import (
-    draw_bode,
-    draw_nyquist,
-    draw_uncertainty,
-    uncertainty_height,
-)
-from relay_autotune.report.loops import (
     distinct_gains,
+    draw_bode,
     draw_closed_loop,
+    draw_nyquist,
     draw_rules,
+    draw_uncertainty,
     rules_height,
+    uncertainty_height,
 )
 from relay_autotune.report.style import INK, MUTED, NARROW, SQUARE, WIDE, new_figure, save
 from relay_autotune.text import visible

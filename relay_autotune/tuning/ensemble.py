@@ -16,17 +16,16 @@ from relay_autotune.errors import TuningError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.margins import frequencies
 from relay_autotune.loop.stability import (
     at_infinity,
     closed_loop_unstable_poles,
+    frequencies,
     winding,
 )
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import allowed_outside
-from relay_autotune.tuning.model_set import HeldSet, ModelSet
 from relay_autotune.tuning.rules import Rule
-from relay_autotune.tuning.task import DesignTask
+from relay_autotune.tuning.task import DesignTask, HeldSet, ModelSet
 
 _MODELS = 100
 # One model in this number is one of another structure on which the gains have to hold.

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
-from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.tuning.task import ModelSet
 
 _ALL = slice(None)
 

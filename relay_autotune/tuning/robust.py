@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import ClosedLoopTransforms, abscissae, inverted
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.responses import ClosedLoopTransforms, abscissae, inverted
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import NoiseLimit, Optimum
 from relay_autotune.tuning.frontier import Bounds

@@ -28,8 +28,8 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.loop.laws import OWN_LAW, Law, Rational, SampledLaw, Slope
-from relay_autotune.loop.margins import peaks
 from relay_autotune.loop.sampled_loop import SampledLoop, circle, sampled_grid, step_response
+from relay_autotune.loop.stability import peaks
 from relay_autotune.process.response import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import Candidates, stable_gains

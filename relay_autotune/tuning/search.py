@@ -30,10 +30,9 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import abscissae, filter_for, inverted
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.margins import frequencies, peaks
-from relay_autotune.loop.noise import filter_for
-from relay_autotune.loop.responses import abscissae, inverted
+from relay_autotune.loop.stability import frequencies, peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.candidates import (

@@ -18,12 +18,16 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import abscissae, inverted, step_responses
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.loop.responses import abscissae, inverted, step_responses
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import Case
-from relay_autotune.report.frequency import loop_frequencies, swept_parts
-from relay_autotune.report.loops import shown_load, step_duration
+from relay_autotune.report.frequency import (
+    loop_frequencies,
+    shown_load,
+    step_duration,
+    swept_parts,
+)
 from relay_autotune.shaping import Shaping
 from relay_autotune.tuning import DEFAULT_RULE, Designed, DesignOptions, designed, judged
 from relay_autotune.tuning.ensemble import ensemble_peaks

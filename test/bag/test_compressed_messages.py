@@ -29,8 +29,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
+from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.definitions import EXPERIMENT, Definition
-from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64

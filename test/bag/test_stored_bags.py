@@ -14,7 +14,7 @@ from made_bags import REPOSITORY, assert_same_record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from relay_autotune.analysis import analyse
-from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.reader import interrupted_experiment, read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.topics import Topics

@@ -19,8 +19,8 @@ from made_bags import REPOSITORY, START
 from mcap.writer import CompressionType, Writer
 
 from relay_autotune.bag import source
+from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.definitions import message_type
-from relay_autotune.bag.mcap_file import McapFile
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.schema import numeric_paths

@@ -14,7 +14,7 @@ import pytest
 
 from relay_autotune.cli import apply_gains
 from relay_autotune.cli.apply_gains import beside, found_lines, verdict_lines
-from relay_autotune.cli.gains_page import GainsPage
+from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import fill_gains

@@ -23,9 +23,8 @@ from made_bags import REPOSITORY
 
 from relay_autotune.bag.signals import Selection
 from relay_autotune.cli import fleet, replay
-from relay_autotune.cli.fleet import in_processes, on_cluster
+from relay_autotune.cli.fleet import COLUMNS, ResultsFile, in_processes, on_cluster, rows
 from relay_autotune.cli.replay_bag import Job
-from relay_autotune.cli.results import COLUMNS, ResultsFile, rows
 from relay_autotune.errors import BagError
 from relay_autotune.running_fit import Task
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 import pytest
 from analysed import completed
 
-from relay_autotune.cli import arguments, layout, tune
-from relay_autotune.cli.layout import labelled
+from relay_autotune.cli import arguments, terminal, tune
 from relay_autotune.cli.table import table
+from relay_autotune.cli.terminal import labelled
 
 COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag", "tune_loop", "apply_gains")
 
@@ -72,8 +72,8 @@ def test_a_message_is_one_line_in_a_pipe_and_is_broken_between_words_on_a_termin
 
 def test_quantities_on_a_line_stay_with_their_units():
     text = "kc 0.6488 u/y   ti 14.99 s   td 4.140 s   tf 0.4140 s"
-    assert layout.broken(text, 99) == [text]
-    assert layout.broken(text, 30) == ["kc 0.6488 u/y   ti 14.99 s", "td 4.140 s   tf 0.4140 s"]
+    assert terminal.broken(text, 99) == [text]
+    assert terminal.broken(text, 30) == ["kc 0.6488 u/y   ti 14.99 s", "td 4.140 s   tf 0.4140 s"]
 
 
 def test_a_label_that_fills_its_column_has_a_space_after_it():

@@ -21,7 +21,6 @@ from made_experiments import record_of
 
 from relay_autotune.cli import proof, report, tune_loop
 from relay_autotune.cli.after_tune import hand_over, left, left_its_limits, prefix, repeated
-from relay_autotune.cli.asking import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.new_loop import (
     add_new_loop,
@@ -30,6 +29,7 @@ from relay_autotune.cli.new_loop import (
     nodes_for,
     with_flags,
 )
+from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.controller_parameters import PARAMETERS

@@ -27,7 +27,7 @@ from made_bags import (
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.cli import csv_to_bag, progress, replay
+from relay_autotune.cli import csv_to_bag, replay, terminal
 from relay_autotune.record.record import Outcome, Record
 
 
@@ -115,7 +115,7 @@ def test_the_process_is_found(tmp_path, capsys):
 
 def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
     # On a terminal it says meanwhile what the computation is at.
-    monkeypatch.setattr(progress, "TOLD_EVERY", 0.02)
+    monkeypatch.setattr(terminal, "TOLD_EVERY", 0.02)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_bag(tmp_path / "bag", tmp_path, relay_record())
     status, out, err = run(capsys, tmp_path / "bag")

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from relay_autotune.cli import tune
-from relay_autotune.cli.tune_model import model_of
+from relay_autotune.cli.tune import model_of
 from relay_autotune.exchange.models import model_fields
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,

@@ -15,9 +15,8 @@ from scipy import signal
 from scipy.integrate import trapezoid
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import analyse_loop, is_stable
+from relay_autotune.loop.analysis import analyse_loop, is_stable, step_responses
 from relay_autotune.loop.gains import Controller, InternalModelLaw
-from relay_autotune.loop.responses import step_responses
 from relay_autotune.loop.stability import closed_loop_unstable_poles, winding
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
@@ -30,7 +29,7 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.ensemble import ensemble_peaks
-from relay_autotune.tuning.model_set import ModelSet
+from relay_autotune.tuning.task import ModelSet
 
 
 def _rational(control, controller: Controller, model: TransferFunction):

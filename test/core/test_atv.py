@@ -26,8 +26,8 @@ from relay_autotune.identification.methods.atv import (
     two_time_constants,
     ultimate_estimate,
 )
-from relay_autotune.identification.methods.lag_models import MODEL_4, MODEL_5
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.identification.methods.lags import MODEL_4, MODEL_5
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction

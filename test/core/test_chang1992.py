@@ -26,8 +26,8 @@ from relay_autotune.identification.methods.chang import (
     two_equal_and_one,
     two_time_constants,
 )
-from relay_autotune.identification.methods.square_wave import fundamental, level, peak, slope_sign
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.identification.methods.lags import fundamental, level, peak, slope_sign
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction

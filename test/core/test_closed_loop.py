@@ -12,8 +12,7 @@ import pytest
 from scipy.linalg import expm
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.noise import noise_gain, open_noise_gain
-from relay_autotune.loop.responses import step_responses
+from relay_autotune.loop.analysis import noise_gain, open_noise_gain, step_responses
 from relay_autotune.loop.sampled import SampledPid, filter_matrices, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, analyse_loop

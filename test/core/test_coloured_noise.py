@@ -14,9 +14,9 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 from relay_autotune.identification.known import NOTHING
-from relay_autotune.identification.waveform.colour import colour_of, slow_colour
 from relay_autotune.identification.waveform.coloured import _simulates, in_colour
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.residuals import colour_of, slow_colour
 from relay_autotune.identification.waveform.selection import (
     Ground,
     fit_all,
@@ -29,7 +29,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.foreign import find_relay, infer_settings
+from relay_autotune.record.cycles import find_relay, infer_settings
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 GAIN, TAU, DEAD_TIME = 2.0, 5.0, 2.0

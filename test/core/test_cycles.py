@@ -21,9 +21,9 @@ from relay_autotune.record.cycles import (
     cycle_from_samples,
     cycles_of,
     find_cycles,
+    infer_settings,
     limit_cycle,
 )
-from relay_autotune.record.foreign import infer_settings
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 CYCLE = Cycle(

@@ -21,9 +21,14 @@ from relay_autotune.exchange.document import judgement_fields, judgement_of_fiel
 from relay_autotune.exchange.fields import of_document, of_message, to_document, to_message
 from relay_autotune.exchange.messages import gains_from_message, identification_from_message
 from relay_autotune.experiment.early_end import FitProgress
-from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.result import FitReport, Identification, Rival, Validation
+from relay_autotune.identification.result import (
+    Combination,
+    FitReport,
+    Identification,
+    Rival,
+    Validation,
+)
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.process.model_parameters import Quadratic

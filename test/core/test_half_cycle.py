@@ -15,8 +15,7 @@ from worked_cases import cases
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.methods.thyagarajan2003 import equal_lags
 from relay_autotune.identification.shown.shape import normalised_growth
-from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.simulation import HalfCycle, simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

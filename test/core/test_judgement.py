@@ -22,7 +22,7 @@ from relay_autotune.identification.judgement.refits import Part, halves, plain_m
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.waveform.theta import theta_of
+from relay_autotune.identification.waveform.rational import theta_of
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import UNSTABLE_FOPDT, GivenModel, structure_named

@@ -10,8 +10,13 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.kick import DirectionWatch, ResponseDetector
-from relay_autotune.experiment.settling import RestState, Settling, rest_state
+from relay_autotune.experiment.settling import (
+    DirectionWatch,
+    ResponseDetector,
+    RestState,
+    Settling,
+    rest_state,
+)
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant

@@ -29,9 +29,8 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
     without_impossible,
 )
-from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.result import FitReport, Identification, Validation
+from relay_autotune.identification.result import Combination, FitReport, Identification, Validation
 from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT, GivenModel

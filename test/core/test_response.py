@@ -13,7 +13,7 @@ from scipy import signal
 from scipy.linalg import expm
 
 from relay_autotune.errors import RecordError
-from relay_autotune.identification.waveform.theta import columns_of
+from relay_autotune.identification.waveform.rational import columns_of
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import (
     FOPDT,

@@ -29,7 +29,7 @@ from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import RULES, DesignOptions, DesignTask, analyse_loop, design
 from relay_autotune.tuning.rules import PUBLISHED
-from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae
+from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae, unstable
 from relay_autotune.tuning.rules.limit_cycle import (
     describing_point_of,
     describing_point_of_cycle,
@@ -39,10 +39,14 @@ from relay_autotune.tuning.rules.limit_cycle import (
     ziegler_nichols,
     ziegler_nichols_cycle,
 )
-from relay_autotune.tuning.rules.simc import half_rule, simc
-from relay_autotune.tuning.rules.step_response import amigo, step_response, two_point_fopdt
+from relay_autotune.tuning.rules.step_response import (
+    amigo,
+    half_rule,
+    simc,
+    step_response,
+    two_point_fopdt,
+)
 from relay_autotune.tuning.rules.thyagarajan2003 import lcmax, phase_margin, thyagarajan
-from relay_autotune.tuning.rules.unstable import unstable
 
 _T = TransferFunction
 

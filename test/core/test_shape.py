@@ -27,8 +27,7 @@ from relay_autotune.identification.shown.shape import (
     shape_of_half_cycle,
     shape_of_record,
 )
-from relay_autotune.process.half_cycle import HalfCycle
-from relay_autotune.process.simulation import simulate_relay
+from relay_autotune.process.simulation import HalfCycle, simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings

@@ -14,11 +14,14 @@ import pytest
 
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.identification.waveform.partial_fractions import partial_fractions
 from relay_autotune.identification.waveform.plausibility import is_unseen
-from relay_autotune.identification.waveform.rational import free_motion, responses
+from relay_autotune.identification.waveform.rational import (
+    columns_of,
+    free_motion,
+    partial_fractions,
+    responses,
+)
 from relay_autotune.identification.waveform.selection import support
-from relay_autotune.identification.waveform.theta import columns_of
 from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay

@@ -19,7 +19,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import atv_from_numbers
 from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 

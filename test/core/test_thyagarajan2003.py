@@ -29,7 +29,7 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     unstable_limit_cycle,
 )
 from relay_autotune.identification.shown.shape import shape_of_half_cycle
-from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

@@ -16,8 +16,8 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import identified
+from relay_autotune.identification.waveform.determination import profile_ends
 from relay_autotune.identification.waveform.fit_covariance import quantisation_step
-from relay_autotune.identification.waveform.profiles import profile_ends
 from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from relay_autotune.nodes import guard
-from relay_autotune.nodes.guard import (
+from relay_autotune.nodes import watch
+from relay_autotune.nodes.watch import (
     FollowWatch,
     Overtime,
     namesake,
@@ -183,7 +183,7 @@ def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expe
         elapsed=0.0, latest=most, parameters=SimpleNamespace(max_duration=duration)
     )
     present = 1000.0
-    monkeypatch.setattr(guard, "now", lambda: present)
+    monkeypatch.setattr(watch, "now", lambda: present)
     look, said = Overtime(tune, standing=5.0, slack=3.0), ""
     # An experiment that goes on by its own time ends by its own limit.
     while not said and rate * (present - 1000.0) <= most:

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64
 from relay_autotune import nodes
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.recordings import RESULTS, Recordings
-from relay_autotune.nodes.signs_of_life import SignsOfLife, said_by
+from relay_autotune.nodes.results import SignsOfLife, said_by
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
 PATIENCE = 500

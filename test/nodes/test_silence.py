@@ -21,7 +21,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller import ControllerNode
 from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.live_types import FLOAT64, reader_of
-from relay_autotune.nodes.silence import Repeater, require_own_time
+from relay_autotune.nodes.watch import Repeater, require_own_time
 
 PERIOD = 0.4
 # Turns of the executor, more than there is to do: nothing happens in the last ones.

@@ -19,8 +19,7 @@ from relay_autotune.report import draw
 from relay_autotune.report.case import case_of, in_loop
 from relay_autotune.report.experiment import rate_of, switches_of
 from relay_autotune.report.figures import PLATES
-from relay_autotune.report.frequency import swept_area
-from relay_autotune.report.loops import distinct_gains, simulated
+from relay_autotune.report.frequency import distinct_gains, simulated, swept_area
 from relay_autotune.report.style import in_steps, inline, save, thinned
 from relay_autotune.tuning import DesignOptions, tune
 

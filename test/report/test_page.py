@@ -18,9 +18,8 @@ from report_cases import aborted, fruitless, only
 
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.models import model_fields
-from relay_autotune.identification.combinations import Combination
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.result import Rival, identified
+from relay_autotune.identification.result import Combination, Rival, identified
 from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import (

@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 
-from relay_autotune.bag.mcap_file import McapFile
+from relay_autotune.bag.bag_file import McapFile
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 KINDS: dict[str, Any] = {

@@ -10,7 +10,7 @@ import pytest
 from served import analysed, subject_of
 
 from relay_autotune.analysis import analyse
-from relay_autotune.cli.gains_page import GainsPage
+from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.record.record import Outcome

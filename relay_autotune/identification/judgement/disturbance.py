@@ -14,9 +14,8 @@ from scipy.optimize import least_squares
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification.differences import jacobian
-from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.quality import is_contradicted, misfit
+from relay_autotune.identification.estimate import Estimate, jacobian
+from relay_autotune.identification.judgement.assessment import is_contradicted, misfit
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.ultimate import ultimate_point

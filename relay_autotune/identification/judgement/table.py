@@ -15,9 +15,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from relay_autotune.identification.judgement.assessment import misfit, unexplained_share
 from relay_autotune.identification.judgement.checks import followed_share, lost_effect
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
-from relay_autotune.identification.judgement.quality import misfit, unexplained_share
 from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.identification.result import NOT_AT_REST
 from relay_autotune.identification.waveform.plausibility import latest_dead_time

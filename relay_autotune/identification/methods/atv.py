@@ -25,7 +25,7 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lag_models import (
+from relay_autotune.identification.methods.lags import (
     MODEL_4,
     Solution,
     require_equal_lags,
@@ -37,7 +37,7 @@ from relay_autotune.identification.methods.symmetric_method import (
     from_record,
 )
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle, require_switching
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle, require_switching
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Record
 

@@ -26,20 +26,22 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lag_models import (
+from relay_autotune.identification.methods.lags import (
     MODEL_4,
     MODEL_5,
     Solution,
+    level,
+    peak,
     require_equal_lags,
+    slope_sign,
 )
-from relay_autotune.identification.methods.square_wave import level, peak, slope_sign
 from relay_autotune.identification.methods.symmetric_method import (
     SymmetricMethod,
     from_numbers,
     from_record,
 )
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.symmetric_cycle import SymmetricCycle, require_switching
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle, require_switching
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
@@ -56,7 +58,7 @@ def time_constant_from_period(
     """Return tau of n equal lags from the period: eqs 8 (n = 1), 9 (2) and 10 (3), and any n.
 
     The equation is F_n = epsilon/(K h), see
-    :mod:`~relay_autotune.identification.methods.square_wave`. The smallest of several roots is
+    :mod:`~relay_autotune.identification.methods.lags`. The smallest of several roots is
     the limit cycle that a relay starts, if y rises there. Eq 8 also has the trivial root
     tau = infinity, which is excluded.
 

@@ -23,14 +23,17 @@ from scipy.special import fdtrc
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.differences import jacobian
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
-from relay_autotune.identification.shown.fourier import FrequencyPoint
-from relay_autotune.identification.shown.harmonics import measured_points, with_noise_about
-from relay_autotune.identification.shown.steady_state import static_gain, steady_state
+from relay_autotune.identification.shown.fourier import (
+    FrequencyPoint,
+    measured_points,
+    static_gain,
+    steady_state,
+    with_noise_about,
+)
+from relay_autotune.identification.shown.limit_cycle import NOT_SETTLED, RelayTest, relay_test
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_LAG,

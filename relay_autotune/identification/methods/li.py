@@ -28,27 +28,29 @@ from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.differences import exact_steps, jacobian
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, exact_steps, jacobian
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.chang import gain_and_time_constant
-from relay_autotune.identification.methods.lag_models import (
+from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
     Solution,
     lags_of,
+    level,
     model_asked_for,
     model_text,
+    peak,
 )
-from relay_autotune.identification.methods.square_wave import level, peak
 from relay_autotune.identification.methods.symmetric_method import alike, shape_misfit
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
-from relay_autotune.identification.shown.symmetric_cycle import (
+from relay_autotune.identification.shown.limit_cycle import (
+    NOT_SETTLED,
     CycleReader,
+    RelayTest,
     SymmetricCycle,
     features,
+    relay_test,
     require_unbiased,
     skew_warning,
 )

@@ -29,8 +29,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.differences import jacobian
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import FitReport, Identification, identified
 from relay_autotune.process.response import response

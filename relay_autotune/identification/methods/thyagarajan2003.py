@@ -22,8 +22,8 @@ from scipy.optimize import brentq
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.methods.square_wave import level as level_of_lags
-from relay_autotune.identification.methods.square_wave import peak as peak_of_lags
+from relay_autotune.identification.methods.lags import level as level_of_lags
+from relay_autotune.identification.methods.lags import peak as peak_of_lags
 
 SMALL_DEAD_TIME = 0.001
 HIGHER_ORDER = 5

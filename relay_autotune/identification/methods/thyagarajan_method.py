@@ -19,8 +19,7 @@ from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.differences import jacobian
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods.thyagarajan2003 import (
     HIGHER_ORDER,
@@ -35,7 +34,12 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     unstable_fopdt,
 )
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, relay_test
+from relay_autotune.identification.shown.limit_cycle import (
+    NOT_SETTLED,
+    relay_test,
+    require_unbiased,
+    skew_warning,
+)
 from relay_autotune.identification.shown.shape import (
     Reading,
     Shape,
@@ -43,7 +47,6 @@ from relay_autotune.identification.shown.shape import (
     envelope,
     read_shape,
 )
-from relay_autotune.identification.shown.symmetric_cycle import require_unbiased, skew_warning
 from relay_autotune.process.model_parameters import DEAD_TIME, GAIN, TIME_CONSTANT, Parameter
 from relay_autotune.process.structures import FOPDT, IPDT, LAG_N, UNSTABLE_FOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction

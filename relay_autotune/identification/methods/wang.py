@@ -28,15 +28,20 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.cycle_scatter import NOT_SETTLED, RelayTest, relay_test
 from relay_autotune.identification.shown.fold import Fold, as_switched, fold, fold_without
-from relay_autotune.identification.shown.steady_state import (
+from relay_autotune.identification.shown.fourier import (
     UNKNOWN_REST,
     StaticGain,
     static_gain,
     steady_state,
 )
-from relay_autotune.identification.shown.symmetric_cycle import known_gain, require_unbiased
+from relay_autotune.identification.shown.limit_cycle import (
+    NOT_SETTLED,
+    RelayTest,
+    known_gain,
+    relay_test,
+    require_unbiased,
+)
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
 

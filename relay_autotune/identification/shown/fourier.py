@@ -1,19 +1,25 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points of the frequency response by Fourier integrals over whole cycles."""
+"""Points of the frequency response by Fourier integrals: at rest, fundamental and harmonics.
+
+The point of frequency zero is the static gain from the means of measurement and command.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.shown.limit_cycle import CycleRun, RelayTest
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import told
-from relay_autotune.record.record import PiecewiseConstant, Record
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, asked_once
 
 _SMALL_ANGLE = 0.2
 
@@ -164,3 +170,205 @@ def cycle_means(record: Record, first: int = 0) -> tuple[float, float]:
     y = fourier_integral_sampled(record.time, record.measurement, start, end, 0.0).real
     u = fourier_integral_held(record.input(), start, end, 0.0).real
     return y / (end - start), u / (end - start)
+
+
+_LEAST_BIAS = 0.02
+_LEAST_SAMPLES = 8
+
+UNKNOWN_REST = (
+    "no samples at rest before the test: the set-point stands in for the steady state, and the "
+    "intervals do not include its error"
+)
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """The measurement at rest under the baseline.
+
+    :param value: [y].
+    :param std: its standard deviation [y]; NaN: not estimated.
+    :param measured: False: the set-point stands in for it.
+    """
+
+    value: float
+    std: float
+    measured: bool
+
+
+@dataclass(frozen=True)
+class StaticGain:
+    """The gain from the means of command and measurement.
+
+    :param value: K [y/u], with its sign.
+    :param scatter: its standard deviation from cycle to cycle [y/u]; NaN: not estimated.
+    :param excursion: mean command minus baseline [u].
+    """
+
+    value: float
+    scatter: float
+    excursion: float
+
+    def std(self, rest: SteadyState) -> float:
+        """Return the standard deviation with that of the steady state [y/u]."""
+        return math.hypot(self.scatter, rest.std / self.excursion)
+
+
+@asked_once
+def steady_state(record: Record, settings: RelaySettings) -> SteadyState:
+    """Return the measurement at rest.
+
+    Before the first kick the command is the baseline; the mean of those samples is the steady
+    state. Without any, the set-point stands in for it.
+
+    :param record: the record.
+    :param settings: its relay.
+    """
+    moved = np.flatnonzero(record.command != settings.baseline)
+    resting = int(moved[0]) if moved.size else 0
+    if resting < 1:
+        return SteadyState(settings.setpoint, math.nan, measured=False)
+    # The sample that was answered by the kick was itself taken at rest.
+    y = record.measurement[: resting + 1]
+    noise = float(np.std(y, ddof=1)) if y.size >= _LEAST_SAMPLES else record.noise
+    return SteadyState(float(np.mean(y)), noise / math.sqrt(y.size), measured=True)
+
+
+def static_gain(test: RelayTest, rest: SteadyState) -> StaticGain:
+    """Return the static gain (Wang, Hang and Zou 1997, eq 6).
+
+    ``K = (mean(y) - rest)/(mean(u) - baseline)`` over whole cycles. An error of the steady state,
+    or a load that came after it was measured, enters K divided by the same denominator.
+
+    :param test: a relay test with a bias.
+    :param rest: the measurement under the baseline.
+    :raises IdentificationError: if the mean command is the baseline: the relay was unbiased, or
+        the process integrates.
+    """
+
+    def ratio(part: CycleRun) -> FloatArray:
+        mean_y, mean_u = cycle_means(part.record)
+        away = mean_u - part.settings.baseline
+        if abs(away) < _LEAST_BIAS * part.settings.amplitude:
+            raise IdentificationError(
+                f"the mean command is only {away:g} away from the baseline, so that its ratio to "
+                "the measurement (eq 6) tells no gain: use a biased relay, or the method "
+                "wang_unbiased; an integrating process always has a mean of zero"
+            )
+        return np.array(((mean_y - rest.value) / away, away))
+
+    value, excursion = ratio(test.whole)
+    covariance, _ = test.scatter(ratio)
+    spread = math.nan if covariance is None else math.sqrt(covariance[0, 0])
+    return StaticGain(float(value), spread, float(excursion))
+
+
+Points = tuple[FrequencyPoint, ...]
+
+_MOST = 9
+# Largest w h of a harmonic with samples h apart, and the factor of the relative error
+# (w h)^2/12 of straight lines between them.
+_COARSEST = 0.5
+_POLYGON = 1.0 / 12.0
+_TOO_UNCERTAIN = 0.2
+_NEIGHBOURS = 6
+
+
+def measured_points(whole: CycleRun) -> Points:
+    """Return the points at the harmonics that the command of a relay test excites.
+
+    Their standard deviations are those of white noise, and of straight lines between the samples.
+    Harmonics that are uncertain by more than a fifth, or have too few samples, are left out.
+
+    :param whole: the cycles.
+    :raises IdentificationError: if a cycle has too few samples, or the response at its own
+        frequency drowns in noise.
+    """
+    record = whole.record
+    interval = record.interval
+    fundamental = 2.0 * math.pi / whole.cycle.period
+    if fundamental * interval > _COARSEST:
+        raise IdentificationError(
+            f"a cycle of {whole.cycle.period:g} s holds {whole.cycle.period / interval:.3g} "
+            f"samples; Fourier integrals need at least {2.0 * math.pi / _COARSEST:.0f}: sample "
+            "faster, or use the method waveform"
+        )
+    first, last = record.cycle_start[0], record.cycle_start[-1]
+    # White noise in n samples h apart has integrals whose parts have the variance std^2 h^2 n/2.
+    part = record.noise * interval * math.sqrt(0.5 * (last - first))
+    found = []
+    for harmonic in range(1, int(_COARSEST / (fundamental * interval)) + 1)[:_MOST]:
+        try:
+            point = frequency_point(record, harmonic)
+        except IdentificationError:
+            # The command of a symmetric relay holds nothing at the even ones.
+            continue
+        point = replace(point, std=_deviation(point, interval, part / abs(_excited(whole, point))))
+        if not point.std > _TOO_UNCERTAIN * abs(point.value):
+            found.append(point)
+        elif harmonic == 1:
+            raise _drowned(point)
+    if not found:
+        raise IdentificationError(
+            "the command holds nothing at the frequency of its cycles: they are not bounded by "
+            "the switches of a relay"
+        )
+    return tuple(found)
+
+
+def with_noise_about(model: TransferFunction, whole: CycleRun, points: Points) -> Points:
+    """Return points with standard deviations from the residual of a model.
+
+    Between the harmonics the residual's Fourier integrals show noise alone: neither the limit
+    cycle nor the error of the model has a part there. So they give the size of the noise at the
+    harmonics, whatever its colour.
+
+    :param model: near the points, without unstable poles.
+    :param whole: the cycles that they were measured in.
+    :param points: from :func:`measured_points`.
+    :return: those that are certain enough.
+    :raises IdentificationError: if the point at the frequency of the limit cycle is not.
+    """
+    record = whole.record
+    start, end, cycles = cycle_window(record)
+    if cycles < 2:
+        return points
+    interval = record.interval
+    inside = slice(record.cycle_start[0], record.cycle_start[-1] + 1)
+    time = record.time[inside]
+    left = record.measurement[inside] - response(model, time, record.input())
+    left = left - np.polyval(np.polyfit(time - time[0], left, 1), time - time[0])
+    step = 2.0 * math.pi / (end - start)
+    begin, until = max(start, float(time[0])), min(end, float(time[-1]))
+    found = []
+    for point in points:
+        number = round(point.frequency / step)
+        powers = [
+            abs(fourier_integral_sampled(time, left, begin, until, each * step)) ** 2
+            for each in range(number - _NEIGHBOURS, number + _NEIGHBOURS + 1)
+            if each % cycles and each > 0
+        ]
+        part = math.sqrt(0.5 * float(np.mean(powers)))
+        deviation = _deviation(point, interval, part / abs(_excited(whole, point)))
+        if not deviation > _TOO_UNCERTAIN * abs(point.value):
+            found.append(replace(point, std=deviation))
+    if not found or found[0].frequency > points[0].frequency:
+        raise _drowned(points[0])
+    return tuple(found)
+
+
+def _drowned(point: FrequencyPoint) -> IdentificationError:
+    return IdentificationError(
+        f"the response at {point.frequency:.4g} rad/s, the frequency of the limit cycle, is "
+        f"uncertain by more than {100.0 * _TOO_UNCERTAIN:.0f} %: raise the amplitude of the "
+        "relay, or let it run for more cycles"
+    )
+
+
+def _excited(whole: CycleRun, point: FrequencyPoint) -> complex:
+    start, end, cycles = cycle_window(whole.record)
+    return excitation(whole.record, round(point.frequency * (end - start) / cycles / 2 / math.pi))
+
+
+def _deviation(point: FrequencyPoint, interval: float, noise: float) -> float:
+    chord = _POLYGON * (point.frequency * interval) ** 2 * abs(point.value)
+    return math.hypot(noise, chord)

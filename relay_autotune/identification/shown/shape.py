@@ -25,7 +25,7 @@ from scipy.special import fdtrc
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.shown.fold import Fold, fold, fold_without
-from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, asked_once
 

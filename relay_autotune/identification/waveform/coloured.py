@@ -16,14 +16,20 @@ from dataclasses import replace
 import numpy as np
 
 from relay_autotune.identification.known import LOSSES, Known
-from relay_autotune.identification.waveform.colour import Colour, colour_of, slow_colour
 from relay_autotune.identification.waveform.fit_covariance import (
     NEGLIGIBLE,
     Fit,
     Noise,
     estimate_of,
 )
-from relay_autotune.identification.waveform.residuals import ljung_box, worth
+from relay_autotune.identification.waveform.rational import unit_steps
+from relay_autotune.identification.waveform.residuals import (
+    Colour,
+    colour_of,
+    ljung_box,
+    slow_colour,
+    worth,
+)
 from relay_autotune.identification.waveform.selection import (
     Candidate,
     Ground,
@@ -40,7 +46,6 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
-from relay_autotune.identification.waveform.theta import unit_steps
 
 # Probability as white noise below which a residual has a colour.
 _WHITE = 1e-3

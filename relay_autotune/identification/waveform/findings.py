@@ -17,15 +17,16 @@ from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.combinations import point_of
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
+from relay_autotune.identification.judgement.refits import Halves, halves_of
 from relay_autotune.identification.result import (
     NOT_AT_REST,
     FitReport,
     Identification,
     Rival,
     identified,
+    point_of,
 )
 from relay_autotune.identification.waveform.coloured import PLAIN
 from relay_autotune.identification.waveform.determination import with_what_is_determined
@@ -37,7 +38,6 @@ from relay_autotune.identification.waveform.fit_covariance import (
     noise_of,
     raw_residual,
 )
-from relay_autotune.identification.waveform.halves import Halves, halves_of
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.selection import Candidate, support
 from relay_autotune.identification.waveform.separable import Problem, Trial, evaluate, refine

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.differences import jacobian, relative_steps
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, jacobian, relative_steps
+from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
     covariance_meat,
     mean_slope,
@@ -22,7 +22,6 @@ from relay_autotune.identification.waveform.residuals import (
 )
 from relay_autotune.identification.waveform.selection import Candidate
 from relay_autotune.identification.waveform.separable import Problem, Trial
-from relay_autotune.identification.waveform.theta import unit_steps
 from relay_autotune.record.record import Record
 
 # Residual that is rounding, as a share of the measurement's range.

@@ -33,6 +33,7 @@ from relay_autotune.identification.waveform.coloured import (
 )
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit, raw_residual
+from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, weights
 from relay_autotune.identification.waveform.selection import (
     Candidate,
@@ -52,7 +53,6 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import changes_within
-from relay_autotune.identification.waveform.theta import unit_steps
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.record import Input, Record
 

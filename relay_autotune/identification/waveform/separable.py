@@ -17,9 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.colour import Colour
-from relay_autotune.identification.waveform.rational import free_motion
-from relay_autotune.identification.waveform.theta import columns_of, stepped, unit_steps
+from relay_autotune.identification.waveform.rational import (
+    columns_of,
+    free_motion,
+    stepped,
+    unit_steps,
+)
+from relay_autotune.identification.waveform.residuals import Colour
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.plausibility import latest_dead_time
+from relay_autotune.identification.waveform.rational import columns_of, unit_steps
 from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
@@ -18,7 +19,6 @@ from relay_autotune.identification.waveform.separable import (
     promised,
     refine,
 )
-from relay_autotune.identification.waveform.theta import columns_of, unit_steps
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Input, PiecewiseConstant

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from relay_autotune.loop.gains import Controller
-from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae
+from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae, unstable
 from relay_autotune.tuning.rules.limit_cycle import (
     tyreus_luyben,
     tyreus_luyben_cycle,
@@ -16,10 +16,8 @@ from relay_autotune.tuning.rules.limit_cycle import (
     ziegler_nichols_cycle,
 )
 from relay_autotune.tuning.rules.luyben2003 import luyben2003, luyben2003_p
-from relay_autotune.tuning.rules.simc import simc
-from relay_autotune.tuning.rules.step_response import amigo
+from relay_autotune.tuning.rules.step_response import amigo, simc
 from relay_autotune.tuning.rules.thyagarajan2003 import lcmax, phase_margin, thyagarajan
-from relay_autotune.tuning.rules.unstable import unstable
 from relay_autotune.tuning.task import DesignTask
 
 Rule = Callable[[DesignTask], tuple[Controller, str]]

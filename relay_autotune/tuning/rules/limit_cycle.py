@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.shown.shape import shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
-from relay_autotune.process.half_cycle import HalfCycle
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.tuning.rules.applicability import (

@@ -1,0 +1,356 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What commands share on a terminal: lines as wide as it is, progress, questions."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.errors import LoopError
+from relay_autotune.text import TOLD_EVERY, duration
+
+if TYPE_CHECKING:
+    from relay_autotune.control.verification import StepRange
+
+
+# Longer lines are hard to read, also where the terminal is wider.
+WIDEST = 99
+NARROWEST = 40
+
+_INDENT = "  "
+_LABEL = 16
+# Quantities on one line stand this far apart.
+_GAP = "   "
+
+
+def width() -> int:
+    """Return the columns that text may fill: those of the terminal, or of COLUMNS if it is set."""
+    given = os.environ.get("COLUMNS", "")
+    columns = int(given) if given.isdecimal() else 0
+    # In a pipe, as to `less`, the terminal is where messages and keys are.
+    for stream in (sys.__stdout__, sys.__stderr__, sys.__stdin__):
+        if columns > 0:
+            break
+        try:
+            columns = os.get_terminal_size(stream.fileno()).columns if stream else 0
+        except (OSError, ValueError):
+            continue
+    return min(max(columns or WIDEST, NARROWEST), WIDEST)
+
+
+def broken(text: str, columns: int) -> list[str]:
+    """Return text as lines; a word that is longer than a line, as a path may be, stays whole.
+
+    :param text: its parts are three blanks apart, and stay whole where they fit.
+    :param columns: that a line may have.
+    :return: at least one line.
+    """
+    if len(text) <= columns:
+        return [text]
+    lines: list[str] = []
+    for part in re.split(rf"(?<=\S){_GAP} *(?=\S)", text):
+        if lines and len(lines[-1]) + len(_GAP) + len(part) <= columns:
+            lines[-1] += _GAP + part
+        else:
+            lines += textwrap.wrap(part, columns, break_long_words=False, break_on_hyphens=False)
+    return lines or [""]
+
+
+def paragraphs(text: str, columns: int) -> str:
+    """Return text with its paragraphs filled; lines that begin with a blank stay as they are.
+
+    :param text: lines, as in a docstring.
+    :param columns: that a line may have.
+    """
+    done: list[str] = []
+    words: list[str] = []
+    for line in [*text.splitlines(), ""]:
+        if line[:1].strip():
+            words += line.split()
+            continue
+        if words:
+            done += broken(" ".join(words), columns)
+            words = []
+        done.append(line)
+    return "\n".join(done).strip("\n")
+
+
+class Help(argparse.RawDescriptionHelpFormatter):
+    """The help of a command: paragraphs as wide as the terminal, examples as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n".join(indent + line for line in paragraphs(text, width).splitlines())
+
+
+def labelled(
+    label: str, text: str, columns: int, *, indent: int = len(_INDENT) + _LABEL + 1
+) -> list[str]:
+    """Return text beside its label, as lines.
+
+    :param label: stands on the first line.
+    :param text: see :func:`broken`.
+    :param columns: that a line may have.
+    :param indent: column at which the text begins.
+    """
+    # A label that fills its column still has a space after it.
+    head = f"{_INDENT}{label} "
+    parts = broken(text, max(columns - indent, NARROWEST // 2))
+    return [f"{head if i == 0 else '':<{indent}}{part}".rstrip() for i, part in enumerate(parts)]
+
+
+def in_columns(rows: Sequence[Sequence[str]], columns: int) -> list[str]:
+    """Return a table: the first cell of each row to the left, the others to the right.
+
+    :param rows: of the same number of cells.
+    :param columns: that a line may have; where they do not suffice, the columns stand closer.
+    """
+    needed = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+    gap = 2 if sum(needed) + 2 * len(needed) <= columns else 1
+    first, *others = needed
+    return [
+        f"{_INDENT}{row[0]:<{first}}".rstrip()
+        if not any(row[1:])
+        else _INDENT
+        + f"{row[0]:<{first}}"
+        + "".join(f"{cell:>{gap + n}}" for cell, n in zip(row[1:], others, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+# Time after which a terminal is first told what is being done [s]: several short works in a row
+# must not be silent together.
+_SOON = 0.3
+# Time before the first share of a work is shown, and between two of them [s].
+_PATIENCE = 1.0
+_INTERVAL = 0.2
+
+
+class StatusLine:
+    """What is done or waited for, on standard error: in place on a terminal, else line by line."""
+
+    def __init__(self) -> None:
+        self.in_place = sys.stderr.isatty()
+        self._shown = False
+
+    def __call__(self, status: str) -> None:
+        """Show a sentence."""
+        text = f"\r\x1b[K{status[: width() - 1]}" if self.in_place else f"{status}\n"
+        # The work goes on even if this cannot be written.
+        with suppress(OSError):
+            sys.stderr.write(text)
+            sys.stderr.flush()
+        self._shown = True
+
+    def clear(self) -> None:
+        """Remove the line of a terminal, so that something else can be written."""
+        if self._shown and self.in_place:
+            with suppress(OSError):
+                sys.stderr.write("\r\x1b[K")
+                sys.stderr.flush()
+            self._shown = False
+
+
+class ProgressLine:
+    """The share of a work that is done; on a terminal only.
+
+    :param what: what is being done.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._next = time.monotonic() + _PATIENCE
+        self._line = StatusLine()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show how much is done of how much."""
+        if not self._line.in_place or total <= 0 or time.monotonic() < self._next:
+            return
+        self._next = time.monotonic() + _INTERVAL
+        self._line(f"{self._what}: {100.0 * min(done / total, 1.0):.0f} %")
+
+    def clear(self) -> None:
+        """Remove the line, so that something else can be written."""
+        self._line.clear()
+
+
+class Stages:
+    """Say each second on a terminal what the computation of a model is at, until the block ends.
+
+    :param before: a line that is shown until then.
+    """
+
+    def __init__(self, before: ProgressLine) -> None:
+        self._before = before
+        self._stack = ExitStack()
+        self._working: Working | None = None
+
+    def __call__(self, stage: str) -> None:
+        """Note what begins."""
+        if not sys.stderr.isatty():
+            return
+        if self._working is None:
+            self._before.clear()
+            self._working = self._stack.enter_context(Working("computing the model"))
+        self._working.at(stage)
+
+    def __enter__(self) -> Stages:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+        self._before.clear()
+
+
+class Working:
+    """Say each second on standard error what is being done, until the block ends.
+
+    :param what: what is being done.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._stage = ""
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
+
+    def __enter__(self) -> Working:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def at(self, stage: str) -> None:
+        """Note what the work is at; any thread may call it.
+
+        :param stage: such as ``comparing structures``.
+        """
+        self._stage = f": {stage}"
+
+    def _tell(self) -> None:
+        began, line = time.monotonic(), StatusLine()
+        wait = min(_SOON, TOLD_EVERY) if line.in_place else TOLD_EVERY
+        while not self._over.wait(wait):
+            wait = TOLD_EVERY
+            line(f"{self._what}, {duration(time.monotonic() - began)}{self._stage}")
+        line.clear()
+
+
+# A number as people type it: with a unit, which counts for nothing. A thousand is no unit.
+_UNIT = r"\s*(?!to\b|and\b|k\b|e\b)[^\W\d_][\w/^*]*|\s*[%°][a-z]*"
+_NUMBER = rf"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(?:{_UNIT})?"
+# What stands between two; a single point belongs to a number, and so does a dash before which
+# there is a blank alone.
+_BETWEEN = r"\s*(?:\.{2,}|[,;]|\bto\b|\band\b|-(?=\s)|(?<!\s)-|\s)\s*"
+_ONE = re.compile(_NUMBER, re.IGNORECASE)
+_TWO = re.compile(_NUMBER + _BETWEEN + _NUMBER, re.IGNORECASE)
+# Dashes of other keyboards.
+_DASHES = str.maketrans(dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}", "-"))
+
+
+def asked_for_file(what: str, names: Collection[str]) -> str:
+    """Ask for a file to write; return its name, or one of some programs, empty for none.
+
+    :param what: what would be written.
+    :param names: programs that may be named in its place.
+    """
+    while True:
+        answer = _input(f"{what}: file name, or another program [none]: ")
+        if answer.lower() in ("n", "no", "none"):
+            return ""
+        if answer.lower() in names:
+            return answer.lower()
+        if answer.lower() not in ("y", "yes"):
+            return str(Path(answer).expanduser()) if answer else ""
+        told = "expected the name of a file, such as gains.yaml, or Enter for none"
+        print(told, file=sys.stderr)
+
+
+def agrees(question: str, *, yes: bool) -> bool:
+    """Ask a question, unless ``--yes`` has answered it.
+
+    :param question: with its question mark.
+    :param yes: whether the flag was given.
+    :raises LoopError: if nobody can be asked.
+    """
+    if yes:
+        return True
+    _require_somebody("--yes")
+    return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
+
+
+def agreed_step(question: str, step: float, allowed: StepRange) -> float:
+    """Ask whether to make a step; return its height, 0 for none.
+
+    :param question: with its question mark.
+    :param step: the height that yes takes [y].
+    :param allowed: the heights that may be typed in its place.
+    :raises LoopError: if nobody can be asked.
+    """
+    _require_somebody("--yes")
+    print("\n" + "\n".join(broken(question, width())))
+    while True:
+        answer = _input(f"[y/N, or another step, such as {0.5 * step:.2g}] ").lower()
+        if answer in ("", "n", "no", "y", "yes"):
+            return step if answer.startswith("y") else 0.0
+        other = number_of(answer)
+        if other is not None and allowed.allows(other):
+            return other
+        told = f"expected y, n, or the height of the step, {allowed.words}"
+        print("\n".join(broken(told, width())), file=sys.stderr)
+
+
+def asked(what: str, flag: str, known: str, example: str, read: Callable[[str], Any]) -> Any:
+    """Ask for a value until it can be read.
+
+    :param what: what is asked for, with its unit.
+    :param flag: the flag that would have given it.
+    :param known: the value that Enter takes; empty: none.
+    :param example: what may be typed.
+    :param read: returns the value of a text; None: it has none.
+    """
+    _require_somebody(flag)
+    shown = f"{what}, such as {example}" + f" [{known}]: " * bool(known) + ": " * (not known)
+    while (value := read(_input(shown) or known)) is None:
+        found = "two numbers, the lower one first" if read is pair_of else "a number"
+        print(f"expected {found}, such as {example}", file=sys.stderr)
+    return value
+
+
+def _require_somebody(flag: str) -> None:
+    if not sys.stdin.isatty():
+        raise LoopError(f"nobody can be asked here: give {flag}")
+
+
+def _input(shown: str) -> str:
+    try:
+        return input(shown).strip()
+    except EOFError:
+        raise LoopError("the input has ended: nothing was changed") from None
+
+
+def number_of(text: str) -> float | None:
+    """Return a finite number, such as 2.5 or 35 %, or None if a text is something else."""
+    found = _ONE.fullmatch(text.strip().translate(_DASHES))
+    value = float(found[1]) if found else math.nan
+    return value if math.isfinite(value) else None
+
+
+def pair_of(text: str) -> list[float] | None:
+    """Return two finite numbers in order, such as 0 5, 0-5, 0 to 5 % or 0..5; None: other text."""
+    found = _TWO.fullmatch(text.strip(" ()[]").translate(_DASHES))
+    low, high = map(float, found.groups()) if found else (math.nan, math.nan)
+    return [low, high] if -math.inf < low < high < math.inf else None
