@@ -32,11 +32,12 @@ from random_experiments import Experiment, with_delay
 from simulated_summary import summary
 
 import relay_autotune
-from relay_autotune.analysis import Analysis, analyse_alone
+from relay_autotune.analysis import analyse_alone
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome
+from relay_autotune.result import Analysis
 from relay_autotune.tuning import DesignOptions, Gains
 
 EXPERIMENTS = 10_000

@@ -29,10 +29,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis, analyse, analyse_jointly
+    from relay_autotune.analysis import analyse, analyse_jointly
     from relay_autotune.bag.reader import read_records
     from relay_autotune.errors import RelayAutotuneError
-    from relay_autotune.exchange.notebook import to_control
+    from relay_autotune.exchange.models import to_control
     from relay_autotune.experiment.experiment import RelayExperiment
     from relay_autotune.experiment.parameters import ExperimentParameters
     from relay_autotune.identification.known import Known
@@ -45,10 +45,12 @@ if TYPE_CHECKING:
     from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
     from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
     from relay_autotune.report import draw, write_report
+    from relay_autotune.result import Analysis
     from relay_autotune.tuning import RULES, Controller, DesignOptions, Gains, tune
 
 _HOMES = {
-    "analysis": ("Analysis", "analyse", "analyse_jointly"),
+    "analysis": ("analyse", "analyse_jointly"),
+    "result": ("Analysis",),
     "bag.reader": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification.known": ("Known",),
@@ -56,7 +58,7 @@ _HOMES = {
     "identification.result": ("Identification",),
     "process.structures": ("STRUCTURES",),
     "process.transfer_function": ("TransferFunction",),
-    "exchange.notebook": ("to_control",),
+    "exchange.models": ("to_control",),
     "record.record": ("Outcome", "PiecewiseConstant", "Record", "RelaySettings"),
     "experiment.experiment": ("RelayExperiment",),
     "experiment.parameters": ("ExperimentParameters",),

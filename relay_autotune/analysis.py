@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError, defect
-from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
@@ -33,18 +32,18 @@ from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
+from relay_autotune.result import Analysis
 from relay_autotune.shaping import Shaping
 from relay_autotune.tuning import (
     DEFAULT_RULE,
     RULES,
     DesignOptions,
     DesignTask,
-    Gains,
     design,
     ensemble,
     rule_named,
 )
-from relay_autotune.tuning.ensemble import PredictedMs, predicted_ms
+from relay_autotune.tuning.ensemble import predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge
 
@@ -61,87 +60,6 @@ Tell = Callable[[str], object]
 
 def _quiet(_: str) -> None:
     """Tell nobody."""
-
-
-@dataclass(frozen=True, repr=False)
-class Analysis:
-    """Result of the analysis of one record.
-
-    >>> from relay_autotune import analyse, read_records
-    >>> found = analyse(read_records("bags/heater.csv")[0])
-    >>> found                                                       # doctest: +ELLIPSIS
-    <Analysis of <Record: 450 samples over 898 s, recorded elsewhere>
-      process   0.6204 e^(-15.89 s) / (1 + 110.2 s)   (fopdt, waveform)
-    ...
-      verdict   trusted
-    ...
-    >>> found.verdict.name, found.best_gains.rule, len(found.gains) > 5
-    ('TRUSTED', 'robust', True)
-
-    :param record: the record.
-    :param cycles: its whole cycles.
-    :param models: the models of all methods that apply, the chosen method's first.
-    :param selected: index of the selected model; None: nothing was identified.
-    :param gains: the gains of all rules that apply to that model, the chosen rule's first.
-    :param recommended: index of the recommended gains; None: there are no gains.
-    :param reason: why there is no model or no gains; empty if there are both.
-    :param added_delay: dead time beside the process's own with which the gains were judged [s]:
-        half a sampling period of the controller, and what else its loop adds.
-    :param judgement: findings of the checks, and the verdict.
-    :param predicted: for a running experiment, Ms with the gains of its model; None: not asked
-        for, or no gains.
-    :param shaping: all that is needed to design other gains; None: no gains are allowed.
-    """
-
-    record: Record
-    cycles: tuple[Cycle, ...] = ()
-    models: tuple[Identification, ...] = ()
-    selected: int | None = None
-    gains: tuple[Gains, ...] = ()
-    recommended: int | None = None
-    reason: str = ""
-    added_delay: float = 0.0
-    judgement: Judgement = NOT_JUDGED
-    predicted: PredictedMs | None = None
-    shaping: Shaping | None = field(default=None, compare=False)
-
-    @property
-    def model(self) -> Identification | None:
-        """The selected identification."""
-        return None if self.selected is None else self.models[self.selected]
-
-    @property
-    def best_gains(self) -> Gains | None:
-        """The recommended gains."""
-        return None if self.recommended is None else self.gains[self.recommended]
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the gains may be used."""
-        return self.judgement.verdict
-
-    @property
-    def finding(self) -> FitProgress:
-        """Result of the fit and its prediction for a running experiment."""
-        model, ms = self.model, self.predicted
-        if model is None:
-            return FitProgress()
-        found = FitProgress(model.ultimate_gain, model.ultimate_gain_std)
-        return found if ms is None else replace(found, ms=ms.ms, ms_low=ms.low, ms_high=ms.high)
-
-    def __repr__(self) -> str:
-        """Return model, verdict and gains on ten lines at most; the fields have the rest."""
-        # Imported here, because only notebooks and interpreters need it.
-        from relay_autotune.exchange.notebook import analysis_text
-
-        return analysis_text(self)
-
-    def _repr_html_(self) -> str:
-        """Return model and gains as a table, as notebooks show it."""
-        # Imported here, because only notebooks need it.
-        from relay_autotune.exchange.notebook import analysis_html
-
-        return analysis_html(self)
 
 
 def check_names(method: str, rule: str) -> None:

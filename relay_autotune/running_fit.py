@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from relay_autotune.analysis import Analysis, model_so_far, prediction_so_far
+from relay_autotune.analysis import model_so_far, prediction_so_far
 from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods import DEFAULT_METHOD
 from relay_autotune.identification.result import Identification
 from relay_autotune.record.record import Record
+from relay_autotune.result import Analysis
 from relay_autotune.tuning import DEFAULT_RULE, DesignOptions
 
 # The structure is chosen again at the latest when the record has grown by this factor.

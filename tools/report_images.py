@@ -18,7 +18,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from relay_autotune.analysis import Analysis, analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import demo
 from relay_autotune.experiment.experiment import RelayExperiment
@@ -28,6 +28,7 @@ from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import Case, case_of
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.style import save
+from relay_autotune.result import Analysis
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs/images"

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from relay_autotune.analysis import Analysis
 from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.analysis_arguments import add_analysis, add_export, export_target, jobs_of
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
@@ -27,6 +26,7 @@ from relay_autotune.cli.report import (
 )
 from relay_autotune.cli.terminal import ProgressLine, Stages, width
 from relay_autotune.errors import SelectionError
+from relay_autotune.result import Analysis
 
 PROGRAM = "replay"
 

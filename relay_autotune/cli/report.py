@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.analysis import Analysis, analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import (
     DONE,
@@ -36,6 +36,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.record.record import Record
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
+from relay_autotune.result import Analysis
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case

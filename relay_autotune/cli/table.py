@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.cli.terminal import WIDEST, labelled
+from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.text import date_text, digits, plus_minus, process_text
+from relay_autotune.text import date_text, digits, plus_minus
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis
     from relay_autotune.identification.result import Identification, Validation
     from relay_autotune.process.transfer_function import TransferFunction
+    from relay_autotune.result import Analysis
     from relay_autotune.tuning import Gains
 
 # Rivals beyond these are told in the JSON document alone.

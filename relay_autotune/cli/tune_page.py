@@ -50,8 +50,9 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.identifier_parameters import options_from
 from relay_autotune.nodes.tune_client import TuneClient
+from relay_autotune.process.transfer_function import process_text
 from relay_autotune.report.case import EstimatedQuantity, case_of, model_case
-from relay_autotune.text import digits, process_text
+from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
 from relay_autotune.web.live import APPLY, CHECK, REVERT, START, Live, Wish

@@ -24,8 +24,9 @@ from relay_autotune.cli.table import gains_lines
 from relay_autotune.cli.terminal import WIDEST, labelled
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
-from relay_autotune.text import digits, duration, process_text
+from relay_autotune.text import digits, duration
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from relay_autotune.record.record import Outcome, Record
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, verdict_named
 
 if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis
+    from relay_autotune.result import Analysis
 
 _SHAPE = ("sharpness", "plateau", "growth", "rise", "rise_half")
 

@@ -1,18 +1,19 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models in documents and messages: the transfer function, its parameters, how sure they are."""
+"""Models in documents, in messages and in python-control, with how sure their parameters are."""
 
 from __future__ import annotations
 
 import array
+import importlib
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from relay_autotune.errors import ModelError, RelayAutotuneError
+from relay_autotune.errors import MissingPackageError, ModelError, RelayAutotuneError
 from relay_autotune.exchange.fields import (
     Special,
     float64_array,
@@ -25,6 +26,7 @@ from relay_autotune.exchange.fields import (
 )
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Rival
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import GENERAL, structure_of
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -189,3 +191,37 @@ register(
     Special(_estimate_fields, _estimate_of_fields, _estimate_to_message, _estimate_of_message),
 )
 register(Rival, Special(_rival_fields, _rival_of_fields))
+
+
+def to_control(system: TransferFunction | Controller, *, pade_order: int = 5) -> Any:
+    """Return a model, or a controller from error to command, as `control.TransferFunction`.
+
+    >>> from relay_autotune import Controller, TransferFunction, to_control
+    >>> loop = to_control(TransferFunction.fopdt(1.65, 20.0, 10.0))
+    >>> loop = loop * to_control(Controller(kc=0.6, ti=20.0))
+    >>> loop.ninputs, loop.noutputs
+    (1, 1)
+
+    A rational function cannot hold a dead time D: it becomes a Pade approximation, all-pass, whose
+    phase is that of the dead time up to about ``w = n/D`` rad/s for the order n (within 0.03 rad
+    for n = 2, 0.003 rad for n = 5). A controller's set-point weight has no place in it.
+
+    :param system: a process, or a controller such as the gains of a rule.
+    :param pade_order: n >= 1, the number of poles that the dead time adds.
+    :raises ModelError: if the order is less than 1.
+    :raises MissingPackageError: if python-control is not installed.
+    """
+    if pade_order < 1:
+        raise ModelError(f"pade_order must be at least 1, found {pade_order}")
+    try:
+        control = importlib.import_module("control")
+    except ImportError as error:
+        raise MissingPackageError(
+            f"python-control is needed for to_control and cannot be loaded ({error}); "
+            "install it with `pip install control`"
+        ) from error
+    model = system if isinstance(system, TransferFunction) else system.transfer_function()
+    rational = control.TransferFunction(list(model.numerator), list(model.denominator))
+    if model.dead_time == 0.0:
+        return rational
+    return rational * control.TransferFunction(*control.pade(model.dead_time, pade_order))

@@ -15,10 +15,9 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, Uncertain
 from relay_autotune.identification.shown.fourier import FrequencyPoint
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95, told, told_fields
-from relay_autotune.text import process_text
 
 # Largest half interval of a determined value, relative to the value.
 DETERMINED = 0.2

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 
-from relay_autotune.analysis import Analysis, analyse, analyse_jointly, check_names, model_so_far
+from relay_autotune.analysis import analyse, analyse_jointly, check_names, model_so_far
 from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,
@@ -35,6 +35,7 @@ from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.results import Refusals, SignsOfLife
 from relay_autotune.record.record import Outcome, Record
+from relay_autotune.result import Analysis
 from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.verdict import Judgement
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction

@@ -1,13 +1,14 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Transfer functions: rational functions of s with a dead time."""
+"""Transfer functions: rational functions of s with a dead time; as text, LaTeX and MathML."""
 
 from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,13 @@ from relay_autotune.process.model_parameters import (
     oscillating_pair,
     positive,
 )
-from relay_autotune.text import process_latex, process_text
+from relay_autotune.text import digits
+
+_MINUS, _TIMES = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}"
+_SPACE = r" \, "
+
+# Coefficients of 1, s, s^2 of one factor.
+_Polynomial = tuple[float, ...]
 
 
 def _conjugate_closed(values: tuple[complex, ...]) -> bool:
@@ -243,3 +250,116 @@ class TransferFunction:
         """Return ``K (z s + 1) exp(-D s)/(s^2/w0^2 + 2 zeta s/w0 + 1)``, any damping."""
         pair = oscillating_pair(natural_frequency, damping)
         return cls.sopdt(gain, pair, dead_time, zero)
+
+
+def process_text(model: TransferFunction) -> str:
+    """Return a transfer function on one line, such as ``1.65 e^(-10 s) / (1 + 20 s)``.
+
+    :param model: the process.
+    """
+    above = [digits(model.gain), *map(_plain, _polynomials(model.zeros))]
+    if model.dead_time:
+        above.append(f"e^(-{digits(model.dead_time)} s)")
+    below = [_plain(p) for p in _polynomials(model.time_constants)]
+    if model.integrators:
+        below.insert(0, "s" if model.integrators == 1 else f"s^{model.integrators}")
+    if not below:
+        return " ".join(above)
+    return f"{' '.join(above)} / {below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
+
+
+def process_latex(model: TransferFunction) -> str:
+    r"""Return a transfer function as LaTeX, such as ``\frac{1.65}{1 + 20 s} e^{-10 s}``.
+
+    :param model: the process.
+    """
+    above = _factors(model.zeros, _latex_factor)
+    below = _factors(model.time_constants, _latex_factor)
+    if model.integrators > 0:
+        below.insert(0, "s" if model.integrators == 1 else f"s^{{{model.integrators}}}")
+    if model.integrators < 0:
+        above.insert(0, "s" if model.integrators == -1 else f"s^{{{-model.integrators}}}")
+    top = _SPACE.join([_latex_number(model.gain), *above])
+    text = rf"\frac{{{top}}}{{{_SPACE.join(below)}}}" if below else top
+    if model.dead_time:
+        text += rf" \, e^{{-{_latex_number(model.dead_time)} s}}"
+    return text
+
+
+def process_mathml(model: TransferFunction) -> str:
+    """Return a transfer function as MathML, which browsers draw by themselves.
+
+    :param model: the process.
+    """
+    above = _factors(model.zeros, _mathml_factor)
+    below = _factors(model.time_constants, _mathml_factor)
+    if model.integrators:
+        power = _mathml_power("<mi>s</mi>", abs(model.integrators))
+        (below if model.integrators > 0 else above).insert(0, power)
+    top = "".join([_mathml_number(model.gain), *above])
+    if model.dead_time:
+        exponent = f"<mo>{_MINUS}</mo>{_mathml_number(model.dead_time)}<mi>s</mi>"
+        top += f"<msup><mi>e</mi><mrow>{exponent}</mrow></msup>"
+    if below:
+        top = f"<mfrac><mrow>{top}</mrow><mrow>{''.join(below)}</mrow></mfrac>"
+    return f'<math display="block"><mrow>{top}</mrow></math>'
+
+
+def _polynomials(constants: Iterable[complex]) -> list[_Polynomial]:
+    """Return a factor for each real constant and for each conjugate pair.
+
+    A pair is (1 + z s)(1 + z* s) = 1 + 2 Re(z) s + |z|^2 s^2.
+    """
+    found: list[_Polynomial] = []
+    for value in constants:
+        if value.imag > 0.0:
+            found.append((1.0, 2.0 * value.real, abs(value) ** 2))
+        elif value.imag == 0.0:
+            found.append((1.0, value.real))
+    return found
+
+
+def _plain(polynomial: _Polynomial) -> str:
+    sign = "-" if polynomial[1] < 0.0 and len(polynomial) == 2 else "+"
+    if len(polynomial) == 2:
+        return f"(1 {sign} {digits(abs(polynomial[1]))} s)"
+    return f"(1 + {digits(polynomial[1])} s + {digits(polynomial[2])} s^2)"
+
+
+def _factors(constants: Iterable[complex], draw: Callable[[_Polynomial, int], str]) -> list[str]:
+    """Return the factors, equal ones as a power."""
+    counted = Counter(_polynomials(constants))
+    return [draw(polynomial, power) for polynomial, power in counted.items()]
+
+
+def _latex_number(value: float) -> str:
+    mantissa, _, exponent = digits(value).partition("e")
+    return rf"{mantissa} \times 10^{{{int(exponent)}}}" if exponent else mantissa
+
+
+def _latex_factor(polynomial: _Polynomial, power: int) -> str:
+    text = "1"
+    for k, c in enumerate(polynomial[1:], start=1):
+        text += f" {'-' if c < 0.0 else '+'} {_latex_number(abs(c))} s" + ("^2" if k == 2 else "")
+    return f"({text})" + (f"^{{{power}}}" if power > 1 else "")
+
+
+def _mathml_number(value: float) -> str:
+    sign = f"<mo>{_MINUS}</mo>" if value < 0.0 else ""
+    mantissa, _, exponent = digits(abs(value)).partition("e")
+    text = f"{sign}<mn>{mantissa}</mn>"
+    if exponent:
+        text += f"<mo>{_TIMES}</mo><msup><mn>10</mn><mn>{int(exponent)}</mn></msup>"
+    return text
+
+
+def _mathml_power(inner: str, power: int) -> str:
+    return f"<msup><mrow>{inner}</mrow><mn>{power}</mn></msup>" if power > 1 else inner
+
+
+def _mathml_factor(polynomial: _Polynomial, power: int) -> str:
+    text = "<mn>1</mn>"
+    for k, c in enumerate(polynomial[1:], start=1):
+        variable = "<mi>s</mi>" if k == 1 else "<msup><mi>s</mi><mn>2</mn></msup>"
+        text += f"<mo>{_MINUS if c < 0.0 else '+'}</mo>{_mathml_number(abs(c))}{variable}"
+    return _mathml_power(f"<mrow><mo>(</mo>{text}<mo>)</mo></mrow>", power)

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from relay_autotune.analysis import Analysis
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.report.case import Case
+    from relay_autotune.result import Analysis
 
 PICTURES = (".png", ".svg", ".pdf")
 # In the head of each page, before the version.
@@ -82,8 +82,8 @@ def write_report(
     :param title: of the page; default: the id of the first experiment.
     :param truth: the true process, if it was simulated.
     """
-    from relay_autotune.analysis import Analysis
     from relay_autotune.report.case import case_of
+    from relay_autotune.result import Analysis
 
     several = [analyses] if isinstance(analyses, Analysis) else list(analyses)
     default = "Relay experiment"

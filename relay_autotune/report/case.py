@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.analysis import Analysis
 from relay_autotune.bag.source import open_regular
 from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.exchange.document import judgement_of_fields
@@ -31,6 +30,7 @@ from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.result import Analysis
 from relay_autotune.text import visible
 from relay_autotune.tuning import Controller, Gains, ensemble
 from relay_autotune.verdict import NOT_JUDGED, Judgement

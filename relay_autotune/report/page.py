@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import relay_autotune
+from relay_autotune.process.transfer_function import process_mathml, process_text
 from relay_autotune.report.case import Case
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
@@ -29,7 +30,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import COLOURS, inline
-from relay_autotune.text import digits, plus_minus, process_mathml, process_text, visible
+from relay_autotune.text import digits, plus_minus, visible
 
 # Colours of the page in dark mode; those of the figures come from COLOURS.
 _NIGHT = (

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record
 from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase
 from relay_autotune.report.findings import (
@@ -29,7 +30,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import in_steps, thinned
-from relay_autotune.text import digits, process_text, visible
+from relay_autotune.text import digits, visible
 from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.shape import CALM, FAST, STEP, Asked, Shaped, Subject

@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from relay_autotune.analysis import Analysis
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.messages import fill_transfer_function
@@ -33,6 +32,7 @@ from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import told_fields
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.result import Analysis
 
 MODEL = TransferFunction.fopdt(1.0, 2.0, 1.0)
 RELAY = RelaySettings(3.0, 1.0, 1.0, 0.0, 0.1)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import Analysis, analyse, analyse_alone, model_so_far
+from relay_autotune.analysis import analyse, analyse_alone, model_so_far
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.disturbance import last_cycles
 from relay_autotune.identification.known import Known
@@ -23,6 +23,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome, Record, RelaySettings
+from relay_autotune.result import Analysis
 from relay_autotune.tuning import RULES
 
 

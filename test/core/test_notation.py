@@ -11,8 +11,12 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from relay_autotune.process.structures import INTEGRATOR_LAG
-from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.text import date_text, digits, process_latex, process_mathml
+from relay_autotune.process.transfer_function import (
+    TransferFunction,
+    process_latex,
+    process_mathml,
+)
+from relay_autotune.text import date_text, digits
 
 MODELS = {
     "1.650 e^(-10.00 s) / (1 + 20.00 s)": TransferFunction.fopdt(1.65, 20.0, 10.0),

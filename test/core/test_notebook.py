@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from relay_autotune.analysis import Analysis, analyse, analyse_alone
+from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.errors import RecordError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.methods import identify
@@ -19,6 +19,7 @@ from relay_autotune.identification.result import identified
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
+from relay_autotune.result import Analysis
 from relay_autotune.text import plus_minus
 
 RECORD = Record(time=[0.0, 1.0], measurement=[0.0, 1.0], command=[0.0, 1.0])

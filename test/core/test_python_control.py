@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import MissingPackageError, ModelError
-from relay_autotune.exchange.notebook import to_control
+from relay_autotune.exchange.models import to_control
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

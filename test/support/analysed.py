@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import Analysis, analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
+from relay_autotune.result import Analysis
 from relay_autotune.verdict import Check, Judgement, Measured, judge
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)

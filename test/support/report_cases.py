@@ -10,9 +10,9 @@ from dataclasses import replace
 import pytest
 from analysed import completed
 
-from relay_autotune.analysis import Analysis
 from relay_autotune.record.record import Outcome
 from relay_autotune.report import figures, page
+from relay_autotune.result import Analysis
 from relay_autotune.verdict import Judgement
 
 

@@ -17,9 +17,10 @@ from typing import Any
 
 from tornado.websocket import websocket_connect
 
-from relay_autotune.analysis import Analysis, analyse
+from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.report.case import case_of
+from relay_autotune.result import Analysis
 from relay_autotune.tuning import DesignOptions
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import Live

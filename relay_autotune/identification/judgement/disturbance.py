@@ -305,9 +305,6 @@ def with_its_load(
     samples = relay and len(found.fitted) == len(record)
     if not samples or record.continuous_command or not is_contradicted(found, record):
         return found, record
-    # Imported here, since few records need it.
-    from relay_autotune.identification.judgement.disturbance import identify_with_load
-
     for structure in _SIMPLE:
         try:
             start = identify(record, structure) if structure else found
