@@ -41,7 +41,7 @@ from information import relative_bounds
 from processes import true_point
 from sampled_relay import exact_limit_cycle
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import RunningFit, Task, analyse_alone
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.structures import (
@@ -53,7 +53,6 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Record, RelaySettings
-from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.tuning import DesignOptions, analyse_loop
 
 RECORDS = 50

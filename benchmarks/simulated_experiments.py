@@ -32,7 +32,7 @@ from random_experiments import Experiment, with_delay
 from simulated_summary import summary
 
 import relay_autotune
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import Task, analyse_alone
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.process.ultimate import ultimate_point
@@ -135,7 +135,7 @@ def run(seed: int, state: str) -> Result:
     elif tune.finished and tune.sample_count:
         # What identifier_node would publish; one structure is enough to see that there is none.
         known = Known(structure="fopdt")
-        result.gains = analyse_alone(tune.record(), known=known).best_gains is not None
+        result.gains = analyse_alone(tune.record(), Task(known=known)).best_gains is not None
     result.seconds = wall.process_time() - began
     return result
 

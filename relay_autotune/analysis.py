@@ -1,17 +1,21 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a record to models and gains; live nodes and replay share this path."""
+"""From records to models and gains: of an ended test, a running one, or several tests.
+
+Live nodes and replay share this path.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from relay_autotune.errors import IdentificationError, RelayAutotuneError, TuningError, defect
+from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
@@ -54,6 +58,10 @@ _NO_GAINS = {
 # Parameters of a load step: its instant and size.
 _LOAD = 2
 
+# The structure of a running experiment is chosen again at the latest when its record has grown by
+# this factor.
+_CHOSEN_ANEW = 1.1
+
 # Takes a sentence on what begins.
 Tell = Callable[[str], object]
 
@@ -62,13 +70,31 @@ def _quiet(_: str) -> None:
     """Tell nobody."""
 
 
-def check_names(method: str, rule: str) -> None:
-    """Refuse unknown names before any work is done.
+@dataclass(frozen=True)
+class Task:
+    """How to identify a record and to design a controller for it.
 
-    :raises RelayAutotuneError: for an unknown method or rule; the message lists the known ones.
+    :param method: the method of the selected model.
+    :param rule: the rule of the recommended gains.
+    :param known: known values of the process.
+    :param options: design options of the controller; noise, amplitude and sampling period come
+        from the record if they are not given.
+    :raises RelayAutotuneError: if method or rule are unknown; the message lists the known ones.
     """
-    method_named(method)
-    rule_named(rule)
+
+    method: str = DEFAULT_METHOD
+    rule: str = DEFAULT_RULE
+    known: Known = NOTHING
+    options: DesignOptions = field(default_factory=DesignOptions)
+
+    def __post_init__(self) -> None:
+        method_named(self.method)
+        rule_named(self.rule)
+
+    @property
+    def chooses(self) -> bool:
+        """Whether the structure is for the method to choose."""
+        return self.method == DEFAULT_METHOD and not self.known.structure
 
 
 def analyse(
@@ -108,25 +134,19 @@ def analyse(
     :raises RelayAutotuneError: if method or rule are unknown, or it is not a record.
     """
     record = one_record(record, "analyse")
-    check_names(method, rule)
+    task = Task(method, rule, known, options or DesignOptions())
     tell("comparing structures" if method == DEFAULT_METHOD else f"identifying by {method}")
-    chosen = _chosen(record, method, known)
+    chosen = _chosen(record, task)
     if isinstance(chosen, Analysis):
         return chosen
     tell("comparing methods")
-    models = [chosen.model, *_others(chosen.driven, method, known, chosen.model)]
+    models = [chosen.model, *_others(chosen.driven, task, chosen.model)]
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
-    return _assessed(chosen, models, known, _first(rule), simple, options, rng, tell)
+    return _assessed(chosen, models, _Tuning(task, _first(rule), simple, rng, tell))
 
 
 def analyse_alone(
-    record: Record,
-    *,
-    method: str = DEFAULT_METHOD,
-    rule: str = DEFAULT_RULE,
-    known: Known = NOTHING,
-    options: DesignOptions | None = None,
-    rng: np.random.Generator | None = None,
+    record: Record, task: Task | None = None, rng: np.random.Generator | None = None
 ) -> Analysis:
     """Identify a record by one method and, where the experiment was completed, tune by one rule.
 
@@ -134,64 +154,78 @@ def analyse_alone(
     records.
 
     :param record: the experiment.
-    :param method: the method.
-    :param rule: the rule.
-    :param known: known values of the process.
-    :param options: as for :func:`analyse`.
+    :param task: method, rule, what is known and asked; None: the defaults.
     :param rng: as for :func:`analyse`.
-    :raises RelayAutotuneError: if method or rule are unknown, or it is not a record.
+    :raises RelayAutotuneError: if it is not a record.
     """
-    record = one_record(record, "analyse_alone")
-    check_names(method, rule)
-    chosen = _chosen(record, method, known)
+    record, task = one_record(record, "analyse_alone"), task or Task()
+    chosen = _chosen(record, task)
     if isinstance(chosen, Analysis):
         return chosen
-    simple = chosen.simple(known, rule)
-    return _assessed(chosen, [chosen.model], known, (rule,), simple, options, rng)
+    tuning = _Tuning(task, (task.rule,), chosen.simple(task), rng)
+    return _assessed(chosen, [chosen.model], tuning)
 
 
-def model_so_far(
-    record: Record, *, method: str = DEFAULT_METHOD, known: Known = NOTHING
-) -> Analysis:
+def model_so_far(record: Record, task: Task | None = None) -> Analysis:
     """Identify the record of a running experiment by one method.
 
     This takes a fraction of the time of :func:`analyse`. There are no gains.
 
     :param record: the record so far.
-    :param method: the method.
-    :param known: known values of the process.
-    :raises RelayAutotuneError: if the method is unknown.
+    :param task: method and what is known; None: the defaults.
     """
-    method_named(method)
-    chosen = _chosen_so_far(record, method, known)
+    chosen = _chosen_so_far(record, task or Task())
     return chosen if isinstance(chosen, Analysis) else chosen.alone
 
 
-def prediction_so_far(
-    record: Record,
-    *,
-    method: str = DEFAULT_METHOD,
-    rule: str = DEFAULT_RULE,
-    known: Known = NOTHING,
-    options: DesignOptions | None = None,
-    rng: np.random.Generator | None = None,
-) -> Analysis:
+def prediction_so_far(record: Record, task: Task) -> Analysis:
     """Identify like :func:`model_so_far`, and predict the Ms of the gains.
 
     :param record: the record so far.
-    :param method: the method.
-    :param rule: the rule of the gains.
-    :param known: known values of the process.
-    :param options: as for :func:`analyse`.
-    :param rng: as for :func:`analyse`.
-    :raises RelayAutotuneError: if method or rule are unknown.
+    :param task: method, rule, what is known and asked.
     """
-    check_names(method, rule)
-    chosen = _chosen_so_far(record, method, known)
+    chosen = _chosen_so_far(record, task)
     if isinstance(chosen, Analysis):
         return chosen
-    task = _task(chosen.alone, rng, chosen.simple(known, rule), options)
-    return replace(chosen.alone, predicted=predicted_ms(task, rule_named(rule)))
+    tuning = _Tuning(task, (task.rule,), chosen.simple(task))
+    predicted = predicted_ms(tuning.design_task(chosen.alone), rule_named(task.rule))
+    return replace(chosen.alone, predicted=predicted)
+
+
+class RunningFit:
+    """Fit the record of a running experiment repeatedly, with as little work as possible.
+
+    Choosing among all structures takes ten times as long as fitting one. So the last chosen
+    structure is fitted first. If its interval is already too wide to end the experiment, the
+    spread between the structures would only widen it, and the choice is skipped.
+    """
+
+    def __init__(self) -> None:
+        self._chosen: Identification | None = None
+        self._duration = 0.0
+
+    def fit(self, record: Record, task: Task, sought: str, wanted: float) -> Analysis:
+        """Return the model of the record so far, with the predicted Ms if that is sought.
+
+        :param record: the record so far.
+        :param task: settings of the fit.
+        :param sought: the quantity whose interval ends the experiment, one of
+            :data:`~relay_autotune.experiment.early_end.SOUGHT`.
+        :param wanted: half the interval's width over the value.
+        """
+        so_far = prediction_so_far if sought == MS else model_so_far
+        chosen = self._chosen
+        recent = record.duration < _CHOSEN_ANEW * self._duration
+        if task.chooses and chosen is not None and recent:
+            order = chosen.estimate.structure.given_order
+            known = replace(task.known, structure=chosen.structure, order=order)
+            again = so_far(record, replace(task, known=known))
+            if again.model is not None and not again.finding.width(sought) <= wanted:
+                return again
+        found = so_far(record, task)
+        if task.chooses:
+            self._chosen, self._duration = found.model, record.duration
+        return found
 
 
 @dataclass(frozen=True)
@@ -214,39 +248,70 @@ class _Chosen:
         """The analysis with this model only."""
         return Analysis(self.record, self.cycles, (self.model,), 0)
 
-    def simple(self, known: Known, rule: str) -> TransferFunction | None:
-        """Return the FOPDT for a rule, None if the rule needs none or there is none."""
+    def simple(self, task: Task) -> TransferFunction | None:
+        """Return the FOPDT for the rule, None if the rule needs none or there is none."""
         if self.model.structure == FOPDT.name:
             return self.model.model
-        return None if rule == DEFAULT_RULE else _simple((self.driven,), known, self.model)
+        if task.rule == DEFAULT_RULE:
+            return None
+        return _simple((self.driven,), task.known, self.model)
 
 
-def _chosen(record: Record, method: str, known: Known) -> _Chosen | Analysis:
+@dataclass(frozen=True)
+class _Tuning:
+    """What the selected model is tuned with.
+
+    :param task: what is known and asked.
+    :param rules: names of the rules, the one of the recommended gains first.
+    :param simple: the FOPDT that most rules need; None: there is none.
+    :param rng: draws the models within the uncertainty; None: of a fixed seed.
+    :param tell: called with what begins.
+    """
+
+    task: Task
+    rules: tuple[str, ...]
+    simple: TransferFunction | None
+    rng: np.random.Generator | None = None
+    tell: Tell = _quiet
+
+    def design_task(self, found: Analysis) -> DesignTask:
+        """Return what the rules are given for the selected model of an analysis."""
+        chosen = found.models[0]
+        return DesignTask(
+            model=chosen.model,
+            options=_with_noise(self.task.options, found),
+            simple=self.simple,
+            models=ensemble(chosen, rng=self.rng or np.random.default_rng(0)),
+            describing=_describing_point(found),
+        )
+
+
+def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     """Return the selected model; without a model, the analysis with the reason."""
     record = thinned(record)
     cycles: tuple[Cycle, ...] = ()
     try:
         cycles = cycles_of(record)
-        chosen = _with_remarks(_guarded(record, method, known), (record,))
+        chosen = _with_remarks(_guarded(record, task.method, task.known), (record,))
     except RelayAutotuneError as error:
         return _nothing(record, cycles, error)
     chosen = without_disturbance(
-        chosen, record, cycles, lambda part: _guarded(part, method, known)
+        chosen, record, cycles, lambda part: _guarded(part, task.method, task.known)
     )
-    if chosen.method != DEFAULT_METHOD or known.structure:
+    if chosen.method != DEFAULT_METHOD or task.known.structure:
         return _Chosen(record, cycles, chosen, record)
     loaded = with_its_load(
         chosen,
         record,
         cycles,
-        lambda part, kind: _guarded(part, method, replace(known, structure=kind)),
+        lambda part, kind: _guarded(part, task.method, replace(task.known, structure=kind)),
     )
     return _Chosen(record, cycles, *loaded)
 
 
-def _chosen_so_far(record: Record, method: str, known: Known) -> _Chosen | Analysis:
+def _chosen_so_far(record: Record, task: Task) -> _Chosen | Analysis:
     """Return the selected model of a running experiment, or the analysis with the reason."""
-    chosen = _chosen(record, method, known)
+    chosen = _chosen(record, task)
     if isinstance(chosen, Analysis):
         # A running experiment without a model is not judged yet.
         return replace(chosen, judgement=NOT_JUDGED)
@@ -257,31 +322,22 @@ def _chosen_so_far(record: Record, method: str, known: Known) -> _Chosen | Analy
     return replace(chosen, model=model)
 
 
-def _assessed(
-    chosen: _Chosen,
-    models: Sequence[Identification],
-    known: Known,
-    rules: Sequence[str],
-    simple: TransferFunction | None,
-    options: DesignOptions | None,
-    rng: np.random.Generator | None,
-    tell: Tell = _quiet,
-) -> Analysis:
+def _assessed(chosen: _Chosen, models: Sequence[Identification], tuning: _Tuning) -> Analysis:
     """Judge models, the selected one first, and tune it."""
     record = chosen.record
-    tell("judging the model")
+    tuning.tell("judging the model")
     found = Analysis(record, chosen.cycles, assess(models, record), 0)
     evidence = Evidence(
         record,
         found.models[0],
         beside=0 if chosen.driven is record else _LOAD,
-        free=not known.structure,
+        free=not tuning.task.known.structure,
         samples=chosen.model.method == DEFAULT_METHOD,
         others=found.models[1:],
         settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
         driven=chosen.driven,
     )
-    return _judged(found, evidence, (record,), rules, simple, options, rng, tell)
+    return _judged(found, evidence, (record,), tuning)
 
 
 def analyse_jointly(
@@ -310,7 +366,7 @@ def analyse_jointly(
     :param rng: as for :func:`analyse`.
     :raises RelayAutotuneError: if method or rule are unknown.
     """
-    rule_named(rule)
+    task = Task(method, rule, known, options or DesignOptions())
     records = [thinned(record) for record in records]
     first = records[0]
     cycles: tuple[Cycle, ...] = ()
@@ -325,7 +381,7 @@ def analyse_jointly(
     found = Analysis(first, cycles, assess((chosen,), first), 0)
     evidence = Evidence(first, found.models[0], free=False, samples=method == DEFAULT_METHOD)
     simple = _simple(records, known, chosen)
-    return _judged(found, evidence, records, _first(rule), simple, options, rng)
+    return _judged(found, evidence, records, _Tuning(task, _first(rule), simple, rng))
 
 
 def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError) -> Analysis:
@@ -338,11 +394,7 @@ def _judged(
     found: Analysis,
     evidence: Evidence,
     records: Sequence[Record],
-    rules: Sequence[str],
-    simple: TransferFunction | None,
-    options: DesignOptions | None,
-    rng: np.random.Generator | None,
-    tell: Tell = _quiet,
+    tuning: _Tuning,
 ) -> Analysis:
     """Judge the model, add gains if they are allowed, and judge the gains."""
     refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")
@@ -350,10 +402,10 @@ def _judged(
     judgement = Judgement(findings, refused=refused)
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
-    tell("designing the gains")
-    shaping = Shaping(_task(found, rng, simple, options), evidence, findings)
+    tuning.tell("designing the gains")
+    shaping = Shaping(tuning.design_task(found), evidence, findings)
     found = replace(found, shaping=shaping)
-    tuned = _tuned(found, shaping.task, rules)
+    tuned = _tuned(found, shaping.task, tuning.rules)
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
@@ -413,22 +465,6 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
 
-def _task(
-    found: Analysis,
-    rng: np.random.Generator | None,
-    simple: TransferFunction | None,
-    options: DesignOptions | None,
-) -> DesignTask:
-    chosen = found.models[0]
-    return DesignTask(
-        model=chosen.model,
-        options=_with_noise(options or DesignOptions(), found),
-        simple=simple,
-        models=ensemble(chosen, rng=rng or np.random.default_rng(0)),
-        describing=_describing_point(found),
-    )
-
-
 def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
     """Take noise, amplitude and sampling period from the record if they are not given."""
     record, chosen = found.record, found.models[0]
@@ -480,21 +516,19 @@ def _guarded(record: Record, method: str, known: Known) -> Identification:
         ) from error
 
 
-def _others(
-    record: Record, method: str, known: Known, chosen: Identification
-) -> list[Identification]:
+def _others(record: Record, task: Task, chosen: Identification) -> list[Identification]:
     """Return the models of the other methods that apply, for comparison.
 
     The first is the best FOPDT, which most rules need.
     """
-    wanted = [(DEFAULT_METHOD, replace(known, structure=FOPDT.name))]
-    wanted += [(name, known) for name in METHODS if name not in (method, DEFAULT_METHOD)]
+    wanted = [(DEFAULT_METHOD, replace(task.known, structure=FOPDT.name))]
+    wanted += [(m, task.known) for m in METHODS if m not in (task.method, DEFAULT_METHOD)]
     if chosen.method == DEFAULT_METHOD and chosen.structure == FOPDT.name:
         wanted = wanted[1:]
     found = []
-    for name, facts in wanted:
+    for name, known in wanted:
         try:
-            found.append(_guarded(record, name, facts))
+            found.append(_guarded(record, name, known))
         except RelayAutotuneError:
             continue
     return found

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from relay_autotune.analysis import check_names
+from relay_autotune.analysis import Task
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
 from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
@@ -22,7 +22,6 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
-from relay_autotune.running_fit import Task
 from relay_autotune.text import visible
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
 
@@ -186,7 +185,6 @@ def jobs_of(
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
     try:
-        check_names(options.method, options.rule)
         known = Known(**given_quantities(options, declared(Known)))
         task = Task(options.method, options.rule, known, design_options(options))
     except RelayAutotuneError as error:

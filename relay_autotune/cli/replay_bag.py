@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from relay_autotune.analysis import analyse, analyse_jointly
+from relay_autotune.analysis import Task, analyse, analyse_jointly
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.cli.arguments import DEBUG, NOTHING_FOUND, USAGE, deserved
@@ -18,7 +18,6 @@ from relay_autotune.cli.table import table
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.record.record import Record
 from relay_autotune.result import Analysis
-from relay_autotune.running_fit import Task
 from relay_autotune.text import visible
 from relay_autotune.verdict import Verdict
 

@@ -16,7 +16,13 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 
-from relay_autotune.analysis import analyse, analyse_jointly, check_names, model_so_far
+from relay_autotune.analysis import (
+    RunningFit,
+    Task,
+    analyse,
+    analyse_jointly,
+    model_so_far,
+)
 from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,
@@ -36,7 +42,6 @@ from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.results import Refusals, SignsOfLife
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.result import Analysis
-from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.verdict import Judgement
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify
@@ -215,8 +220,7 @@ class IdentifierNode(ServedNode):
             new, self._cycles_are_new = self._cycles_are_new, False
             if new and self._cycles:
                 record = record_from_cycles(self._cycles.values())
-                task = self._task()
-                work = partial(model_so_far, record, method=task.method, known=task.known)
+                work = partial(model_so_far, record, self._task())
                 return _Fit(work, partial(self._fitted, record.experiment_id))
         except RelayAutotuneError as error:
             what = "the cycles" if progress is None else "the progress"
@@ -287,8 +291,7 @@ class IdentifierNode(ServedNode):
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            task = task_from(merged(self, PARAMETERS, changes))
-            check_names(task.method, task.rule)
+            task_from(merged(self, PARAMETERS, changes))
         except RelayAutotuneError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

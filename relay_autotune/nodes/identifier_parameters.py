@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from relay_autotune.analysis import Task
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import DEFAULT_METHOD, METHODS
 from relay_autotune.quantities import Quantity, declared
-from relay_autotune.running_fit import Task
 from relay_autotune.tuning import DEFAULT_RULE, RULES
 from relay_autotune.tuning.task import DesignOptions
 
@@ -62,6 +62,6 @@ def task_from(values: Mapping[str, Any]) -> Task:
     """Return how a record is to be identified and a controller to be designed.
 
     :param values: of the parameters, by name.
-    :raises RelayAutotuneError: if a value is out of its range.
+    :raises RelayAutotuneError: if a value is out of its range, or a name is unknown.
     """
     return Task(values["method"], values["rule"], known_from(values), options_from(values))

@@ -21,12 +21,12 @@ import pytest
 from fleet_work import die_of_bag_3, die_once, mark, wait_for_ever
 from made_bags import REPOSITORY
 
+from relay_autotune.analysis import Task
 from relay_autotune.bag.signals import Selection
 from relay_autotune.cli import fleet, replay
 from relay_autotune.cli.fleet import COLUMNS, ResultsFile, in_processes, on_cluster, rows
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import BagError
-from relay_autotune.running_fit import Task
 
 STEP = REPOSITORY / "bags" / "step_test"
 # A method that finds nothing in a step test leaves the time to what is tested here.

@@ -16,6 +16,7 @@ import pytest
 from analysed import completed as analysed
 from report_cases import only
 
+from relay_autotune.analysis import Task
 from relay_autotune.cli import tune_loop
 from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.report import defaults, flags_of, report_of_tune
@@ -34,7 +35,6 @@ from relay_autotune.cli.tune_view import (
 )
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.identifier_parameters import known_from, options_from
-from relay_autotune.running_fit import Task
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction

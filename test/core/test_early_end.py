@@ -13,14 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.analysis import analyse_alone, model_so_far
+from relay_autotune.analysis import RunningFit, Task, analyse_alone, model_so_far
 from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome
-from relay_autotune.running_fit import RunningFit, Task
 from relay_autotune.tuning import DesignOptions, analyse_loop
 
 PERIOD = 0.03

@@ -24,7 +24,6 @@ FLOORS = (
     {"shaping"},
     {"result"},
     {"analysis"},
-    {"running_fit"},
     {"exchange"},
     {"bag"},
     {"report"},
