@@ -64,7 +64,7 @@ class LoopError(RelayAutotuneError, RuntimeError):
 
 
 class NotReadyError(RelayAutotuneError):
-    """A tune that cannot start.
+    """A tune, or a verification, that cannot start.
 
     :param message: the reason.
     :param typed: the parameter to set, and a value or what it stands for; empty: another remedy.

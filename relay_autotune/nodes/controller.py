@@ -20,7 +20,13 @@ from std_srvs.srv import SetBool, Trigger
 from relay_autotune.control.controller import GainBounds, is_usable, running
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Step, runs_stably
-from relay_autotune.errors import FieldError, ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.errors import (
+    FieldError,
+    NotReadyError,
+    ParameterError,
+    RelayAutotuneError,
+    TuningError,
+)
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller_parameters import (
@@ -43,7 +49,7 @@ from relay_autotune.nodes.parameters import declare, merged, values_of
 from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
 from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
-from relay_autotune.nodes.verifier import NotVerifiable, Predictors, Verifiable, Verifier
+from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
 from relay_autotune.nodes.watch import Repeater, require_own_time
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
@@ -436,21 +442,21 @@ class ControllerNode(ServedNode):
 
     async def _prepare_verification(self, request: Verify.Goal) -> Verifiable:
         if self._held:
-            raise NotVerifiable("a tune is running")
+            raise NotReadyError("a tune is running")
         self._verifier.require_samples()
         self._predictors.require_any()
         if self._remote is None and self._untaken:
-            raise NotVerifiable(f"nobody subscribes to {self._commands.topic_name}")
+            raise NotReadyError(f"nobody subscribes to {self._commands.topic_name}")
         if self._remote is not None:
             self._remote.require_ready()
             kept = await self._place.read()
         else:
             kept = self._keeper.gains
         if kept is None or (self._remote is None and not self._pid.is_automatic):
-            raise NotVerifiable("the controller is not in automatic, or has no gains")
+            raise NotReadyError("the controller is not in automatic, or has no gains")
         model, doubt = self._predictors.of(kept)
         if doubt and not self.get_parameter("accept_doubtful").value:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"the model that would predict the step is {doubt}; set the parameter "
                 "accept_doubtful to true to step all the same"
             )
@@ -465,28 +471,28 @@ class ControllerNode(ServedNode):
             abs(self.get_parameter(name).value) for name in ("verify_step", "verify_step_max")
         )
         if not (math.isfinite(height) and math.isfinite(request.load_step)):
-            raise NotVerifiable("a step must be finite")
+            raise NotReadyError("a step must be finite")
         if height == 0.0 and request.load_step == 0.0:
-            raise NotVerifiable(
+            raise NotReadyError(
                 "no step is given: set setpoint_step, or the parameter verify_step"
             )
         if abs(height) > highest:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"setpoint_step is {height:g}, verify_step_max allows {highest:g}: set it to the "
                 "largest step that the process may be given"
             )
         setpoint = self._setpoint if self._remote is None else self._remote.setpoint
         if height and not self._is_possible(setpoint + height):
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"the step leads to the set-point {setpoint + height:g}, outside of "
                 f"measurement_min to measurement_max"
             )
         if request.load_step and self._remote is not None:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"{self._place.name} commands: no load step can be added to that, ask for none"
             )
         if abs(request.load_step) > allowed:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"load_step is {request.load_step:g}, verify_load_max allows {allowed:g}"
             )
         steps = [Step(setpoint=height)] if height else []

@@ -14,11 +14,10 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 
 from relay_autotune.control.controller import is_usable
-from relay_autotune.errors import FieldError, ParameterError
+from relay_autotune.errors import FieldError, NotReadyError, ParameterError
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.tune_parameters import MESSAGE_PARAMETERS
-from relay_autotune.nodes.verifier import NotVerifiable
 
 # A controller without a command for this time counts as silent [s].
 _SILENCE = 2.0
@@ -96,23 +95,23 @@ class RemoteLoop:
     def require_ready(self) -> None:
         """Refuse a loop in which the effect of a set-point step could not be seen.
 
-        :raises NotVerifiable: with the reason.
+        :raises NotReadyError: with the reason.
         """
         topic, target = self._publisher.topic_name, self._target
         if math.isnan(self.setpoint):
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"the set-point of {target} is not known: publish it on {topic}, or give "
                 "initial_setpoint"
             )
         # One subscription is the node's own.
         if self._publisher.get_subscription_count() < 2:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"nobody takes a set-point from {topic}: remap it to the topic of {target}"
             )
         if math.isnan(self.command):
-            raise NotVerifiable(f"no command of {target} has been heard")
+            raise NotReadyError(f"no command of {target} has been heard")
         if reason := self.why_silent():
-            raise NotVerifiable(reason)
+            raise NotReadyError(reason)
 
     def move(self, offset: float) -> None:
         """Put a step on the set-point [y]; 0: none."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.loop.gains import Controller
@@ -53,10 +53,6 @@ _TIMES_PLANNED = 4.0
 _MORE_THAN_PLANNED = 10.0
 
 _Sample = tuple[float, float, float]
-
-
-class NotVerifiable(RelayAutotuneError):  # noqa: N818  it is a state of the loop, not a defect
-    """The loop cannot be verified now."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +93,10 @@ class Predictors:
     def require_any(self) -> None:
         """Refuse a verification without any model.
 
-        :raises NotVerifiable: if no model has come.
+        :raises NotReadyError: if no model has come.
         """
         if not self._models:
-            raise NotVerifiable(
+            raise NotReadyError(
                 "no model has come, so the step cannot be predicted; run a tune first"
             )
 
@@ -110,13 +106,13 @@ class Predictors:
         Gains without a known experiment, such as those of the parameters, take the newest model.
 
         :param gains: the gains in force.
-        :raises NotVerifiable: if there are only models of other experiments.
+        :raises NotReadyError: if there are only models of other experiments.
         """
         self.require_any()
         name = next((n for known, n in self._experiments.items() if known.is_near(gains)), "")
         newest = list(self._models)[-1]
         if name not in self._models and name and newest:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"the gains are of the experiment {name}, and its model has not come; the newest "
                 f"one is of {newest}: try again when the model has come, or run a tune"
             )
@@ -209,10 +205,10 @@ class Verifier:
     def require_samples(self) -> None:
         """Refuse a loop without samples.
 
-        :raises NotVerifiable: if there are too few samples to know the loop's rest.
+        :raises NotReadyError: if there are too few samples to know the loop's rest.
         """
         if len(self._recent) < _LEAST_BEFORE:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"only {len(self._recent)} samples have come with a command, expected "
                 f"{_LEAST_BEFORE}"
             )
@@ -280,13 +276,13 @@ class Verifier:
         t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
         period = float(np.median(np.diff(t)))
         if not period > 0.0:
-            raise NotVerifiable("the time of the samples stands still: is /clock published?")
+            raise NotReadyError("the time of the samples stands still: is /clock published?")
         line = np.polyfit(t - t[0], y, 1)
         noise = float(np.std(y - np.polyval(line, t - t[0]), ddof=2))
         drift = abs(float(line[0])) * float(t[-1] - t[0])
         smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
         if drift > 4.0 * noise and drift > 0.1 * smallest:
-            raise NotVerifiable(
+            raise NotReadyError(
                 f"the loop is not at rest: the measurement moved by {drift:.3g} over the last "
                 f"{len(self._recent)} samples; wait until it has settled"
             )

@@ -8,8 +8,9 @@ from __future__ import annotations
 import pytest
 
 from relay_autotune.control.gains_history import GainSet
+from relay_autotune.errors import NotReadyError
 from relay_autotune.nodes.results import keep
-from relay_autotune.nodes.verifier import NotVerifiable, Predictors
+from relay_autotune.nodes.verifier import Predictors
 from relay_autotune.process.transfer_function import TransferFunction
 
 GOOD, WILD, BY_HAND = (GainSet.of({"kc": kc, "ti": 0.3}) for kc in (0.5, 0.9, 0.7))
@@ -19,13 +20,13 @@ TRUE, WRONG = (TransferFunction.fopdt(gain, 0.5, 0.2) for gain in (2.0, 0.7))
 def test_gains_are_proved_on_the_model_of_their_own_experiment() -> None:
     known: dict[str, tuple[TransferFunction, str]] = {}
     models = Predictors(known)
-    with pytest.raises(NotVerifiable, match="no model has come"):
+    with pytest.raises(NotReadyError, match="no model has come"):
         models.of(GOOD)
     keep(known, "first", (TRUE, ""))
     models.applied(GOOD, "first")
     models.applied(WILD, "second")
     # The model of the second is late: with that of the first, any gains do what is predicted.
-    with pytest.raises(NotVerifiable, match=r"of the experiment second.*newest one is of first"):
+    with pytest.raises(NotReadyError, match=r"of the experiment second.*newest one is of first"):
         models.of(WILD)
     keep(known, "second", (WRONG, "doubtful"))
     assert models.of(WILD) == (WRONG, "doubtful")
