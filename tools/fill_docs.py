@@ -26,10 +26,9 @@ from pathlib import Path
 
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop.laws import LAWS, Law
-from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from relay_autotune.nodes.identifier_parameters import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
-from relay_autotune.nodes.tune_parameters import FIXED_PARAMETERS, TUNE_PARAMETERS
+from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS, FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity
 from relay_autotune.verdict import Check
 

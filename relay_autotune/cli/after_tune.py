@@ -176,8 +176,8 @@ def _own_controller(
 ) -> Steps:
     """Return the commands that control the loop with the gains, without any other controller."""
     # Imported here, because it loads slowly.
-    from relay_autotune.nodes.controller_parameters import FIXED, GAINS, parameters_of_law
     from relay_autotune.nodes.live_types import FLOAT64
+    from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law
 
     names = ["measurement_type", "command_type"]
     kind, command_kind = client.values(client.name, names).values()

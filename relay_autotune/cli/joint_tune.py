@@ -26,24 +26,22 @@ from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.controller_manager import (
+from relay_autotune.nodes.gains_place import controller_of
+from relay_autotune.nodes.live_types import CommandMessage, message_class
+from relay_autotune.nodes.readiness import ChecklistLine, Mark
+from relay_autotune.nodes.ros2_control import (
+    COMMAND_TYPE,
+    GAINS,
+    STATE_TYPE,
     ControllerManager,
     ManagedController,
     Opened,
     forwarding,
     in_the_way,
-)
-from relay_autotune.nodes.gains_place import controller_of
-from relay_autotune.nodes.joint_loop import (
-    COMMAND_TYPE,
-    GAINS,
-    STATE_TYPE,
     joint_loop,
     put_gains,
     told,
 )
-from relay_autotune.nodes.live_types import CommandMessage, message_class
-from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune.nodes.tune_client import TuneClient
 
 _JOINT_STATES = "/joint_states"

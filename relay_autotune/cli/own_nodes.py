@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import fcntl
 import os
+import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from relay_autotune.cli.export import number
 from relay_autotune.cli.terminal import Working
-from relay_autotune.errors import LoopError
+from relay_autotune.errors import LoopError, RelayAutotuneError
 
 # How long a node may take to end: relay_node sends its last command first [s].
 _END_WITHIN = 8.0
@@ -157,3 +162,49 @@ def _end(processes: Collection[subprocess.Popen[bytes]]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """Take a domain from 1 to 101 whose lock is free and whose ports are unused.
+
+    :raises RelayAutotuneError: if there is none.
+    """
+    folder = Path(tempfile.gettempdir()) / "relay_autotune_domains"
+    folder.mkdir(exist_ok=True)
+    with suppress(OSError):
+        folder.chmod(0o777)
+    candidates = list(range(1, 102))
+    random.SystemRandom().shuffle(candidates)
+    for domain in candidates:
+        lock = os.open(folder / f"{domain}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            continue
+        if _is_used(domain):
+            os.close(lock)
+            continue
+        try:
+            yield domain
+        finally:
+            os.close(lock)
+        return
+    raise RelayAutotuneError("no free ROS domain between 1 and 101: end what uses them")
+
+
+def ports(domain: int) -> range:
+    """Return the UDP ports of a domain, by the rule of the DDS standard."""
+    return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
+
+
+def _is_used(domain: int) -> bool:
+    # The first participants of a domain listen at these ports, whoever started them.
+    for offset in (10, 12):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", ports(domain)[offset]))
+            except OSError:
+                return True
+    return False

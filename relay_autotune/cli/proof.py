@@ -31,8 +31,8 @@ from relay_autotune.control.verification import (
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.sampled import Limits
-from relay_autotune.nodes.controller_parameters import parameters_of_law, rate_from
 from relay_autotune.nodes.gains_client import GainsClient
+from relay_autotune.nodes.tables import parameters_of_law, rate_from
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.text import duration
 from relay_autotune.verdict import Verdict

@@ -29,26 +29,33 @@ from relay_autotune.errors import (
 )
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.controller_parameters import (
+from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
+from relay_autotune.nodes.gains_place import (
+    OwnGains,
+    Place,
+    RemoteGains,
+    RemoteLoop,
+    mapping_of,
+    reported_by,
+    said,
+)
+from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
+from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
+from relay_autotune.nodes.results import ResultCheck, why_doubtful
+from relay_autotune.nodes.tables import (
+    CONTROLLER_PARAMETERS,
     FIXED,
     GAINS,
     NONE_WAIT,
     OTHERS,
-    PARAMETERS,
     bounds_from,
     gains_from,
     limits_from,
     range_from,
     rate_from,
 )
-from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
-from relay_autotune.nodes.gains_place import OwnGains, Place, RemoteGains, mapping_of, said
-from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.parameters import declare, merged, values_of
-from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
-from relay_autotune.nodes.remote_loop import RemoteLoop, reported_by
-from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
 from relay_autotune.nodes.watch import Repeater, require_own_time
 from relay_autotune_msgs.action import Verify
@@ -585,4 +592,4 @@ class ControllerNode(ServedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run controller_node."""
-    return run(ControllerNode, "controller_node", args, PARAMETERS)
+    return run(ControllerNode, "controller_node", args, CONTROLLER_PARAMETERS)

@@ -33,9 +33,9 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.controller_parameters import FIXED, GAINS, NONE_WAIT, rate_from
 from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
+from relay_autotune.nodes.tables import FIXED, GAINS, NONE_WAIT, rate_from
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.text import TOLD_EVERY, duration

@@ -18,8 +18,8 @@ from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.lockstep import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.nodes.parameters import declare, values_of
+from relay_autotune.nodes.quality import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.process.structures import FIELDS, TABLE, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess

@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter as RosParameter
 from relay_autotune.errors import NotReadyError, ParameterError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
 from relay_autotune.experiment.narration import how_long, motion
+from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.experiment.relay_law import Levels
@@ -32,7 +33,7 @@ from relay_autotune.nodes.quality import (
     why_no_publisher,
     why_no_subscriber,
 )
-from relay_autotune.nodes.tune_parameters import EXPERIMENT_PARAMETERS, TUNE_PARAMETERS
+from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration

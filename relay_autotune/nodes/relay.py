@@ -27,20 +27,18 @@ from relay_autotune.experiment.procedure import SETTLING_LIMIT
 from relay_autotune.nodes.goals import Narrator, TuneAction
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
-from relay_autotune.nodes.lockstep import NO_REPEAT_AFTER
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import declare, values_of
-from relay_autotune.nodes.quality import FOLLOW_EVERY, why_no_publisher
+from relay_autotune.nodes.quality import FOLLOW_EVERY, NO_REPEAT_AFTER, why_no_publisher
 from relay_autotune.nodes.readiness import (
     Checklist,
     Readiness,
     Ready,
     why_not_settable,
 )
-from relay_autotune.nodes.recordings import Recordings
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
-from relay_autotune.nodes.session import Session, SetpointSession, reported_by
-from relay_autotune.nodes.tune_parameters import (
+from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
+from relay_autotune.nodes.tables import (
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )

@@ -32,8 +32,8 @@ from relay_autotune.cli.new_loop import (
 from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import fill_gains
-from relay_autotune.nodes.controller_parameters import PARAMETERS
 from relay_autotune.nodes.live_types import FLOAT64
+from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design
@@ -344,7 +344,9 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
         "std_msgs/msg/Float32",
         "90.0",
     )
-    assert set(given) - {"measurement", "controller_command"} <= {e.name for e in PARAMETERS}
+    assert set(given) - {"measurement", "controller_command"} <= {
+        e.name for e in CONTROLLER_PARAMETERS
+    }
     # For another type relay_node stands between controller and actuator.
     both = shown(None, "", "", command_type="std_msgs/msg/Float32").partition("NEXT ")[2]
     assert "controller_command:=" not in both

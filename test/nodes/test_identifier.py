@@ -15,13 +15,13 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
+from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled_loop import SampledLoop
-from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.identifier import IdentifierNode
 from relay_autotune.nodes.identifier_parameters import KNOWN, PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import Executor

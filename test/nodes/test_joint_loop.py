@@ -17,17 +17,15 @@ from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.controller_manager import (
+from relay_autotune.nodes.gains_place import controller_of
+from relay_autotune.nodes.ros2_control import (
+    LAWS,
+    TRAJECTORY_CONTROLLER,
+    DofState,
     ManagedController,
     above,
     forwarding,
     in_the_way,
-)
-from relay_autotune.nodes.gains_place import controller_of
-from relay_autotune.nodes.joint_loop import (
-    LAWS,
-    TRAJECTORY_CONTROLLER,
-    DofState,
     is_continuous,
     joint_loop,
     limits_in,
@@ -242,7 +240,7 @@ class Arm:
 
 @pytest.fixture(autouse=True)
 def _messages_need_not_be_installed(monkeypatch):
-    monkeypatch.setattr("relay_autotune.nodes.joint_loop.interface_class", lambda *_: object)
+    monkeypatch.setattr("relay_autotune.nodes.ros2_control.interface_class", lambda *_: object)
 
 
 def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:

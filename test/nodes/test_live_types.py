@@ -17,10 +17,10 @@ from std_msgs.msg import Byte
 from relay_autotune.bag.definitions import find_definition, message_type
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.errors import FieldError, ParameterError
-from relay_autotune.nodes import remote_loop
-from relay_autotune.nodes.controller_parameters import PARAMETERS as CONTROLLER_PARAMETERS
+from relay_autotune.nodes import gains_place
 from relay_autotune.nodes.live_types import reader_of, struct_of
 from relay_autotune.nodes.session import reported_by
+from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 
 JOINTS = [f"arm_{k}" for k in range(7)]
 
@@ -131,6 +131,6 @@ def test_parameters_of_another_nodes_set_point_need_that_node(
     given: dict[str, str], sentence: str
 ) -> None:
     defaults = {each.name: each.default for each in CONTROLLER_PARAMETERS}
-    assert remote_loop.reported_by(defaults)[0] is None
+    assert gains_place.reported_by(defaults)[0] is None
     with pytest.raises(ParameterError, match=sentence):
-        remote_loop.reported_by(defaults | given)
+        gains_place.reported_by(defaults | given)

@@ -11,7 +11,7 @@ import pytest
 
 from relay_autotune.nodes.parameters import descriptor_of
 from relay_autotune.nodes.plant import PARAMETERS as PLANT
-from relay_autotune.nodes.tune_parameters import FIXED_PARAMETERS, TUNE_PARAMETERS
+from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity
 
 LENGTH = Quantity("length", 1.0, "m", "How long.", 0.5, 2.0)

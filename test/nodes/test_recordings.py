@@ -18,9 +18,9 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 
 from relay_autotune import nodes
-from relay_autotune.nodes.domain import free_domain
-from relay_autotune.nodes.recordings import RESULTS, Recordings
+from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.nodes.results import SignsOfLife, said_by
+from relay_autotune.nodes.session import RESULTS, Recordings
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
 PATIENCE = 500

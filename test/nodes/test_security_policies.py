@@ -15,8 +15,8 @@ import pytest
 import rclpy
 from rclpy.node import Node
 
+from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.nodes.controller import ControllerNode
-from relay_autotune.nodes.domain import free_domain
 from relay_autotune.nodes.identifier import IdentifierNode
 from relay_autotune.nodes.plant import PlantNode
 from relay_autotune.nodes.relay import RelayNode

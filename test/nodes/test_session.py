@@ -14,7 +14,7 @@ import pytest
 from relay_autotune.errors import RecordError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.nodes.lockstep import QUIET_AFTER_GO
+from relay_autotune.nodes.quality import QUIET_AFTER_GO
 from relay_autotune.nodes.session import Session
 
 

@@ -9,7 +9,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from relay_autotune.nodes.domain import free_domain, ports
+from relay_autotune.cli.own_nodes import free_domain, ports
 
 __all__ = ["free_domain", "mapped_segments", "remove_leftovers", "remove_unmapped"]
 
