@@ -21,8 +21,7 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import Procedure, State
-from relay_autotune.experiment.samples import Samples
-from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.record.record import Outcome, Record
 
 __all__ = [
     "ExperimentParameters",
@@ -41,7 +40,7 @@ _OUTCOMES = {
 _BASELINE = SafePolicy()
 
 
-class RelayExperiment:
+class RelayExperiment(Procedure):
     """Run one relay experiment: call :meth:`step` for each measurement and send its command.
 
     >>> from relay_autotune import (
@@ -89,46 +88,37 @@ class RelayExperiment:
         before: Sequence[float] | None = None,
     ) -> None:
         parameters.validate(baseline)
-        self.parameters = parameters
-        self.experiment_id = experiment_id
-        self.baseline = float(baseline)
-        self.safe_command = self.baseline if math.isnan(policy.command) else policy.command
-        """Command after an abort or a failure, without proportional hold of the process [u]."""
-        self._policy = policy
-        self._hold: ProportionalHold | None = None
-        self._samples = Samples()
-        self._frozen = FrozenWatch()
-        self._silence = SilenceWatch()
-        self._check = SampleCheck()
-        self._procedure = Procedure(
+        super().__init__(
             parameters,
-            self.baseline,
-            self._samples,
+            baseline,
             until_converged=until_converged,
             from_small=from_small,
             before=before,
         )
+        self.experiment_id = experiment_id
+        self.safe_command = self.baseline if math.isnan(policy.command) else policy.command
+        """Command after an abort or a failure, without proportional hold of the process [u]."""
+        self._policy = policy
+        self._hold: ProportionalHold | None = None
+        self._frozen = FrozenWatch()
+        self._silence = SilenceWatch()
+        self._check = SampleCheck()
         self._origin = math.nan
-
-    @property
-    def state(self) -> State:
-        """The present state."""
-        return self._procedure.state
 
     @property
     def finished(self) -> bool:
         """True once the experiment has ended, however it ended."""
-        return self._procedure.state in _OUTCOMES
+        return self.state in _OUTCOMES
 
     @property
     def outcome(self) -> Outcome:
         """How it ended: completed, aborted (on request or at a limit), failed; UNKNOWN before."""
-        return _OUTCOMES.get(self._procedure.state, Outcome.UNKNOWN)
+        return _OUTCOMES.get(self.state, Outcome.UNKNOWN)
 
     @property
     def reason(self) -> str:
         """Why it ended, a sentence for people; empty before."""
-        reason, repeated = self._procedure.reason, self._silence.repeated
+        reason, repeated = self._end_reason, self._silence.repeated
         if not (reason and repeated):
             return reason
         told = f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
@@ -140,96 +130,22 @@ class RelayExperiment:
     @property
     def status(self) -> str:
         """What it waits for and what it sees, or how it ended, a sentence for people."""
-        samples = self._samples
+        trace = self.trace
         if self.finished:
             return f"{self.outcome.name.lower()}: {self.reason}"
-        if not samples:
+        if not trace:
             return "waiting for the first measurement"
-        return self._procedure.tell(samples.seen[-1], samples.measurement[-1])
-
-    @property
-    def settings(self) -> RelaySettings | None:
-        """The relay's settings; None until the measurement has settled.
-
-        While the sign of the process gain is not known, ``reverse_acting`` is False.
-        """
-        return self._procedure.settings
-
-    @property
-    def noise_std(self) -> float:
-        """Standard deviation of the measurement at rest [y]; NaN until it has settled."""
-        return self._procedure.rest.noise_std
-
-    @property
-    def rest_measurement(self) -> float:
-        """Mean measurement at rest at the baseline [y]; NaN until it has settled."""
-        return self._procedure.rest.mean
-
-    @property
-    def dead_time_seen(self) -> float:
-        """Time from the kick to the last sample before the response [s]; NaN until it is seen.
-
-        Without noise the dead time lies between this and one sample interval more. With noise
-        this time is longer: the response must first leave the noise band.
-        """
-        return self._procedure.dead_time_seen
-
-    @property
-    def process_gain_sign(self) -> int:
-        """1 or -1 as given or found; 0 while unknown."""
-        return self._procedure.sign
-
-    @property
-    def cycles(self) -> tuple[Cycle, ...]:
-        """The whole cycles so far."""
-        return tuple(self._procedure.cycles)
-
-    @property
-    def cycle_count(self) -> int:
-        """Number of whole cycles so far."""
-        return len(self._procedure.cycles)
-
-    @property
-    def switches(self) -> int:
-        """Number of switches of the relay so far; two of them are a half cycle."""
-        return self._procedure.switches
-
-    @property
-    def cycle_start(self) -> tuple[int, ...]:
-        """Index of the first sample of each cycle, as in a record."""
-        return tuple(self._procedure.cycle_start)
-
-    @property
-    def is_tried(self) -> bool:
-        """True unless the levels began small and it is not known yet whether the process follows.
-
-        Until then the cycles may be those of an actuator that is at its ends.
-        """
-        return self._procedure.is_tried
+        return self._tell(trace.seen[-1], trace.measurement[-1])
 
     @property
     def sample_count(self) -> int:
         """Number of samples recorded."""
-        return len(self._samples)
+        return len(self.trace)
 
     @property
     def elapsed(self) -> float:
         """Time from the first sample to the last [s]."""
-        return self._samples.time[-1] if self._samples else 0.0
-
-    @property
-    def kicked_at(self) -> float:
-        """Time of the kick from the first sample on [s]; NaN before."""
-        return self._procedure.kicked_at
-
-    @property
-    def latest(self) -> float:
-        """Deadline of the present part, from the first sample, gaps not counted [s].
-
-        It grows when a part begins, or takes longer than before; an experiment beyond it has
-        failed. Infinite if only max_duration limits the part.
-        """
-        return self._procedure.latest
+        return self.trace.time[-1] if self.trace else 0.0
 
     @property
     def cycles_left(self) -> int:
@@ -241,8 +157,7 @@ class RelayExperiment:
         """Expected time until the end [s]; NaN before the first whole cycle."""
         if self.finished:
             return 0.0
-        cycles = self._procedure.cycles
-        return self.cycles_left * cycles[-1].period if cycles else math.nan
+        return self.cycles_left * self.cycles[-1].period if self.cycles else math.nan
 
     @property
     def progress(self) -> float:
@@ -254,7 +169,7 @@ class RelayExperiment:
 
     def samples(self, first: int, stop: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return time [s], measurement [y] and command [u] of the samples first to stop - 1."""
-        return self._samples.columns(first, stop)
+        return self.trace.columns(first, stop)
 
     def record(
         self,
@@ -276,8 +191,8 @@ class RelayExperiment:
         :raises RecordError: if there is no sample.
         """
         # If the caller raised while a sample was being answered, that sample has no answer.
-        n = len(self._samples.command)
-        time, measurement, command = self._samples.columns(0, n)
+        n = len(self.trace.command)
+        time, measurement, command = self.trace.columns(0, n)
         return Record(
             time=time,
             measurement=measurement,
@@ -316,25 +231,25 @@ class RelayExperiment:
         return self._take(time, measurement, repeated=True)
 
     def _take(self, time: float, measurement: float, *, repeated: bool) -> float:
-        procedure, samples = self._procedure, self._samples
-        if procedure.state in _OUTCOMES:
+        trace = self.trace
+        if self.finished:
             return self.after_end(measurement)
-        last = samples.time[-1] if samples else -math.inf
+        last = trace.time[-1] if trace else -math.inf
         problem = self._check.problem(time, measurement, last, self._origin)
         if problem is not None:
-            procedure.end(State.FAILED, problem)
+            self._end(State.FAILED, problem)
             return self._ended(math.nan)
-        if not samples:
+        if not trace:
             self._origin = float(time)
         t, y = float(time) - self._origin, float(measurement)
-        samples.add(t, y)
+        trace.add(t, y)
         over = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
-        command = self.baseline if over else procedure.answer(samples.seen[-1], y)
-        if procedure.state in _OUTCOMES:
+        command = self.baseline if over else self._answer(trace.seen[-1], y)
+        if self.state in _OUTCOMES:
             command = self._ended(y)
         elif self.parameters.command_rate > 0.0:
             command = self._rate_limited(command)
-        samples.command.append(command)
+        trace.command.append(command)
         return command
 
     def after_end(self, measurement: float) -> float:
@@ -344,7 +259,7 @@ class RelayExperiment:
         """
         if self._hold is not None:
             return self._hold.command(measurement)
-        if self._procedure.state is State.COMPLETED and not self._policy.give_back:
+        if self.state is State.COMPLETED and not self._policy.give_back:
             return self.baseline
         return self.safe_command
 
@@ -360,7 +275,7 @@ class RelayExperiment:
                 raise ParameterError(
                     "an experiment cannot be completed before its first half cycle; abort it"
                 )
-            self._procedure.end(State.COMPLETED, reason)
+            self._end(State.COMPLETED, reason)
             self._ended(math.nan)
         return self.after_end(self._last_measurement())
 
@@ -372,25 +287,21 @@ class RelayExperiment:
         :returns: the command of :meth:`after_end` [u], to be sent now.
         """
         if not self.finished:
-            at = self.elapsed if time is None or not self._samples else time - self._origin
-            self._procedure.end(
-                State.ABORTED, f"{reason} (at {at:.6g} s, {self._procedure.where()})"
-            )
+            at = self.elapsed if time is None or not self.trace else time - self._origin
+            self._end(State.ABORTED, f"{reason} (at {at:.6g} s, {self._where()})")
             self._ended(math.nan)
         return self.after_end(self._last_measurement())
 
     def _last_measurement(self) -> float:
-        return self._samples.measurement[-1] if self._samples else math.nan
+        return self.trace.measurement[-1] if self.trace else math.nan
 
     def _ended(self, measurement: float) -> float:
         if self._policy.hold and not self._policy.give_back:
-            self._hold = ProportionalHold.after(
-                self.settings, self._procedure.cycles, self._policy.gain
-            )
+            self._hold = ProportionalHold.after(self.settings, self.cycles, self._policy.gain)
         return self.after_end(measurement)
 
     def _rate_limited(self, wanted: float) -> float:
-        samples = self._samples
+        samples = self.trace
         if len(samples) < 2:
             return wanted
         before = samples.command[-1]
@@ -399,57 +310,55 @@ class RelayExperiment:
 
     def _passes_limit(self, t: float, y: float) -> bool:
         """End the experiment if the last sample passes a limit; return True if it does."""
-        p, procedure = self.parameters, self._procedure
-        resting = procedure.state is State.SETTLING
+        p, resting = self.parameters, self.state is State.SETTLING
         if not p.measurement_min <= y <= p.measurement_max:
-            procedure.end(
+            self._end(
                 State.ABORTED,
                 f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
                 f"to {p.measurement_max:g}",
             )
         elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:
-            procedure.end(
+            self._end(
                 State.ABORTED,
                 f"the measurement {y:g} at {t:g} s is {self._deviation(y):g} away from the "
                 f"set-point, more than max_deviation, {p.max_deviation:g}",
             )
         elif 0.0 < p.max_duration < t:
-            procedure.end(
+            self._end(
                 State.FAILED,
-                f"max_duration {p.max_duration:g} s was over {procedure.where()}: allow more time "
+                f"max_duration {p.max_duration:g} s was over {self._where()}: allow more time "
                 f"or fewer cycles",
             )
-        elif (seen := self._samples.seen[-1]) > procedure.latest:
-            procedure.end(
+        elif (seen := self.trace.seen[-1]) > self.latest:
+            self._end(
                 State.FAILED,
                 f"the experiment was not over after {seen:.4g} s, longer than its parts may take, "
-                f"{procedure.where()}: let the process rest and look at the recording first",
+                f"{self._where()}: let the process rest and look at the recording first",
             )
-        return procedure.state in _OUTCOMES
+        return self.finished
 
     def _is_dead(self, t: float, y: float, *, repeated: bool) -> bool:
         """End the experiment if the sensor is silent or frozen; return True if so."""
-        procedure = self._procedure
         if repeated:
-            longest = max((cycle.period for cycle in procedure.cycles), default=math.inf)
+            longest = max((cycle.period for cycle in self.cycles), default=math.inf)
             if self._silence.repeat(t, longest_cycle=longest):
-                procedure.end(
+                self._end(
                     State.FAILED,
                     f"the measurement does not respond any more: silent for "
                     f"{self._silence.silence:.3g} s, much longer than before, "
-                    f"{procedure.where()}; check the sensor",
+                    f"{self._where()}; check the sensor",
                 )
-            return procedure.state in _OUTCOMES
-        self._silence.hear(t, relaying=procedure.state is State.RELAY)
-        resting = procedure.state is State.SETTLING
-        if self._frozen.add(y, at_rest=resting, in_cycles=bool(procedure.cycles)):
-            procedure.end(
+            return self.finished
+        self._silence.hear(t, relaying=self.state is State.RELAY)
+        resting = self.state is State.SETTLING
+        if self._frozen.add(y, at_rest=resting, in_cycles=bool(self.cycles)):
+            self._end(
                 State.FAILED,
                 f"the sensor is frozen: its last {self._frozen.run} samples are all {y:g}, "
-                f"{procedure.where()}; check the sensor",
+                f"{self._where()}; check the sensor",
             )
-        return procedure.state in _OUTCOMES
+        return self.finished
 
     def _deviation(self, y: float) -> float:
-        settings = self._procedure.settings
+        settings = self.settings
         return abs(y - settings.setpoint) if settings is not None else 0.0

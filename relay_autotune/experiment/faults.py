@@ -422,11 +422,6 @@ def is_growing(swings: Sequence[float]) -> bool:
     return steps[0] > 0.0 and all(b >= _FASTER * a for a, b in pairwise(steps))
 
 
-def count_cycles(cycles: list[Cycle]) -> str:
-    """Return the number of cycles in words."""
-    return f"{len(cycles)} whole cycle{'' if len(cycles) == 1 else 's'}"
-
-
 # Least ratio of the samples' standard deviation to the noise's for an oscillation. A relay without
 # a process switches on noise, too, and some of its cycles agree in the end.
 _ABOVE_NOISE = 1.5

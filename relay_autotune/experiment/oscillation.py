@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 from relay_autotune.arrays import FloatArray
@@ -15,19 +16,16 @@ from relay_autotune.experiment.faults import (
     NO_ANSWER,
     TELL,
     RunawayWatch,
-    count_cycles,
     has_moved,
     is_growing,
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.narration import while_switching
-from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.relay_law import Levels, Patience, Relay, Turns, clear_swing
-from relay_autotune.experiment.samples import Samples
-from relay_autotune.experiment.settling import RestState
+from relay_autotune.experiment.relay_law import Patience, Relay, Turns, clear_swing
+from relay_autotune.experiment.samples import Run
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
 from relay_autotune.record.record import Cycle, Outcome
+from relay_autotune.text import duration
 
 # Two instants that differ by less than this part of the sample interval are equal.
 _ROUNDING = 1e-6
@@ -67,19 +65,22 @@ _MANY_STAYS, _OF_RESPONSE = 40, 0.5
 # Three stays as long as that show that the time to respond was not that of a gap.
 _SHOWN = 3
 
-# If the levels started at a quarter, the swings are compared after this many cycles, once the
-# swing grows by less than this factor from one to the next.
-_TRIED, _STILL = 2, 1.1
+# If the levels started at a quarter, the swings are compared once the swing grows by less than
+# this factor from one cycle to the next.
+_STILL = 1.1
 # A last swing this many times as large as a clear one should have been clear at a quarter, too.
 _CLEARLY = 5.0
 
 # A measurement that did not move for this many stays of the relay does not follow it.
 _STAYS = 2
 
+# Least difference of the periods of two cycles that is told, as a fraction.
+_DIFFER = 0.001
+
 _SIGNS = {1: "positive", -1: "negative"}
 
 
-def usual_period(cycles: list[Cycle]) -> float:
+def usual_period(cycles: Sequence[Cycle]) -> float:
     """Return the lower quartile of the undisturbed periods [s]; 0 for less than two of them.
 
     The longer ones may hold an actuator that stuck, and the shortest the begin of fast switching.
@@ -95,55 +96,22 @@ class Oscillation:
     cycles count from then on. A load changes the mean command that the process needs, and with it
     the half periods; the levels are shifted so that the half periods stay the same.
 
-    :param parameters: the user's parameters, valid.
-    :param baseline: command of the operating point [u].
-    :param samples: the samples so far; the relay begins at the last one.
-    :param levels: the levels of the relay.
-    :param rest: the measurement at rest.
-    :param setpoint: measurement about which the relay switches [y].
-    :param hysteresis: half width of its band [y].
-    :param sign: sign of the process gain.
+    :param run: the experiment so far; the relay begins at its last sample.
     :param doubtful: True if the user did not give the sign, so that it may be reversed later.
-    :param response_time: time that the process took to respond to the kick [s].
     :param first_limit: longest stay until the first switch [s].
     :param until_converged: False: agreement of the cycles does not end it.
     """
 
     def __init__(
-        self,
-        parameters: ExperimentParameters,
-        baseline: float,
-        samples: Samples,
-        levels: Levels,
-        rest: RestState,
-        *,
-        setpoint: float,
-        hysteresis: float,
-        sign: int,
-        doubtful: bool,
-        response_time: float,
-        first_limit: float,
-        until_converged: bool,
+        self, run: Run, *, doubtful: bool, first_limit: float, until_converged: bool
     ) -> None:
-        self.sign = sign
-        """Sign of the process gain."""
-        self.cycles: list[Cycle] = []
-        """The whole cycles."""
-        self.cycle_start: list[int] = []
-        """Index of the first sample of each cycle, the unfinished one included."""
         self.verdict: tuple[Outcome, str] | None = None
         """How it ended and why; None while it goes on."""
-        self.notes: list[str] = []
-        """Notes to add to the reason."""
-        self._parameters = parameters
-        self._baseline = baseline
-        self._samples = samples
-        self._levels = levels
-        self._rest = rest
-        self._setpoint = setpoint
-        self._hysteresis = hysteresis
+        self._run = run
+        self._parameters = run.parameters
+        self._samples = run.trace
+        self._levels = run.levels
         self._doubtful = doubtful
-        self._response_time = response_time
         self._first_limit = first_limit
         self._until_converged = until_converged
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
@@ -153,9 +121,7 @@ class Oscillation:
         self._patient_from = -math.inf
         self._share = math.nan
         self._switches_before = 0
-        self.switches = 0
-        """Number of switches so far."""
-        self._kick_amplitude = levels.amplitude
+        self._kick_amplitude = run.levels.amplitude
         self._answered: deque[bool] = deque(maxlen=_MANY_STAYS)
         self._long_stays = 0
         self._shifts = self._borne = 0
@@ -177,7 +143,7 @@ class Oscillation:
         """
         relay = self._relay
         if relay.update(t, y):
-            self.switches += 1
+            self._run.switches += 1
             # Only a stay without a shift of the levels counts: else each shift would lengthen the
             # limit of the next stay.
             was_shifted = self._shifts > 0
@@ -201,7 +167,7 @@ class Oscillation:
         elif t - max(relay.since, self._patient_from) > self._limit:
             self._no_return(t, y)
         elif self._runs_away(t, y):
-            if self._doubtful and not self.cycles:
+            if self._doubtful and not self._run.cycles:
                 self._no_return(t, y)
             else:
                 self._end(Outcome.FAILED, self._why_lost(t, y))
@@ -218,48 +184,56 @@ class Oscillation:
         :param t: its time [s].
         :param y: the measurement [y].
         """
-        relay = self._relay
-        rises = relay.is_high == (self.sign > 0)
-        return while_switching(
-            self.cycles,
-            self._parameters.min_cycles,
-            level=self.command,
-            since=t - relay.since,
-            measurement=y,
-            target=self._setpoint + (self._hysteresis if rises else -self._hysteresis),
-            rises=rises,
-            limit=self._limit,
-            growing=self._levels.searching,
+        relay, run, cycles = self._relay, self._run, self._run.cycles
+        since, needed = t - relay.since, self._parameters.min_cycles
+        if self._levels.searching:
+            told = "the amplitude is still growing"
+        elif not cycles:
+            told = "no whole cycle yet"
+        elif len(cycles) < needed:
+            told = f"{len(cycles)} of at least {needed} cycles"
+        else:
+            last, before = cycles[-1].period, cycles[-2].period
+            differ = 100.0 * max(abs(last - before) / before if before > 0.0 else 0.0, _DIFFER)
+            told = f"{len(cycles)} cycles, the periods of the last two differ by {differ:.2g} %"
+        patience = ""
+        if cycles and since > cycles[-1].period:
+            patience = f", longer than a cycle took; it may take {duration(self._limit)}"
+        rises = relay.is_high == (run.process_gain_sign > 0)
+        target = run.setpoint + (run.hysteresis if rises else -run.hysteresis)
+        return (
+            f"{told}; at {self.command:g} for {duration(since)}{patience}: the measurement "
+            f"{y:.6g} is to {'rise' if rises else 'fall'} to {target:.6g}"
         )
 
     def _runs_away(self, t: float, y: float) -> bool:
-        if not self.cycles:
-            return self._watch.add(t, y - self._setpoint)
-        self._away = self._away + 1 if abs(y - self._setpoint) > self._furthest else 0
+        if not self._run.cycles:
+            return self._watch.add(t, y - self._run.setpoint)
+        self._away = self._away + 1 if abs(y - self._run.setpoint) > self._furthest else 0
         return self._away >= _RUNAWAY_SAMPLES
 
     def _begin(self) -> None:
-        t, y = self._samples.seen[-1], self._samples.measurement[-1]
-        self._relay = Relay(self.sign, self._setpoint, self._hysteresis, t, y)
+        run, t, y = self._run, self._samples.seen[-1], self._samples.measurement[-1]
+        self._relay = Relay(run.process_gain_sign, run.setpoint, run.hysteresis, t, y)
         self._is_high = self._relay.is_high
-        floor = max(self._hysteresis, abs(y - self._setpoint), 3.0 * self._rest.noise_std)
+        floor = max(run.hysteresis, abs(y - run.setpoint), 3.0 * run.noise_std)
         self._watch = RunawayWatch(floor)
-        self.cycle_start.clear()
+        run.cycle_start = ()
         self._on_the_way.clear()
         self._switched_at.clear()
         self._answered.clear()
         self._long_stays = 0
-        self._switches_before = self.switches
+        self._switches_before = self._run.switches
         self._patience = Patience(self._levels.amplitude, self._levels.bias)
-        self._turns = Turns(t, self._response_time)
+        self._turns = Turns(t, self._run.response_time)
         self._answers = self._is_lost = False
         # The shortest cycle before a cycle was lost [s]; 0: no cycle was lost.
         self._usual = 0.0
         # The most switches in a cycle, and the number of switches at the end of the last cycle.
-        self._most, self._counted = 0, self.switches
+        self._most, self._counted = 0, self._run.switches
         self._began, self._longest_limit = t, 0.0
         p = self._parameters
-        self._learn(self._response_time)
+        self._learn(self._run.response_time)
         if not p.max_half_cycle and (p.hysteresis > 0.0 or not math.isnan(p.setpoint)):
             # The user's set-point decides the distance to the first switch, so the time to respond
             # gives no limit.
@@ -276,7 +250,7 @@ class Oscillation:
         self._patience.learn(stay, self._samples.interval)
         p = self._parameters
         limit = self._patience.limit
-        if self.cycles:
+        if self._run.cycles:
             least = Patience.LEAST_SAMPLES * self._samples.interval
             limit = max(_PATIENCE_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
@@ -291,14 +265,14 @@ class Oscillation:
     def _learn_anew(self) -> None:
         """Learn the length of a stay again from the relay's present switching, or fail."""
         turns, most = self._turns, self._parameters.max_cycles
-        self._usual = self._usual or usual_period(self.cycles)
+        self._usual = self._usual or usual_period(self._run.cycles)
         if self._switches_fast(2.0 * turns.longest, self._usual):
             return
-        if len(self.cycles) + turns.lost >= most:
+        if len(self._run.cycles) + turns.lost >= most:
             self._end(
                 Outcome.FAILED,
                 f"no clear cycle for {turns.lost_for:.3g} s, though the relay went on switching, "
-                f"after {count_cycles(self.cycles)}, and max_cycles, {most}, are over: its half "
+                f"after {self._run.counted}, and max_cycles, {most}, are over: its half "
                 f"cycles differ too much; check sensor and actuator, and that the process rests "
                 f"at the baseline",
             )
@@ -311,19 +285,19 @@ class Oscillation:
         if period >= _FAST * usual:
             return False
         self._end_fast(
-            f"each {0.5 * period:.3g} s or sooner after {count_cycles(self.cycles)}, where a "
+            f"each {0.5 * period:.3g} s or sooner after {self._run.counted}, where a "
             f"cycle took {usual:.3g} s before"
         )
         return True
 
     def _chatters(self) -> bool:
         """Fail if the relay switched far more often in the last cycle than in any before."""
-        count, self._counted = self.switches - self._counted, self.switches
+        count, self._counted = self._run.switches - self._counted, self._run.switches
         most, self._most = self._most, max(self._most, count)
         if not most or count <= max(_CHATTER_RATIO * most, _CHATTER):
             return False
         self._end_fast(
-            f"{count} times in the last of {count_cycles(self.cycles)}, and {most} times at most "
+            f"{count} times in the last of {self._run.counted}, and {most} times at most "
             f"in those before"
         )
         return True
@@ -331,7 +305,7 @@ class Oscillation:
     def _look_for_chatter(self) -> None:
         """Fail if the process cannot have caused the last stays."""
         stay = self._relay.last_stay
-        is_long = stay >= _OF_RESPONSE * self._response_time
+        is_long = stay >= _OF_RESPONSE * self._run.response_time
         if stay > 0.0:  # the clock goes
             self._answered.append(is_long)
         self._long_stays += is_long
@@ -339,7 +313,7 @@ class Oscillation:
         if known and len(self._answered) == _MANY_STAYS and sum(self._answered) <= 1:
             self._end_fast(
                 f"{_MANY_STAYS} times with at most one stay of {_OF_RESPONSE:g} times the "
-                f"{self._response_time:.3g} s that the process took to respond"
+                f"{self._run.response_time:.3g} s that the process took to respond"
             )
 
     def _end_fast(self, how: str) -> None:
@@ -350,24 +324,24 @@ class Oscillation:
     # Cycles.
 
     def _begin_cycle(self) -> None:
-        self.cycle_start.append(len(self._samples) - 1)
-        if len(self.cycle_start) < 2 or self._has_grown():
-            self._counted = self.switches
+        self._run.cycle_start += (len(self._samples) - 1,)
+        if len(self._run.cycle_start) < 2 or self._has_grown():
+            self._counted = self._run.switches
             return
         cycle = self._cycle_that_ended()
         if was_lost := self._is_lost:
             cycle = replace(cycle, disturbed=True)
             self._is_lost = False
-        self.cycles.append(cycle)
-        last = max(c.period for c in self.cycles[-_FAST_CYCLES:])
-        usual = self._usual or usual_period(self.cycles[:-_FAST_CYCLES])
+        self._run.cycles += (cycle,)
+        last = max(c.period for c in self._run.cycles[-_FAST_CYCLES:])
+        usual = self._usual or usual_period(self._run.cycles[:-_FAST_CYCLES])
         if self._switches_fast(last, usual) or self._chatters():
             return
         p = self._parameters
-        if is_growing([c.peak_max - c.peak_min for c in self.cycles]):
+        if is_growing([c.peak_max - c.peak_min for c in self._run.cycles]):
             self._end(
                 Outcome.FAILED,
-                f"the oscillation grows faster and faster, after {count_cycles(self.cycles)}: an "
+                f"the oscillation grows faster and faster, after {self._run.counted}: an "
                 f"unstable process that the relay cannot hold; give a larger amplitude",
             )
         elif noise := self._only_noise(TELL):
@@ -375,12 +349,12 @@ class Oscillation:
         elif clipped := self._clipped():
             self._end(Outcome.FAILED, clipped)
         elif self._until_converged and cycle.converged:
-            n = len(self.cycles)
+            n = len(self._run.cycles)
             which = f"{n}" if n == p.min_cycles else f"the last {p.min_cycles} of {n}"
             self._complete(
                 f"{which} cycles agree within {100.0 * p.cycle_tolerance:g} %, allowing for noise"
             )
-        elif len(self.cycles) + self._turns.lost >= p.max_cycles:
+        elif len(self._run.cycles) + self._turns.lost >= p.max_cycles:
             self._complete(
                 f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} cycles do not "
                 f"agree within {100.0 * p.cycle_tolerance:g} %"
@@ -388,7 +362,7 @@ class Oscillation:
                 else f"max_cycles, {p.max_cycles}, reached",
             )
         else:
-            swing = max(c.peak_max - c.peak_min for c in self.cycles)
+            swing = max(c.peak_max - c.peak_min for c in self._run.cycles)
             self._furthest = 0.5 * _RUNAWAY * swing
             if not (was_lost or self._is_alone(cycle.period)):
                 self._bear_load()
@@ -400,7 +374,7 @@ class Oscillation:
             return
         # Noise may switch the relay many times while the measurement passes the band.
         time = self._samples.seen[last] - self._samples.seen[first]
-        noise = self._noise_alone(first, last) if time >= _STAYS * self._response_time else ""
+        noise = self._noise_alone(first, last) if time >= _STAYS * self._run.response_time else ""
         if noise and self._levels.can_grow:
             self._levels.grow()
             self._begin()
@@ -411,13 +385,13 @@ class Oscillation:
         """Make an amplitude that is not given larger if the last cycle was too small."""
         if not self._levels.searching:
             return False
-        first, last = self.cycle_start[-2:]
+        first, last = self._run.cycle_start[-2:]
         y = self._samples.columns(first, last + 1)[1]
         least = clear_swing(
-            self._parameters.target_amplitude, self._rest.noise_std, self._hysteresis, y
+            self._parameters.target_amplitude, self._run.noise_std, self._run.hysteresis, y
         )
         half_swing = 0.5 * float(y.max() - y.min())
-        clear = clear_swing(0.0, self._rest.noise_std, self._hysteresis, y)
+        clear = clear_swing(0.0, self._run.noise_std, self._run.hysteresis, y)
         clipped = (
             "" if self._levels.from_small else self._levels.why_clipped(half_swing, settled=False)
         )
@@ -428,7 +402,7 @@ class Oscillation:
         factor = self._levels.growth_for(half_swing, least)
         if factor == 1.0:
             if half_swing < least and not self._levels.from_small:
-                self.notes.append(
+                self._run.notes.append(
                     f"the amplitude {self._levels.amplitude:g} is all that the command limits "
                     f"allow, and the measurement swings by {half_swing:.3g} only, less than "
                     f"{least:.3g}"
@@ -436,40 +410,35 @@ class Oscillation:
             self._levels.searching = False
             return False
         self._levels.grow(factor)
-        self.cycle_start[:] = [last]
+        self._run.cycle_start = (last,)
         return True
 
     def _clipped(self) -> str:
         """Return why the actuator is at its ends, once the swing grows no more; empty: nothing."""
-        if not self._levels.from_small or len(self.cycles) < _TRIED:
+        if not (self._levels.from_small and self._run.is_tried):
             return ""
-        before, last = (0.5 * (c.peak_max - c.peak_min) for c in self.cycles[-2:])
+        before, last = (0.5 * (c.peak_max - c.peak_min) for c in self._run.cycles[-2:])
         return "" if last > _STILL * before else self._levels.why_clipped(last, settled=True)
 
     def _should_have_told(self) -> bool:
         """Return True if a quarter of the last swing would have stood clear of the noise."""
-        first, last = self.cycle_start[-2:]
+        first, last = self._run.cycle_start[-2:]
         y = self._samples.columns(first, last + 1)[1]
-        clear = clear_swing(0.0, self._rest.noise_std, self._hysteresis, y)
+        clear = clear_swing(0.0, self._run.noise_std, self._run.hysteresis, y)
         return 0.5 * float(y.max() - y.min()) > _CLEARLY * clear
 
-    @property
-    def is_tried(self) -> bool:
-        """True unless levels that began small have not shown yet that the process follows."""
-        return not self._levels.from_small or len(self.cycles) >= _TRIED
-
     def _cycle_that_ended(self) -> Cycle:
-        first, last = self.cycle_start[-2:]
+        first, last = self._run.cycle_start[-2:]
         time, measurement, command = self._samples.columns(first, last + 1)
         p = self._parameters
         return next_cycle(
-            self.cycles,
+            self._run.cycles,
             time,
             measurement,
             command,
-            middle=self._baseline + self._levels.bias,
-            reverse_acting=self.sign < 0,
-            noise_std=self._rest.noise_std,
+            middle=self._run.baseline + self._levels.bias,
+            reverse_acting=self._run.process_gain_sign < 0,
+            noise_std=self._run.noise_std,
             min_cycles=p.min_cycles,
             tolerance=p.cycle_tolerance,
         )
@@ -479,26 +448,27 @@ class Oscillation:
 
         A load would show in the next cycle, too.
         """
-        return len(self.cycles) > 1 and period > _ALONE * self.cycles[-2].period
+        return len(self._run.cycles) > 1 and period > _ALONE * self._run.cycles[-2].period
 
     def _bear_load(self) -> None:
         """Shift the levels by the change of the mean command that a load has caused."""
-        share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in self.cycles[-2:]]
+        last = self._run.cycles[-2:]
+        share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in last]
         if math.isnan(self._share):
             if len(share) == 2 and abs(share[1] - share[0]) < _SAME_SHARE:
                 self._share = share[1]
             return
         change = share[-1] - self._share
         # After a disturbed cycle a small change counts too: the rest of the same load.
-        if abs(change) > (_SAME_SHARE if self.cycles[-2].disturbed else _OTHER_SHARE):
+        if abs(change) > (_SAME_SHARE if last[0].disturbed else _OTHER_SHARE):
             self._shift(2.0 * change * self._levels.amplitude)
-            self.cycles[-1] = replace(self.cycles[-1], disturbed=True)
+            self._run.cycles = (*self._run.cycles[:-1], replace(last[1], disturbed=True))
 
     def _shift(self, by: float) -> None:
         self._levels.shift(by)
         note = "a load came during the test, and the relay's levels were shifted to compensate it"
-        if note not in self.notes:
-            self.notes.append(note)
+        if note not in self._run.notes:
+            self._run.notes.append(note)
 
     # The end.
 
@@ -513,10 +483,10 @@ class Oscillation:
                 "oscillation at a quarter of the amplitude stood clear of the noise: give "
                 "command_min and command_max"
             )
-            if not self.cycles[-1].converged or self._should_have_told():
+            if not self._run.cycles[-1].converged or self._should_have_told():
                 self._end(Outcome.FAILED, f"{untold}; {reason}")
                 return
-            self.notes.append(untold)
+            self._run.notes.append(untold)
         self._end(Outcome.COMPLETED, reason)
 
     def _only_noise(self, least: int) -> str:
@@ -524,15 +494,15 @@ class Oscillation:
 
         :param least: number of samples needed for a decision before MIN_CYCLES cycles.
         """
-        last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
+        last_cycles = self._run.cycle_start[-min(len(self._run.cycles), MIN_CYCLES) - 1 :]
         first, last = last_cycles[0], last_cycles[-1]
-        few = len(self.cycles) < MIN_CYCLES and last - first < least
+        few = len(self._run.cycles) < MIN_CYCLES and last - first < least
         return "" if few else self._noise_alone(first, last)
 
     def _noise_alone(self, first: int, last: int) -> str:
         """Return why the samples first to last - 1 are no oscillation, "" if they may be one."""
         measurement = self._samples.columns(first, last)[1]
-        noise = why_noise_alone(measurement, self._rest.noise_std, count_cycles(self.cycles))
+        noise = why_noise_alone(measurement, self._run.noise_std, self._run.counted)
         if noise and self._levels.from_small:
             noise += (
                 "; give command_min and command_max, so that it need not begin at a quarter of "
@@ -541,28 +511,29 @@ class Oscillation:
         return noise
 
     def _end(self, outcome: Outcome, reason: str) -> None:
-        disturbed = sum(cycle.disturbed for cycle in self.cycles)
+        disturbed = sum(cycle.disturbed for cycle in self._run.cycles)
         if outcome is Outcome.COMPLETED and disturbed:
-            self.notes.append(
-                f"{disturbed} of {len(self.cycles)} cycles disturbed: a long gap in the samples, "
-                "a load step, or switches that formed no clear cycle"
+            self._run.notes.append(
+                f"{disturbed} of {self._run.cycle_count} cycles disturbed: a long gap in the "
+                "samples, a load step, or switches that formed no clear cycle"
             )
         self.verdict = outcome, reason
 
     def _no_return(self, t: float, y: float) -> None:
         """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
         # A half cycle beyond the noise shows that the process follows the relay both ways.
-        stays = self.switches - self._switches_before
-        follows = bool(self.cycles) or (stays >= _FOLLOWS and self._answers)
+        stays = self._run.switches - self._switches_before
+        follows = bool(self._run.cycles) or (stays >= _FOLLOWS and self._answers)
         # A constant measurement is no response at all; a saturated one still is.
         moved = has_moved(self._since(self._told_at)[1])
         if self._doubtful and not follows and moved:
             self._doubtful = False
-            self.notes.append(
-                f"the process gain was first taken for {_SIGNS[self.sign]}: the measurement did "
-                f"not come back; give process_gain_sign to spare the process that"
+            sign = self._run.process_gain_sign
+            self._run.notes.append(
+                f"the process gain was first taken for {_SIGNS[sign]}: the measurement did not "
+                f"come back; give process_gain_sign to spare the process that"
             )
-            self.sign = -self.sign
+            self._run.process_gain_sign = -sign
             self._begin()
             return
         if self._levels.can_grow:
@@ -595,9 +566,10 @@ class Oscillation:
 
     def _why_lost(self, t: float, y: float) -> str:
         time, measurement = self._since(self._relay.since)
-        towards = self.sign if self._relay.is_high else -self.sign
+        sign = self._run.process_gain_sign
+        towards = sign if self._relay.is_high else -sign
         why = (
-            why_no_return(time, towards * measurement, self._rest.noise_std)
+            why_no_return(time, towards * measurement, self._run.noise_std)
             if has_moved(self._since(self._told_at)[1])
             else NO_ANSWER
         )
@@ -607,8 +579,8 @@ class Oscillation:
             else ""
         )
         return (
-            f"no oscillation after {count_cycles(self.cycles)}{shifted}: the measurement is {y:g} "
-            f"and did not come back to {self._setpoint:g} -/+ {self._hysteresis:g} within "
+            f"no oscillation after {self._run.counted}{shifted}: the measurement is {y:g} "
+            f"and did not come back to {self._run.setpoint:g} -/+ {self._run.hysteresis:g} within "
             f"{t - self._relay.since:.3g} s; {why} (process_gain_sign was taken as "
-            f"{_SIGNS[self.sign]})"
+            f"{_SIGNS[sign]})"
         )

@@ -1,16 +1,21 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The samples of a running experiment."""
+"""The samples of a running experiment, and what its parts know from them."""
 
 from __future__ import annotations
 
+import math
 from array import array
 from itertools import pairwise
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.relay_law import Levels
+from relay_autotune.experiment.settling import NOT_SETTLED
+from relay_autotune.record.record import Cycle, RelaySettings
 
 # An interval counts at most this many times the mean of the intervals before it: a gap in the
 # samples, or a step of their clock, says nothing about the process. The pauses of a sensor that
@@ -78,3 +83,96 @@ class Samples:
             for column in (self.time, self.measurement, self.command)
         )
         return time, measurement, command
+
+
+# If the levels started at a quarter, the swings are compared after this many cycles.
+_TRIED = 2
+
+
+class Run:
+    """What is known of a running experiment: each of its parts reads it and adds to it.
+
+    :param parameters: the user's parameters, valid.
+    :param baseline: command of the operating point [u].
+    :param from_small: True: a given amplitude begins at a quarter of that.
+    """
+
+    def __init__(
+        self, parameters: ExperimentParameters, baseline: float, *, from_small: bool = False
+    ) -> None:
+        self.parameters = parameters
+        self.baseline = float(baseline)
+        self.levels = Levels(parameters, self.baseline, from_small=from_small)
+        """The levels of the relay."""
+        self.trace = Samples()
+        """The samples so far; each is appended before it is answered."""
+        self.rest = NOT_SETTLED
+        """The measurement at rest at the baseline."""
+        self.setpoint = self.hysteresis = math.nan
+        """Middle and half width of the relay's band [y]; NaN until the measurement has settled."""
+        self.process_gain_sign = parameters.process_gain_sign
+        """1 or -1 as given or found; 0 while unknown."""
+        self.kicked_at = math.nan
+        """Time of the kick from the first sample on [s]; NaN before."""
+        self.dead_time_seen = math.nan
+        """Time from the kick to the last sample before the response [s]; NaN until it is seen.
+
+        Without noise the dead time lies between this and one sample interval more. With noise
+        this time is longer: the response must first leave the noise band."""
+        self.response_time = math.nan
+        """Time from the kick to the first sample of the response [s]; NaN until it is seen."""
+        self.cycles: tuple[Cycle, ...] = ()
+        """The whole cycles so far."""
+        self.cycle_start: tuple[int, ...] = ()
+        """Index of the first sample of each cycle, as in a record."""
+        self.switches = 0
+        """Number of switches of the relay so far; two of them are a half cycle."""
+        self.notes: list[str] = []
+        """Sentences that follow the reason of the end."""
+
+    @property
+    def settings(self) -> RelaySettings | None:
+        """The relay's settings; None until the measurement has settled.
+
+        While the sign of the process gain is not known, ``reverse_acting`` is False.
+        """
+        if not self.rest.samples:
+            return None
+        return RelaySettings(
+            setpoint=self.setpoint,
+            baseline=self.baseline,
+            amplitude=self.levels.amplitude,
+            bias=self.levels.bias,
+            hysteresis=self.hysteresis,
+            extra_delay=self.parameters.extra_delay,
+            sample_period=self.parameters.sample_period,
+            reverse_acting=self.process_gain_sign < 0,
+        )
+
+    @property
+    def is_tried(self) -> bool:
+        """True unless the levels began small and it is not known yet whether the process follows.
+
+        Until then the cycles may be those of an actuator that is at its ends.
+        """
+        return not self.levels.from_small or len(self.cycles) >= _TRIED
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of the measurement at rest [y]; NaN until it has settled."""
+        return self.rest.noise_std
+
+    @property
+    def rest_measurement(self) -> float:
+        """Mean measurement at rest at the baseline [y]; NaN until it has settled."""
+        return self.rest.mean
+
+    @property
+    def cycle_count(self) -> int:
+        """Number of whole cycles so far."""
+        return len(self.cycles)
+
+    @property
+    def counted(self) -> str:
+        """The number of whole cycles in words."""
+        return f"{len(self.cycles)} whole cycle{'' if len(self.cycles) == 1 else 's'}"

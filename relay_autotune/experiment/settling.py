@@ -68,6 +68,11 @@ class RestState:
         )
 
     @property
+    def motion(self) -> str:
+        """How the measurement moves, in words, such as "falling 0.2 y/s"."""
+        return f"{'rising' if self.slope > 0.0 else 'falling'} {abs(self.slope):.2g} y/s"
+
+    @property
     def drift(self) -> float:
         """How far the straight line moves over the window [y]."""
         return abs(self.slope) * self.span

@@ -20,10 +20,9 @@ from rclpy.parameter import Parameter as RosParameter
 
 from relay_autotune.errors import NotReadyError, ParameterError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
-from relay_autotune.experiment.narration import how_long, motion
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.procedure import SETTLING_LIMIT
+from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
 from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import merged, values_of
@@ -470,7 +469,7 @@ def _look_at_rest(checks: Checklist, samples: LastSamples) -> None:
     else:
         checks.tell(
             "at rest",
-            f"no: {motion(rest)} over {duration(rest.span)}; wait until the process rests, else "
+            f"no: {rest.motion} over {duration(rest.span)}; wait until the process rests, else "
             f"the tune waits for that",
             good=False,
         )

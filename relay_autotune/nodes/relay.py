@@ -22,8 +22,7 @@ from relay_autotune.errors import FieldError, NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
-from relay_autotune.experiment.narration import how_long
-from relay_autotune.experiment.procedure import SETTLING_LIMIT
+from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
 from relay_autotune.nodes.goals import Narrator, TuneAction
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
