@@ -36,8 +36,7 @@ from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
-from relay_autotune.result import Analysis
-from relay_autotune.shaping import Shaping
+from relay_autotune.result import Analysis, Shaping
 from relay_autotune.tuning import (
     DEFAULT_RULE,
     RULES,

@@ -16,7 +16,7 @@ from relay_autotune.errors import MissingPackageError
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Gains
     from relay_autotune.report.case import Case
-    from relay_autotune.shaping import Shaping
+    from relay_autotune.result import Shaping
     from relay_autotune.web.shape import Asked
 
 _LOOPBACK = "127.0.0.1"

@@ -42,7 +42,7 @@ from relay_autotune.process.structures import (
 )
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.record.record import Outcome
-from relay_autotune.shaping import Shaping
+from relay_autotune.result import Shaping
 from relay_autotune.text import digits
 from relay_autotune.tuning import (
     DEFAULT_RULE,

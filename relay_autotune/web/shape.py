@@ -28,7 +28,7 @@ from relay_autotune.report.frequency import (
     step_duration,
     swept_parts,
 )
-from relay_autotune.shaping import Shaping
+from relay_autotune.result import Shaping
 from relay_autotune.tuning import DEFAULT_RULE, Designed, DesignOptions, designed, judged
 from relay_autotune.tuning.ensemble import ensemble_peaks
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict

@@ -14,7 +14,6 @@ import pytest
 
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.rational import (
     columns_of,
     free_motion,
@@ -22,6 +21,7 @@ from relay_autotune.identification.waveform.rational import (
     responses,
 )
 from relay_autotune.identification.waveform.selection import support
+from relay_autotune.identification.waveform.starts import is_unseen
 from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay

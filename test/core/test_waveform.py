@@ -17,10 +17,10 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.identification.waveform.plausibility import latest_dead_time
 from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
 from relay_autotune.identification.waveform.selection import Ground, of_shown_direction
 from relay_autotune.identification.waveform.separable import problem_of
+from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.structures import TABLE

@@ -21,7 +21,6 @@ FLOORS = (
     {"identification"},
     {"loop"},
     {"control", "tuning"},
-    {"shaping"},
     {"result"},
     {"analysis"},
     {"exchange"},
@@ -34,7 +33,7 @@ FLOORS = (
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in sorted(names)}
 # What brings ROS in; all else runs without it.
 NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "loop",
-           "control", "tuning", "shaping", "result", "analysis", "exchange")  # fmt: skip
+           "control", "tuning", "result", "analysis", "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

@@ -25,7 +25,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, given_model
 from relay_autotune.report.frequency import shown_load
-from relay_autotune.shaping import Shaping
+from relay_autotune.result import Shaping
 from relay_autotune.tuning import Designed, DesignOptions, designed, judged, task_of_model
 from relay_autotune.verdict import NOT_JUDGED, Verdict
 from relay_autotune.web import wire

@@ -31,7 +31,6 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
-from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
     Problem,
@@ -41,6 +40,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.identification.waveform.starts import (
     Starts,
+    is_unseen,
     refine_best,
     start_fopdt,
     two_lags,

@@ -27,7 +27,6 @@ from relay_autotune.identification.waveform.fit_covariance import (
     Noise,
     estimate_of,
 )
-from relay_autotune.identification.waveform.plausibility import is_unseen
 from relay_autotune.identification.waveform.rational import theta_of, unit_steps
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
@@ -39,7 +38,12 @@ from relay_autotune.identification.waveform.separable import (
     problem_of,
     refine,
 )
-from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
+from relay_autotune.identification.waveform.starts import (
+    Starts,
+    is_unseen,
+    refine_best,
+    start_fopdt,
+)
 from relay_autotune.process.structures import FOPDT, SOPDT, GivenModel, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record

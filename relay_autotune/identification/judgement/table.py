@@ -20,7 +20,7 @@ from relay_autotune.identification.judgement.checks import followed_share, lost_
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.identification.result import NOT_AT_REST
-from relay_autotune.identification.waveform.plausibility import latest_dead_time
+from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.text import digits

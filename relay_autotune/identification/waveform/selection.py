@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.plausibility import is_unseen, longest_push
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
     Problem,
@@ -29,8 +28,10 @@ from relay_autotune.identification.waveform.starts import (
     changes_within,
     coarse,
     go_on,
+    is_unseen,
     latest_dead_times,
     least_promised,
+    longest_push,
     refine_all,
     refine_best,
     start_fopdt,
