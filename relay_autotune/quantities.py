@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
@@ -34,29 +34,36 @@ _Getter = TypeVar("_Getter", bound=Callable[..., float])
 
 @dataclass(frozen=True)
 class Quantity:
-    """A value that a user may set.
+    """A value that a user may set; `means` says in one sentence what it is.
 
     :param name: its name, as a field and as a ROS parameter.
     :param default: its default, which also decides its type. NaN: not given. Infinite: no limit.
         (): an array of numbers that is not given.
     :param unit: y of the measurement, u of the command, s seconds; "" for a pure number or a word.
-    :param description: one sentence for people.
     :param lower: smallest value allowed.
     :param upper: largest value allowed.
     :param open_ended: True if ``lower`` and ``upper`` themselves are not allowed.
     :param choices: the allowed words, for a text; (): any text.
     :param flag: its name on the command line; empty: ``name``.
+    :param description: one sentence for people.
     """
 
     name: str
     default: float | int | bool | str | tuple[float, ...]
-    unit: str
-    description: str
+    unit: str = ""
     lower: float = -math.inf
     upper: float = math.inf
     open_ended: bool = False
     choices: tuple[str, ...] = ()
     flag: str = ""
+    description: str = ""
+
+    def means(self, description: str) -> Quantity:
+        """Return the quantity with its description.
+
+        :param description: one sentence for people.
+        """
+        return replace(self, description=description)
 
     @property
     def is_number(self) -> bool:
@@ -129,15 +136,15 @@ def quantity(
     flag: str = "",
 ) -> Any:
     """Declare the field of a dataclass as a quantity; the arguments are :class:`Quantity`'s."""
-    words = (default, unit, description, lower, upper, open_ended, choices, flag)
-    return field(default=default, metadata={_DECLARED: words})
+    found = Quantity("", default, unit, lower, upper, open_ended, choices, flag, description)
+    return field(default=default, metadata={_DECLARED: found})
 
 
 @cache
 def declared(kind: type) -> tuple[Quantity, ...]:
     """Return the quantities that a dataclass declares, in the order of its fields."""
     return tuple(
-        Quantity(each.name, *each.metadata[_DECLARED])
+        replace(each.metadata[_DECLARED], name=each.name)
         for each in fields(kind)
         if _DECLARED in each.metadata
     )

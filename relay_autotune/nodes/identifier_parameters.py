@@ -27,14 +27,10 @@ KNOWN = tuple(
 )
 DESIGN = tuple(each for each in declared(DesignOptions) if each.name not in _MEASURED)
 PARAMETERS = (
-    Quantity(
-        "method",
-        DEFAULT_METHOD,
-        "",
-        "Method whose model is published.",
-        choices=tuple(METHODS),
+    Quantity("method", DEFAULT_METHOD, choices=tuple(METHODS)).means(
+        "Method whose model is published."
     ),
-    Quantity("rule", DEFAULT_RULE, "", "Rule whose gains are published.", choices=tuple(RULES)),
+    Quantity("rule", DEFAULT_RULE, choices=tuple(RULES)).means("Rule whose gains are published."),
     *KNOWN,
     *DESIGN,
 )

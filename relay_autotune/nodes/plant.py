@@ -34,91 +34,58 @@ LONGEST_WAIT = 0.2
 CLOCK_START = 1.0
 
 PARAMETERS = (
-    Quantity("numerator", (), "", "Coefficients of s in the numerator, highest power first."),
-    Quantity("denominator", (), "", "Coefficients of s in the denominator, highest power first."),
-    Quantity(
-        "structure",
-        "",
-        "",
-        "Named structure of the process, instead of the two polynomials.",
-        choices=("", *TABLE),
+    Quantity("numerator", ()).means("Coefficients of s in the numerator, highest power first."),
+    Quantity("denominator", ()).means(
+        "Coefficients of s in the denominator, highest power first."
     ),
-    Quantity("gain", 1.0, "y/u", "Gain of the structure."),
-    Quantity("time_constants", (), "s", "Lags of the structure."),
-    Quantity("zeros", (), "s", "Time constants of the structure's zeros."),
-    Quantity("order", 0, "", "Number of equal lags, for lag_n and lag_n_zero.", 0, 50),
-    Quantity("damping", 0.0, "", "Damping of the structure's complex pair."),
-    Quantity(
-        "natural_frequency",
-        0.0,
-        "rad/s",
-        "Natural frequency of the structure's complex pair.",
-        0.0,
+    Quantity("structure", "", choices=("", *TABLE)).means(
+        "Named structure of the process, instead of the two polynomials."
     ),
-    Quantity("dead_time", 0.0, "s", "Dead time of the process.", 0.0),
-    Quantity("sample_period", 0.1, "s", "Time between samples.", 1e-5),
-    Quantity("noise_std", 0.0, "y", "Standard deviation of white noise.", 0.0),
-    Quantity("seed", 0, "", "Seed of the noise.", 0),
-    Quantity("quantisation", 0.0, "y", "Resolution of the sensor; 0: none.", 0.0),
-    Quantity("operating_point", (), "", "Measurement [y] and command [u] at rest, y0 and u0."),
-    Quantity("load_time", 0.0, "s", "When a load step enters before the process.", 0.0),
-    Quantity("load_size", 0.0, "u", "Height of the load step; 0: none."),
-    Quantity("drift", 0.0, "y/s", "Slope added to the measurement."),
-    Quantity("command_min", -math.inf, "u", "Lower limit of the actuator."),
-    Quantity("command_max", math.inf, "u", "Upper limit of the actuator."),
-    Quantity("stiction", 0.0, "u", "Band in which the actuator sticks.", 0.0),
-    Quantity("dead_band", 0.0, "u", "Play of the actuator.", 0.0),
-    Quantity(
-        "falling_gain",
-        1.0,
-        "",
-        "Factor on the command's part below rest, for a process that cools slower than it heats.",
-        1e-3,
-        1e3,
+    Quantity("gain", 1.0, "y/u").means("Gain of the structure."),
+    Quantity("time_constants", (), "s").means("Lags of the structure."),
+    Quantity("zeros", (), "s").means("Time constants of the structure's zeros."),
+    Quantity("order", 0, "", 0, 50).means("Number of equal lags, for lag_n and lag_n_zero."),
+    Quantity("damping", 0.0).means("Damping of the structure's complex pair."),
+    Quantity("natural_frequency", 0.0, "rad/s", 0.0).means(
+        "Natural frequency of the structure's complex pair."
     ),
-    Quantity(
-        "jitter",
-        0.0,
-        "s",
-        "Largest delay of a sample after its time, evenly spread, in the mode realtime.",
-        0.0,
+    Quantity("dead_time", 0.0, "s", 0.0).means("Dead time of the process."),
+    Quantity("sample_period", 0.1, "s", 1e-5).means("Time between samples."),
+    Quantity("noise_std", 0.0, "y", 0.0).means("Standard deviation of white noise."),
+    Quantity("seed", 0, "", 0).means("Seed of the noise."),
+    Quantity("quantisation", 0.0, "y", 0.0).means("Resolution of the sensor; 0: none."),
+    Quantity("operating_point", ()).means("Measurement [y] and command [u] at rest, y0 and u0."),
+    Quantity("load_time", 0.0, "s", 0.0).means("When a load step enters before the process."),
+    Quantity("load_size", 0.0, "u").means("Height of the load step; 0: none."),
+    Quantity("drift", 0.0, "y/s").means("Slope added to the measurement."),
+    Quantity("command_min", -math.inf, "u").means("Lower limit of the actuator."),
+    Quantity("command_max", math.inf, "u").means("Upper limit of the actuator."),
+    Quantity("stiction", 0.0, "u", 0.0).means("Band in which the actuator sticks."),
+    Quantity("dead_band", 0.0, "u", 0.0).means("Play of the actuator."),
+    Quantity("falling_gain", 1.0, "", 1e-3, 1e3).means(
+        "Factor on the command's part below rest, for a process that cools slower than it heats."
     ),
-    Quantity(
-        "loss",
-        0.0,
-        "",
-        "Share of the samples that are not published, in the modes realtime and clock.",
-        0.0,
-        0.9,
+    Quantity("jitter", 0.0, "s", 0.0).means(
+        "Largest delay of a sample after its time, evenly spread, in the mode realtime."
     ),
-    Quantity(
-        "on_change",
-        False,
-        "",
-        "True: a sample is published only if it differs from the last one; not in lockstep.",
+    Quantity("loss", 0.0, "", 0.0, 0.9).means(
+        "Share of the samples that are not published, in the modes realtime and clock."
     ),
-    Quantity(
-        "feedback",
-        False,
-        "",
-        "True: the actuator's position is published on command_feedback after each command.",
+    Quantity("on_change", False).means(
+        "True: a sample is published only if it differs from the last one; not in lockstep."
     ),
-    Quantity(
-        "mode",
-        "realtime",
-        "",
-        "realtime; clock: publishes /clock; lockstep: one step for each command.",
-        choices=MODES,
+    Quantity("feedback", False).means(
+        "True: the actuator's position is published on command_feedback after each command."
     ),
-    Quantity(
-        "lockstep_speed",
-        0.0,
-        "",
-        "Largest number of simulated seconds per second, in lockstep; 0: no limit.",
-        0.0,
-        1e4,
+    Quantity("mode", "realtime", choices=MODES).means(
+        "realtime; clock: publishes /clock; lockstep: one step for each command."
     ),
-    Quantity("speed", 1.0, "", "Simulated seconds in a second, in the mode clock.", 1e-3, 1e4),
+    Quantity("lockstep_speed", 0.0, "", 0.0, 1e4).means(
+        "Largest number of simulated seconds per second, in lockstep; 0: no limit."
+    ),
+    Quantity("speed", 1.0, "", 1e-3, 1e4).means(
+        "Simulated seconds in a second, in the mode clock."
+    ),
 )
 
 

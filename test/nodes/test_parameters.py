@@ -14,11 +14,11 @@ from relay_autotune.nodes.plant import PARAMETERS as PLANT
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity
 
-LENGTH = Quantity("length", 1.0, "m", "How long.", 0.5, 2.0)
-LIMIT = Quantity("limit", math.inf, "y", "Where it ends.")
-OPTIONAL = Quantity("optional", math.nan, "y", "Perhaps.")
-WORD = Quantity("word", "a", "", "Which.", choices=("a", "b"))
-LIST = Quantity("list", (), "s", "Several.")
+LENGTH = Quantity("length", 1.0, "m", 0.5, 2.0).means("How long.")
+LIMIT = Quantity("limit", math.inf, "y").means("Where it ends.")
+OPTIONAL = Quantity("optional", math.nan, "y").means("Perhaps.")
+WORD = Quantity("word", "a", choices=("a", "b")).means("Which.")
+LIST = Quantity("list", (), "s").means("Several.")
 
 
 @pytest.mark.parametrize(
