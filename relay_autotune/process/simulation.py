@@ -229,7 +229,7 @@ class _Segment:
 
 
 @dataclass
-class _HalfCycle:
+class _Half:
     """Data collected between two switches."""
 
     start: float
@@ -308,8 +308,8 @@ def simulate_relay(
     threshold = settings.setpoint + (settings.hysteresis if kick is None else kick)
     switches = [(0.0, settings.high if is_high else settings.low)]
     on_the_way = deque([(process.dead_time, switches[0][1])])
-    half = _HalfCycle(0.0, is_high)
-    halves: list[_HalfCycle] = []
+    half = _Half(0.0, is_high)
+    halves: list[_Half] = []
     segment = _Segment(modes, z, level, corners)
     # The half cycle from rest and the one after it come before the first whole cycle.
     while sum(1 for h in halves[1:] if h.level_is_high != direct) <= cycles:
@@ -343,7 +343,7 @@ def simulate_relay(
             half.end = now
             halves.append(half)
             is_high = not is_high
-            half = _HalfCycle(now, is_high)
+            half = _Half(now, is_high)
             threshold = settings.setpoint + (1 if is_high == direct else -1) * settings.hysteresis
             switches.append((now, settings.high if is_high else settings.low))
             on_the_way.append((now + process.dead_time, switches[-1][1]))
@@ -365,7 +365,7 @@ def simulate_relay(
 
 
 def _whole_cycles(
-    halves: list[_HalfCycle], settings: RelaySettings, told: int | None
+    halves: list[_Half], settings: RelaySettings, told: int | None
 ) -> tuple[Cycle, ...]:
     # The first half starts from rest and belongs to no cycle.
     usable = halves[1:] if not settings.reverse_acting else halves

@@ -17,9 +17,9 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import JOINT_METHODS, identify, identify_jointly
 from relay_autotune.identification.methods.lags import MODEL_1, MODEL_4, MODEL_5
 from relay_autotune.identification.methods.li import (
+    describing_function_point,
     fit_jointly,
     fits_jointly,
-    frequency_point,
     li_from_numbers,
 )
 from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
@@ -77,7 +77,7 @@ def test_the_simplest_model_that_agrees_comes_first(model, values):
 def test_points_of_the_describing_function():
     process = TransferFunction.lag_n(2.0, 3.0, 3, 1.0)
     for test in _tests(process, 0.1):
-        w, value = frequency_point(test)
+        w, value = describing_function_point(test)
         # Three lags leave little but the fundamental.
         assert value == pytest.approx(complex(process(1j * w)), rel=0.06)
     literal = fit_jointly(equal_lags(3), _tests(process), exact=False)
@@ -88,7 +88,7 @@ def test_points_of_the_describing_function():
 
 def test_a_point_of_a_pure_delay_has_the_phase_of_what_was_added():
     test = SymmetricCycle(8.0, 1.0, 1.0, 0.0, 1.0)
-    w, value = frequency_point(test)
+    w, value = describing_function_point(test)
     assert w == pytest.approx(math.pi / 4.0)
     assert cmath.phase(-value) == pytest.approx(math.pi / 4.0)
     assert abs(value) == pytest.approx(math.pi / 4.0)

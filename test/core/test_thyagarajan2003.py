@@ -17,11 +17,11 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.methods.thyagarajan2003 import (
     dead_time_ratio,
-    equal_lags,
     first_half,
     flat_fopdt,
     fopdt,
     higher_order,
+    lags_from_cycle,
     order_from_curvature,
     rise_time_constant,
     small_dead_time,
@@ -152,7 +152,7 @@ def test_higher_orders_with_hysteresis(relay, order):
     assert found == pytest.approx((1.5, 3.0), rel=1e-9)
     # and with a dead time that is known
     s = reading(TransferFunction.lag_n(1.5, 3.0, order, 1.0), relay)
-    known = equal_lags(order, s.period, s.amplitude, 2.0, relay.hysteresis, dead_time=1.0)
+    known = lags_from_cycle(order, s.period, s.amplitude, 2.0, relay.hysteresis, dead_time=1.0)
     assert known == pytest.approx((1.5, 3.0, 1.0), rel=1e-9)
 
 
@@ -200,7 +200,7 @@ def test_numbers_of_no_process_are_refused_with_the_reason():
     with pytest.raises(IdentificationError, match="exceed"):
         fopdt(10.0, 1.0, 4.0, 1.0, 1.5)
     with pytest.raises(IdentificationError, match="exceed"):
-        equal_lags(5, 10.0, 1.0, 1.0, 1.5)
+        lags_from_cycle(5, 10.0, 1.0, 1.0, 1.5)
     with pytest.raises(IdentificationError, match="ln 2"):
         unstable_limit_cycle(1.0, 1.0, 0.7, 1.0)
     with pytest.raises(IdentificationError, match="at least 3"):

@@ -86,7 +86,7 @@ class JointFit:
     jacobian: FloatArray
 
 
-def frequency_point(cycle: SymmetricCycle) -> tuple[float, complex]:
+def describing_function_point(cycle: SymmetricCycle) -> tuple[float, complex]:
     """Return (w, G(j w)) of the process, by the describing function.
 
     :param cycle: a limit cycle whose ``dead_time`` is what was added to the relay.
@@ -274,7 +274,7 @@ def _point_residuals(
     """Return how far the logarithms of G are from the describing function's points."""
     found = []
     for test, (_, amplitude_error) in zip(tests, errors, strict=True):
-        w, point = frequency_point(test)
+        w, point = describing_function_point(test)
         size, phase = gain, -w * dead_time
         for tau in lags_of(model, constants):
             size /= math.hypot(1.0, w * tau)

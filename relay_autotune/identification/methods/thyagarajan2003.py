@@ -252,7 +252,7 @@ def small_dead_time(
     :raises IdentificationError: if no such process has this limit cycle.
     """
     if level is not None:
-        return equal_lags(2, period, amplitude, relay, level, ratio=ratio)
+        return lags_from_cycle(2, period, amplitude, relay, level, ratio=ratio)
     w = 2.0 * math.pi / period
     x = float(
         brentq(
@@ -288,12 +288,12 @@ def higher_order(
             f"{order} lags without dead time do not oscillate under a relay; at least 3 do"
         )
     if level is not None:
-        return equal_lags(order, period, amplitude, relay, level)[:2]
+        return lags_from_cycle(order, period, amplitude, relay, level)[:2]
     w, x = 2.0 * math.pi / period, math.tan(math.pi / order)
     return math.hypot(1.0, x) ** order * math.pi * amplitude / (4.0 * relay), x / w
 
 
-def equal_lags(
+def lags_from_cycle(
     order: int,
     period: float,
     amplitude: float,

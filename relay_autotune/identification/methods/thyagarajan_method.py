@@ -25,10 +25,10 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     HIGHER_ORDER,
     SMALL_DEAD_TIME,
     dead_time_ratio,
-    equal_lags,
     flat_fopdt,
     fopdt,
     higher_order,
+    lags_from_cycle,
     order_from_curvature,
     small_dead_time,
     unstable_fopdt,
@@ -69,15 +69,24 @@ class Solver:
     :param name: the structure, as text.
     :param equations: their numbers in the paper.
     :param structure: of the model.
-    :param exact: from shape to values, shape (p,).
-    :param literal: the same by the equations as they stand.
+    :param solve: from shape and the level at which the relay switched to values, shape (p,);
+        level None: by the equations of the paper as they stand.
+    :param ideal: the level of the relay in the paper's equations; None: they have no place for it.
     """
 
     name: str
     equations: str
     structure: Structure
-    exact: Callable[[Shape], FloatArray]
-    literal: Callable[[Shape], FloatArray]
+    solve: Callable[[Shape, float | None], FloatArray]
+    ideal: float | None = 0.0
+
+    def exact(self, shape: Shape) -> FloatArray:
+        """Return the values for the level at which the relay switched, shape (p,)."""
+        return self.solve(shape, shape.level)
+
+    def literal(self, shape: Shape) -> FloatArray:
+        """Return the values by the equations as they stand, shape (p,)."""
+        return self.solve(shape, self.ideal)
 
 
 @dataclass(frozen=True)
@@ -224,85 +233,62 @@ def _peak_time(shape: Shape, dead_time: float) -> float:
 
 
 def _sharp(dead_time: float) -> Solver:
-    def solve(s: Shape, level: float) -> FloatArray:
-        return np.array(fopdt(s.period, s.amplitude, _peak_time(s, dead_time), 1.0, level))
+    def solve(s: Shape, level: float | None) -> FloatArray:
+        return np.array(fopdt(s.period, s.amplitude, _peak_time(s, dead_time), 1.0, level or 0.0))
 
-    return Solver(
-        "FOPDT",
-        "eqs 10 and 11",
-        FOPDT,
-        lambda s: solve(s, s.level),
-        lambda s: solve(s, 0.0),
-    )
+    return Solver("FOPDT", "eqs 10 and 11", FOPDT, solve)
 
 
 def _unstable(dead_time: float) -> Solver:
-    def solve(s: Shape, level: float) -> FloatArray:
+    def solve(s: Shape, level: float | None) -> FloatArray:
         peak = _peak_time(s, dead_time)
-        return np.array(unstable_fopdt(s.period, s.amplitude, peak, 1.0, level))
+        return np.array(unstable_fopdt(s.period, s.amplitude, peak, 1.0, level or 0.0))
 
-    return Solver(
-        "unstable FOPDT",
-        "eqs 16 and 17",
-        UNSTABLE_FOPDT,
-        lambda s: solve(s, s.level),
-        lambda s: solve(s, 0.0),
-    )
+    return Solver("unstable FOPDT", "eqs 16 and 17", UNSTABLE_FOPDT, solve)
 
 
 def _integrating() -> Solver:
-    def solve(s: Shape, level: float) -> FloatArray:
-        if not (s.time_to_peak > 0.0 and s.amplitude > level):
+    def solve(s: Shape, level: float | None) -> FloatArray:
+        epsilon = level or 0.0
+        if not (s.time_to_peak > 0.0 and s.amplitude > epsilon):
             raise IdentificationError(
                 f"the peak of {s.amplitude:g} comes {s.time_to_peak:g} s after the switch at "
-                f"{level:g}: this is no limit cycle of a process with dead time"
+                f"{epsilon:g}: this is no limit cycle of a process with dead time"
             )
         # Half a period takes y from epsilon up to a, in D, and down to -epsilon.
-        return np.array(((s.amplitude - level) / s.time_to_peak, s.time_to_peak))
+        return np.array(((s.amplitude - epsilon) / s.time_to_peak, s.time_to_peak))
 
-    return Solver(
-        "integrator with dead time",
-        "the limit of eqs 10 and 11",
-        IPDT,
-        lambda s: solve(s, s.level),
-        lambda s: solve(s, 0.0),
-    )
+    return Solver("integrator with dead time", "the limit of eqs 10 and 11", IPDT, solve)
 
 
 def _flat() -> Solver:
     def solve(s: Shape, level: float | None) -> FloatArray:
         return np.array(flat_fopdt(s.period, s.amplitude, s.rise, s.rise_half, 1.0, level))
 
-    return Solver(
-        "FOPDT",
-        "eqs 20 to 22",
-        FOPDT,
-        lambda s: solve(s, s.level),
-        lambda s: solve(s, None),
-    )
+    return Solver("FOPDT", "eqs 20 to 22", FOPDT, solve, ideal=None)
 
 
 def _lags(order: int, dead_time: float) -> Solver:
     """K/(tau s + 1)^n with the dead time that is known, or that the category assumes."""
-    given = not math.isnan(dead_time)
     ratio = SMALL_DEAD_TIME if order == 2 else 0.0
+    assumed = {"ratio": ratio} if math.isnan(dead_time) else {"dead_time": dead_time}
 
-    def exact(s: Shape) -> FloatArray:
-        assumed = {"dead_time": dead_time} if given else {"ratio": ratio}
-        return np.array(equal_lags(order, s.period, s.amplitude, 1.0, s.level, **assumed)[:2])
-
-    def literal(s: Shape) -> FloatArray:
-        if order == 2:
-            return np.array(small_dead_time(s.period, s.amplitude, 1.0)[:2])
-        return np.array(higher_order(s.period, s.amplitude, 1.0, order))
+    def solve(s: Shape, level: float | None) -> FloatArray:
+        if level is not None:
+            found = lags_from_cycle(order, s.period, s.amplitude, 1.0, level, **assumed)
+        elif order == 2:
+            found = small_dead_time(s.period, s.amplitude, 1.0)
+        else:
+            return np.array(higher_order(s.period, s.amplitude, 1.0, order))
+        return np.array(found[:2])
 
     lags = LAG_N.of_order(order)
     return Solver(
         f"{order} equal lags",
         "eqs 23 and 24" if order == 2 else "eqs 26 and 27",
         _TiedLags(lags.name, lags.factors, given=dead_time, ratio=ratio),
-        exact,
-        literal,
+        solve,
+        ideal=None,
     )
 
 
