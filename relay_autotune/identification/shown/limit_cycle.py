@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr, stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -72,6 +71,9 @@ class RelayTest:
         :return: covariance, shape (p, p), None if fewer than three cycles are left; and half the
             width of a 95 % interval in standard deviations.
         """
+        # Imported here, as relay_node needs this module's types alone, and starts sooner so.
+        from scipy.special import stdtrit
+
         found = []
         for single in self.singles:
             try:
@@ -344,6 +346,8 @@ def _excess_of_peaks(whole: CycleRun, noise: float) -> float:
     With heights s_i and standard deviation sigma of the noise, the highest sample is below z with
     the probability prod Phi((z - s_i)/sigma).
     """
+    from scipy.special import log_ndtr  # as above
+
     since, y = half_cycles(whole)
     halves = 2 * len(whole.cycle.cycles)
     bins = max(min(_BINS, since.size // _SAMPLES_PER_BIN), 2)
