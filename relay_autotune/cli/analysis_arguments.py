@@ -14,7 +14,7 @@ from pathlib import Path
 from relay_autotune.analysis import Task
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
-from relay_autotune.cli.arguments import add_options, add_quantities, given_quantities
+from relay_autotune.cli.arguments import add_quantities, finite, given_quantities
 from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target
 from relay_autotune.cli.replay_bag import Job
 from relay_autotune.errors import RelayAutotuneError, SelectionError
@@ -24,39 +24,6 @@ from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
 from relay_autotune.text import visible
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
-
-# What a CSV file does not say of its times.
-TIMES = """
---time NAME  column of the time of a CSV
---time-unit  its unit, where the CSV does not say it (s)
---period S   time from row to row of a CSV without times"""
-_TAKEN = f"""
-what is taken from a recording
---measurement TOPIC[:FIELD]  topic, or column of a CSV, of the measurement
---command TOPIC[:FIELD]      topic, or column of a CSV, of the command{TIMES}
---start S          leave out what is before S [s from the start]
---end S            leave out what is after S [s from the start]
---command-before U  command that held before the recording, where that begins with its step
---clock            time of a message: when it was published, when it was recorded, or its header's
-                   stamp (%(default)s)
---join             take all BAGs as one recording on one timeline
---joint NAME       find measurement and command of this joint by its name; of several, one after
-                   the other
---joint-order NAME,NAME,...
-                  joints of commands that do not name them, as in the controller's parameter joints
---jointly          take all experiments as tests of one process, with one model
---max-chunk SIZE   leave out chunks that declare more than SIZE, such as 64M or 2G
-                   ({LARGEST_CHUNK >> 20}M)
-"""
-_EXPORT = """
-gains as a file
---export LAW       print a file that other programs load instead: yaml, or of a law of --law, which
-                   needs not be named again
---node NAME=/pid_controller  whose file it is (%(default)s)
---dof NAME         its degree of freedom (that of --joint, else joint)
---command-min U    lower clamp in it [u]
---command-max U    upper clamp in it [u]
-"""
 
 
 def add_design(parser: argparse.ArgumentParser) -> None:
@@ -93,13 +60,29 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     return DesignOptions(**given)
 
 
-def add_export(parser: argparse.ArgumentParser, more: str) -> None:
+def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Add the options that say where gains go.
 
     :param parser: of the command.
-    :param more: lines of the command's own options in that group.
+    :return: the group that they are in.
     """
-    add_options(parser, _EXPORT + more, export={"choices": EXPORTS})
+    group = parser.add_argument_group("gains as a file")
+    group.add_argument(
+        "--export",
+        choices=EXPORTS,
+        metavar="LAW",
+        help="print a file that other programs load instead: yaml, or of a law of --law, which "
+        "needs not be named again",
+    )
+    group.add_argument(
+        "--node", default="/pid_controller", metavar="NAME", help="whose file it is (%(default)s)"
+    )
+    group.add_argument(
+        "--dof", metavar="NAME", help="its degree of freedom (that of --joint, else joint)"
+    )
+    group.add_argument("--command-min", type=finite, metavar="U", help="lower clamp in it [u]")
+    group.add_argument("--command-max", type=finite, metavar="U", help="upper clamp in it [u]")
+    return group
 
 
 def export_target(options: argparse.Namespace) -> Target:
@@ -119,19 +102,69 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
 
     :param parser: of the command.
     """
-    add_options(
-        parser,
-        _TAKEN,
-        time_unit={"choices": TIME_UNITS},
-        clock={"choices": CLOCKS, "default": CLOCKS[0]},
-        joint={"action": "append", "default": []},
-        max_chunk={"dest": "largest_chunk", "type": _size, "default": LARGEST_CHUNK},
+    taken = parser.add_argument_group("what is taken from a recording")
+    for signal in ("measurement", "command"):
+        taken.add_argument(
+            f"--{signal}",
+            metavar="TOPIC[:FIELD]",
+            help=f"topic, or column of a CSV, of the {signal}",
+        )
+    add_times(taken)
+    taken.add_argument(
+        "--start", type=finite, metavar="S", help="leave out what is before S [s from the start]"
     )
+    taken.add_argument(
+        "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
+    )
+    taken.add_argument(
+        "--command-before", type=finite, metavar="U",
+        help="command that held before the recording, where that begins with its step",
+    )  # fmt: skip
+    taken.add_argument(
+        "--clock", choices=CLOCKS, default=CLOCKS[0],
+        help="time of a message: when it was published, when it was recorded, or its header's "
+        "stamp (%(default)s)",
+    )  # fmt: skip
+    taken.add_argument(
+        "--join", action="store_true", help="take all BAGs as one recording on one timeline"
+    )
+    taken.add_argument(
+        "--joint", action="append", default=[], metavar="NAME",
+        help="find measurement and command of this joint by its name; of several, one after the "
+        "other",
+    )  # fmt: skip
+    taken.add_argument(
+        "--joint-order", metavar="NAME,NAME,...",
+        help="joints of commands that do not name them, as in the controller's parameter joints",
+    )  # fmt: skip
+    taken.add_argument(
+        "--jointly", action="store_true",
+        help="take all experiments as tests of one process, with one model",
+    )  # fmt: skip
+    taken.add_argument(
+        "--max-chunk", dest="largest_chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
+        help="leave out chunks that declare more than SIZE, such as 64M or 2G "
+        f"({LARGEST_CHUNK >> 20}M)",
+    )  # fmt: skip
     how = parser.add_argument_group("identification and design")
-    add_options(how, "--method METHOD=waveform  how to identify (%(default)s)")
+    how.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
     add_quantities(how, declared(Known))
-    add_options(how, "--rule RULE=robust  how to tune (%(default)s)")
+    how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
     add_design(parser)
+
+
+def add_times(parser: argparse._ActionsContainer) -> None:
+    """Add options: what a CSV file does not say of its times.
+
+    :param parser: of the command, or a group of its options.
+    """
+    parser.add_argument("--time", metavar="NAME", help="column of the time of a CSV")
+    parser.add_argument(
+        "--time-unit", choices=TIME_UNITS, help="its unit, where the CSV does not say it (s)"
+    )
+    parser.add_argument(
+        "--period", type=finite, metavar="S", help="time from row to row of a CSV without times"
+    )
 
 
 def _size(text: str) -> int:

@@ -22,7 +22,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, add_options, guarded, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
 from relay_autotune.cli.terminal import (
     Help,
     StatusLine,
@@ -43,19 +43,6 @@ if TYPE_CHECKING:
 
 PROGRAM = "apply_gains"
 
-_OPTIONS = """
---namespace NS=  namespace of the loop
---node NAME=controller_node  name of the controller_node (%(default)s)
---step Y=0       step of the set-point [y]
---load U=0       a second step, added to the command [u]; the node's verify_load_max must allow it
---yes            do not ask
---accept-doubtful  also gains whose verdict is not trusted
---verify-only    verify the gains that are in force
---no-verify      apply them without a step
---revert         take the gains before back
---file FILE      write the gains, for pid_controller or the law that they are for; apply nothing
---wait S=60.0    how long to wait until the loop is at rest [s] (%(default)s)
-"""
 _FIGURES = (
     ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
 )  # fmt: skip
@@ -88,7 +75,35 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=Help,
         epilog="Example:\n  apply_gains --namespace tank --step 0.5",
     )
-    add_options(parser, _OPTIONS)
+    parser.add_argument("--namespace", default="", metavar="NS", help="namespace of the loop")
+    parser.add_argument(
+        "--node", default="controller_node", metavar="NAME",
+        help="name of the controller_node (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--step", type=finite, default=0.0, metavar="Y", help="step of the set-point [y]"
+    )
+    parser.add_argument(
+        "--load", type=finite, default=0.0, metavar="U",
+        help="a second step, added to the command [u]; the node's verify_load_max must allow it",
+    )  # fmt: skip
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    parser.add_argument(
+        "--accept-doubtful", action="store_true", help="also gains whose verdict is not trusted"
+    )
+    parser.add_argument(
+        "--verify-only", action="store_true", help="verify the gains that are in force"
+    )
+    parser.add_argument("--no-verify", action="store_true", help="apply them without a step")
+    parser.add_argument("--revert", action="store_true", help="take the gains before back")
+    parser.add_argument(
+        "--file", metavar="FILE",
+        help="write the gains, for pid_controller or the law that they are for; apply nothing",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wait", type=finite, default=60.0, metavar="S",
+        help="how long to wait until the loop is at rest [s] (%(default)s)",
+    )  # fmt: skip
     parser.set_defaults(stays=True)
     return parser
 

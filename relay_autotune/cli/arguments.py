@@ -8,11 +8,10 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -58,54 +57,6 @@ def finite(text: str) -> float:
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"expected a finite number, found {text}")
     return value
-
-
-# What stands for a number in the line of an option; any other word stands for a text.
-_NUMBERS: dict[str, Callable[[str], Any]] = {
-    **dict.fromkeys(("A", "B", "K", "KC", "LOW", "S", "T", "U", "W", "Y", "Z", "ZETA"), finite),
-    "N": int,
-}
-
-
-def add_options(
-    parser: argparse._ActionsContainer, lines: str, **others: Mapping[str, Any]
-) -> list[argparse.Action]:
-    """Add options from lines such as ``--wait S=5.0  how long to wait [s] (%(default)s)``.
-
-    An option, the names of its values, two blanks or a new line, and its help; indented lines
-    continue it. The default follows the name of a value; ``T...`` stands for one value or more;
-    an option without values is a switch. A line without a dash is the title of a group, in which
-    the options after it are; what follows its colon describes it.
-
-    :param parser: of the command, or a group of its options.
-    :param lines: an entry for each option.
-    :param others: what argparse is given besides, by the destination of the option.
-    :return: the options.
-    """
-    group, added = parser, []
-    for entry in re.split(r"\n(?=\S)", lines.strip()):
-        if not entry.startswith("-"):
-            title, _, about = " ".join(entry.split()).partition(": ")
-            group = parser.add_argument_group(title.removesuffix(":"), about or None)
-            continue
-        shown, told = re.split(r" {2,}|\n", entry, maxsplit=1)
-        flags = re.findall(r"(?<!\S)-\S+", shown)
-        values = shown.split()[len(flags) :]
-        dest = flags[-1].strip("-").replace("-", "_")
-        how: dict[str, Any] = {"help": " ".join(told.split())}
-        if values:
-            first, given, default = values[0].partition("=")
-            # NAME,NAME,... is one value.
-            name = first if "," in first else first.removesuffix("...")
-            kind = _NUMBERS.get(name, str)
-            how |= {"type": kind, "metavar": (name, *values[1:]) if values[1:] else name}
-            how |= {"default": kind(default)} if given else {}
-            how |= {"nargs": len(values)} if values[1:] else {}
-            how |= {"nargs": "+"} if name != first else {}
-        elif dest not in others:
-            how["action"] = "store_true"
-        added.append(group.add_argument(*flags, **how | dict(others.get(dest, {}))))
-    return added
 
 
 def say(program: str, text: str) -> None:

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from relay_autotune.bag.csv_file import read_csv
-from relay_autotune.bag.signals import TIME_UNITS, Selection
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.cli.analysis_arguments import TIMES
-from relay_autotune.cli.arguments import DONE, add_options, guarded, say
+from relay_autotune.cli.analysis_arguments import add_times
+from relay_autotune.cli.arguments import DONE, finite, guarded, say
 from relay_autotune.errors import BagError, SelectionError
 
 PROGRAM = "csv_to_bag"
@@ -29,13 +29,6 @@ Example:
   csv_to_bag bags/heater.csv heater_bag \\
       --measurement 'Temperature 1 (degC)' --command 'Heater 1 (%)'
   replay heater_bag --measurement /temperature_1 --command /heater_1
-"""
-_OPTIONS = f"""
---measurement NAME  column of the measurement
---command NAME      column of the command{TIMES}
---measurement-topic TOPIC  name of its topic
---command-topic TOPIC      name of its topic
---epoch S=0         time zero of the file [s since 1970-01-01 UTC] (%(default)s)
 """
 
 
@@ -53,7 +46,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("csv", metavar="CSV", type=Path, help="file with a header line")
     parser.add_argument("bag", metavar="BAG", type=Path, help="directory to make")
-    add_options(parser, _OPTIONS, time_unit={"choices": TIME_UNITS})
+    parser.add_argument("--measurement", metavar="NAME", help="column of the measurement")
+    parser.add_argument("--command", metavar="NAME", help="column of the command")
+    add_times(parser)
+    parser.add_argument("--measurement-topic", metavar="TOPIC", help="name of its topic")
+    parser.add_argument("--command-topic", metavar="TOPIC", help="name of its topic")
+    parser.add_argument(
+        "--epoch",
+        type=finite,
+        default=0.0,
+        metavar="S",
+        help="time zero of the file [s since 1970-01-01 UTC] (%(default)s)",
+    )
     options = parser.parse_args(arguments)
     return guarded(PROGRAM, lambda: _convert(options))
 

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from relay_autotune.cli.arguments import DONE, add_options, finite, guarded
+from relay_autotune.cli.arguments import DONE, finite, guarded
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
 from relay_autotune.errors import ParameterError, SelectionError, look_up
@@ -48,11 +48,6 @@ Exit status: 0 done; 1 no model has these numbers; 2 the command line is wrong.
 Examples:
   identify --method wang_biased --period-high 15.4 --period-low 20.4 \\
            --peak-max 0.5 --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
-"""
-_OPTIONS = """
---structure NAME=  structure of the model
---order N=0        number of equal lags of the model
---json             print the model as a JSON document
 """
 
 ANY, POSITIVE, NOT_NEGATIVE, NOT_ZERO = "", "> 0", ">= 0", "not 0"
@@ -365,13 +360,17 @@ def _parser() -> argparse.ArgumentParser:
         epilog="\n".join(["methods and their numbers:", *methods, "", _EPILOG]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_options(parser, "--method NAME  how to identify", method={"required": True})
+    parser.add_argument("--method", required=True, metavar="NAME", help="how to identify")
     for name, number in NUMBERS.items():
         letter = number.unit.upper() if number.unit.isalpha() else "X"
         parser.add_argument(
             option(name), type=finite, metavar=letter, help=f"{number.meaning} [{number.unit}]"
         )
-    add_options(parser, _OPTIONS)
+    parser.add_argument("--structure", default="", metavar="NAME", help="structure of the model")
+    parser.add_argument(
+        "--order", type=int, default=0, metavar="N", help="number of equal lags of the model"
+    )
+    parser.add_argument("--json", action="store_true", help="print the model as a JSON document")
     return parser
 
 

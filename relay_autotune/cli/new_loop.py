@@ -16,7 +16,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
-from relay_autotune.cli.arguments import add_options
+from relay_autotune.cli.arguments import finite
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
 from relay_autotune.cli.terminal import Working, asked, broken, number_of, pair_of, width
 from relay_autotune.errors import ParameterError, SelectionError
@@ -42,42 +42,58 @@ _FLAGS = {
 }
 
 
-_OF_NEW_LOOP = """
-a loop without nodes: with --measurement and --command it starts relay_node and identifier_node
-    itself, asks for what it must know, shows the plan, tunes, and ends them
---measurement TOPIC  topic that measures
---command TOPIC      topic that commands the actuator
---field PATH=data    the number in the messages of --measurement (%(default)s)
---command-field PATH    the number in the messages of --command, such as linear.x
---command-message YAML  what stands in their other elements, such as '{data: [0.0, 1.5]}'
---command-period S
-    send the last command again after this time, for an actuator that stops without
---at U               the present command, at which the process rests
---within LOW HIGH    the tune ends where the measurement leaves these [y]
---command-within LOW HIGH  no command beyond these is sent [u]
---law LAW            design the gains for the law of another program, such as simple_pid, and prove
-                     them with that law
---sample-period S    time between two runs of that program [s]; default: that of the measurement
---verify             prove the gains with a step of the set-point, by a controller_node of its own;
-                     without either flag it asks, with --yes it does not
---step Y             height of that step [y]; default: half of the swing of the tune, at least
-                     twenty times the noise (forty if that is within a third of the way to a
-                     limit), as far as --within and --command-within allow
---yes                do not ask, for scripts; gains are then proven with --verify alone
---export FILE        write the gains for ros2_controllers' pid_controller
-"""
-_OF_JOINT = """
-a joint of ros2_control: with --controller and --joint it finds topics, limits and gains by itself,
-    tunes, and applies and verifies the gains
---controller NAME  an active pid_controller, or with --open a joint_trajectory_controller
---joint NAME       the joint, or degree of freedom
---controller-manager NAME=
-                   full name of the controller_manager; default: the only one that is there
---open             switch its controllers off for the tune, and command the joint itself; default:
-                   the controller stays active, and its reference is moved
---forward NAME     with --open: the controller that passes commands on; default: found
---keep-gains       leave the gains of the controller as they are
-"""
+_LIMITS = {"type": finite, "nargs": 2, "metavar": ("LOW", "HIGH")}
+_OF_NEW_LOOP: dict[str, dict[str, Any]] = {
+    "measurement": {"metavar": "TOPIC", "help": "topic that measures"},
+    "command": {"metavar": "TOPIC", "help": "topic that commands the actuator"},
+    "field": {
+        "default": "data", "metavar": "PATH",
+        "help": "the number in the messages of --measurement (%(default)s)",
+    },
+    "command_field": {
+        "metavar": "PATH",
+        "help": "the number in the messages of --command, such as linear.x",
+    },
+    "command_message": {
+        "metavar": "YAML",
+        "help": "what stands in their other elements, such as '{data: [0.0, 1.5]}'",
+    },
+    "command_period": {
+        "type": finite, "metavar": "S",
+        "help": "send the last command again after this time, for an actuator that stops without",
+    },
+    "at": {
+        "type": finite, "metavar": "U",
+        "help": "the present command, at which the process rests",
+    },
+    "within": {**_LIMITS, "help": "the tune ends where the measurement leaves these [y]"},
+    "command_within": {**_LIMITS, "help": "no command beyond these is sent [u]"},
+    "law": {
+        "choices": tuple(LAWS), "metavar": "LAW",
+        "help": "design the gains for the law of another program, such as simple_pid, and prove "
+        "them with that law",
+    },
+    "sample_period": {
+        "type": finite, "metavar": "S",
+        "help": "time between two runs of that program [s]; default: that of the measurement",
+    },
+    "verify": {
+        "action": argparse.BooleanOptionalAction,
+        "help": "prove the gains with a step of the set-point, by a controller_node of its own; "
+        "without either flag it asks, with --yes it does not",
+    },
+    "step": {
+        "type": finite, "metavar": "Y",
+        "help": "height of that step [y]; default: half of the swing of the tune, at least twenty "
+        "times the noise (forty if that is within a third of the way to a limit), as far as "
+        "--within and --command-within allow",
+    },
+    "yes": {
+        "default": False, "action": "store_true",
+        "help": "do not ask, for scripts; gains are then proven with --verify alone",
+    },
+    "export": {"metavar": "FILE", "help": "write the gains for ros2_controllers' pid_controller"},
+}  # fmt: skip
 
 # Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
 _OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
@@ -91,10 +107,13 @@ def add_new_loop(parser: argparse.ArgumentParser) -> None:
 
     :param parser: of tune_loop.
     """
-    verify = {"action": argparse.BooleanOptionalAction}
-    flags = add_options(parser, _OF_NEW_LOOP, law={"choices": tuple(LAWS)}, verify=verify)
-    # One with a default is not told from one that is not given.
-    parser.set_defaults(of_new_loop=[each.dest for each in flags if each.default is None])
+    group = parser.add_argument_group(
+        "a loop without nodes",
+        "with --measurement and --command it starts relay_node and identifier_node itself, asks "
+        "for what it must know, shows the plan, tunes, and ends them",
+    )
+    for name, how in _OF_NEW_LOOP.items():
+        group.add_argument(f"--{name.replace('_', '-')}", **how)
 
 
 def is_new_loop(options: argparse.Namespace) -> bool:
@@ -105,8 +124,9 @@ def is_new_loop(options: argparse.Namespace) -> bool:
     """
     if options.measurement and options.command:
         return True
-    for name in options.of_new_loop:
-        if getattr(options, name) is not None:
+    for name, how in _OF_NEW_LOOP.items():
+        # One with a default is not told from one that is not given.
+        if "default" not in how and getattr(options, name) is not None:
             raise SelectionError(
                 f"--{name.replace('_', '-')} is for a loop without nodes: give --measurement and "
                 f"--command, too"
@@ -119,7 +139,32 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
 
     :param parser: of tune_loop.
     """
-    add_options(parser, _OF_JOINT)
+    group = parser.add_argument_group(
+        "a joint of ros2_control",
+        "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
+        "applies and verifies the gains",
+    )
+    group.add_argument(
+        "--controller", metavar="NAME",
+        help="an active pid_controller, or with --open a joint_trajectory_controller",
+    )  # fmt: skip
+    group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
+    group.add_argument(
+        "--controller-manager", default="", metavar="NAME",
+        help="full name of the controller_manager; default: the only one that is there",
+    )  # fmt: skip
+    group.add_argument(
+        "--open", action="store_true",
+        help="switch its controllers off for the tune, and command the joint itself; default: "
+        "the controller stays active, and its reference is moved",
+    )  # fmt: skip
+    group.add_argument(
+        "--forward", metavar="NAME",
+        help="with --open: the controller that passes commands on; default: found",
+    )  # fmt: skip
+    group.add_argument(
+        "--keep-gains", action="store_true", help="leave the gains of the controller as they are"
+    )
 
 
 def is_of_joint(options: argparse.Namespace) -> bool:

@@ -10,7 +10,7 @@ import importlib.util
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from relay_autotune.cli.arguments import add_options, as_typed, say
+from relay_autotune.cli.arguments import as_typed, say
 from relay_autotune.errors import MissingPackageError
 
 if TYPE_CHECKING:
@@ -20,14 +20,6 @@ if TYPE_CHECKING:
     from relay_autotune.web.shape import Asked
 
 _LOOPBACK = "127.0.0.1"
-
-_OPTIONS = f"""
-a page in the browser
---web  what the page does
---web-address HOST[:PORT]={_LOOPBACK}
-       where it is served (%(default)s, any free port); other than on this machine's own address it
-       asks for a token, which is part of the address that is printed
-"""
 
 
 def add_web(
@@ -39,7 +31,13 @@ def add_web(
     :param parser: of the command.
     :param what: the page does.
     """
-    add_options(parser, _OPTIONS, web={"action": "store_true", "help": what})
+    group = parser.add_argument_group("a page in the browser")
+    group.add_argument("--web", action="store_true", help=what)
+    group.add_argument(
+        "--web-address", default=_LOOPBACK, metavar="HOST[:PORT]",
+        help="where it is served (%(default)s, any free port); other than on this machine's own "
+        "address it asks for a token, which is part of the address that is printed",
+    )  # fmt: skip
 
 
 def check_web(options: argparse.Namespace) -> None:

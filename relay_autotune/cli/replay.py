@@ -13,7 +13,7 @@ from pathlib import Path
 
 from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.analysis_arguments import add_analysis, add_export, export_target, jobs_of
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, add_options, guarded, say, worst
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
 from relay_autotune.cli.export import write
 from relay_autotune.cli.page import add_web, check_web, show
 from relay_autotune.cli.replay_bag import Done, Job, replay
@@ -55,16 +55,6 @@ And with some of your own:
   replay --joint left_wheel --joint right_wheel --output wheels.csv robot_bag
   replay --method li without_extra_delay with_extra_delay
 """
-_SHOWN = """
---json         print one JSON document a bag
---report FILE  also write a report: .html, or a .png, .svg or .pdf
-"""
-_FILED = """
--o --output FILE  write results as they come to a .jsonl, .csv or .parquet file instead; bags that
-                  it already has are left out; with --export the file of the gains
---jobs N=1        bags at a time (%(default)s)
---scheduler ADDRESS  work on a Dask cluster, such as tcp://host:8786
-"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -88,10 +78,25 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help="recordings")
     add_analysis(parser)
-    add_options(parser, _SHOWN)
+    parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
+    parser.add_argument(
+        "--report", metavar="FILE", help="also write a report: .html, or a .png, .svg or .pdf"
+    )
     add_present(parser)
-    add_options(parser, _FILED, jobs={"type": _count})
-    add_export(parser, "--accept-doubtful  also write gains that are doubtful")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE",
+        help="write results as they come to a .jsonl, .csv or .parquet file instead; "
+        "bags that it already has are left out; with --export the file of the gains",
+    )  # fmt: skip
+    parser.add_argument(
+        "--jobs", type=_count, metavar="N", default=1, help="bags at a time (%(default)s)"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
+    )
+    add_export(parser).add_argument(
+        "--accept-doubtful", action="store_true", help="also write gains that are doubtful"
+    )
     add_web(parser)
     return parser
 

@@ -23,7 +23,7 @@ from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
-    add_options,
+    finite,
     flag_of,
     guarded,
     say,
@@ -60,17 +60,6 @@ Examples:
   report bags/step_test -o tank.html --figures figures \\
       --measurement /reactor/temperature --command /reactor/heater
 """
-_OPTIONS = """
--o --output FILE=report.html
-               the report: .html, or one picture: .png, .svg or .pdf (%(default)s)
---figures DIR  also write each figure to a file in DIR
---format       of these figures (%(default)s)
---title TEXT=  title of the report
-"""
-_PRESENT = """
---present KC TI TD
-        gains in the controller now, for comparison in the report [u/y, s, s]; TI 0: P
-"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,8 +81,15 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("sources", nargs="+", metavar="SOURCE", help="recordings or results")
-    kinds = {"choices": ("png", "svg"), "default": "png"}
-    add_options(parser, _OPTIONS, format=kinds)
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", default="report.html",
+        help="the report: .html, or one picture: .png, .svg or .pdf (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--figures", metavar="DIR", help="also write each figure to a file in DIR")
+    parser.add_argument(
+        "--format", choices=("png", "svg"), default="png", help="of these figures (%(default)s)"
+    )
+    parser.add_argument("--title", metavar="TEXT", default="", help="title of the report")
     add_present(parser)
     add_analysis(parser)
     return parser
@@ -141,7 +137,10 @@ def add_present(parser: argparse.ArgumentParser) -> None:
 
     :param parser: of the command.
     """
-    add_options(parser, _PRESENT)
+    parser.add_argument(
+        "--present", nargs=3, type=finite, metavar=("KC", "TI", "TD"),
+        help="gains in the controller now, for comparison in the report [u/y, s, s]; TI 0: P",
+    )  # fmt: skip
 
 
 def command_line(program: str, arguments: Sequence[str] | None) -> str:

@@ -24,7 +24,7 @@ from relay_autotune.cli.analysis_arguments import (
     design_options,
     export_target,
 )
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, add_options, guarded, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
 from relay_autotune.cli.export import exported, write
 from relay_autotune.cli.page import add_web, check_web, show
 from relay_autotune.cli.table import gains_lines
@@ -379,29 +379,6 @@ Examples:
   tune --numerator 1 --denominator 10 7 1 --dead-time 2 --ms 1.6
   replay --json bag | tune - --export pid_controller --dof heater > gains.yaml
 """
-_MODEL = """
---experiment N         which experiment of a document, from 1
-the model, where no document is given
---gain K               gain [y/u; y/(u s) if it integrates]
---time-constants T...  T of (T s + 1) [s]
---dead-time S          dead time [s]
---zeros Z...           Z of (Z s + 1) above; < 0: inverse response [s]
---integrators N        number of poles at s = 0
---order N              number of equal lags
---natural-frequency W  of a pair [rad/s]
---damping ZETA         of a pair
---structure NAME       structure, such as unstable_fopdt
---numerator B...       powers of s, highest first
---denominator A...     powers of s, highest first
-the rule
---rule NAME            the rule; --table shows them all
---table                every rule, side by side
-"""
-_SHOWN = """
-how it is shown
---form  form of the gains (isa)
---json  print a JSON document
-"""
 
 _NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
 
@@ -438,11 +415,39 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "document", nargs="?", metavar="MODEL", help="JSON document with the model; -: from stdin"
     )
-    add_options(parser, _MODEL)
+    parser.add_argument(
+        "--experiment", type=int, metavar="N", help="which experiment of a document, from 1"
+    )
+    model = parser.add_argument_group("the model, where no document is given")
+    number: dict[str, Any] = {"type": finite}
+    several: dict[str, Any] = {"type": finite, "nargs": "+"}
+    model.add_argument(
+        "--gain", **number, metavar="K", help="gain [y/u; y/(u s) if it integrates]"
+    )
+    model.add_argument("--time-constants", **several, metavar="T", help="T of (T s + 1) [s]")
+    model.add_argument("--dead-time", **number, metavar="S", help="dead time [s]")
+    model.add_argument(
+        "--zeros", **several, metavar="Z", help="Z of (Z s + 1) above; < 0: inverse response [s]"
+    )
+    model.add_argument("--integrators", type=int, metavar="N", help="number of poles at s = 0")
+    model.add_argument("--order", type=int, metavar="N", help="number of equal lags")
+    model.add_argument("--natural-frequency", **number, metavar="W", help="of a pair [rad/s]")
+    model.add_argument("--damping", **number, metavar="ZETA", help="of a pair")
+    model.add_argument("--structure", metavar="NAME", help="structure, such as unstable_fopdt")
+    model.add_argument("--numerator", **several, metavar="B", help="powers of s, highest first")
+    model.add_argument("--denominator", **several, metavar="A", help="powers of s, highest first")
+
+    asked = parser.add_argument_group("the rule")
+    asked.add_argument("--rule", metavar="NAME", help="the rule; --table shows them all")
+    asked.add_argument("--table", action="store_true", help="every rule, side by side")
     add_design(parser)
 
-    add_options(parser, _SHOWN, form={"choices": FORMS, "default": "isa"})
-    add_export(parser, "--output FILE  write the file there, not to standard output")
+    shown = parser.add_argument_group("how it is shown")
+    shown.add_argument("--form", choices=FORMS, default="isa", help="form of the gains (isa)")
+    shown.add_argument("--json", action="store_true", help="print a JSON document")
+    add_export(parser).add_argument(
+        "--output", metavar="FILE", help="write the file there, not to standard output"
+    )
     add_web(parser)
     return parser
 

@@ -39,8 +39,8 @@ from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
     USAGE,
-    add_options,
     deserved,
+    finite,
     guarded,
     say,
 )
@@ -80,18 +80,6 @@ if TYPE_CHECKING:
 # Parts of the checklist's lines on rest while few samples have come, and on the model while
 # identifier_node is not discovered.
 NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
-
-
-_OPTIONS = """
---amplitude U=0  half the distance of the two commands [u]; default: the node's parameter
---dry-run        only ask whether a tune could start, and how
---namespace NS=  namespace of the loop; with --web several, separated by commas
---node NAME=relay_node  name of the relay_node (%(default)s)
---record-only    tune without an identifier_node: a recording, and no model
---wait S=5.0     how long to wait for the nodes [s] (%(default)s)
---report FILE    write a report: .html, or a picture: .png, .svg or .pdf
---json           print the result as JSON
-"""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -146,7 +134,33 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=Help,
         epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5 --report tank.html",
     )
-    add_options(parser, _OPTIONS)
+    parser.add_argument(
+        "--amplitude", type=finite, default=0.0, metavar="U",
+        help="half the distance of the two commands [u]; default: the node's parameter",
+    )  # fmt: skip
+    parser.add_argument(
+        "--dry-run", action="store_true", help="only ask whether a tune could start, and how"
+    )
+    parser.add_argument(
+        "--namespace", default="", metavar="NS",
+        help="namespace of the loop; with --web several, separated by commas",
+    )  # fmt: skip
+    parser.add_argument(
+        "--node", default="relay_node", metavar="NAME", help="name of the relay_node (%(default)s)"
+    )
+    parser.add_argument(
+        "--record-only", action="store_true",
+        help="tune without an identifier_node: a recording, and no model",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wait", type=finite, default=5.0, metavar="S",
+        help="how long to wait for the nodes [s] (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--report", metavar="FILE",
+        help="write a report: .html, or a picture: .png, .svg or .pdf",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_new_loop(parser)
     add_joint(parser)
     add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
