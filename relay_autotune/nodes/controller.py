@@ -39,10 +39,9 @@ from relay_autotune.nodes.gains_place import (
     reported_by,
     said,
 )
-from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
+from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import declare, merged, values_of
-from relay_autotune.nodes.quality import FOLLOW_EVERY, Following
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.tables import (
     CONTROLLER_PARAMETERS,
@@ -57,7 +56,7 @@ from relay_autotune.nodes.tables import (
     rate_from,
 )
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
-from relay_autotune.nodes.watch import Repeater, require_own_time
+from relay_autotune.nodes.watch import Following, Repeater, require_own_time
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
@@ -139,18 +138,7 @@ class ControllerNode(ServedNode):
         if values["repeat_period"] > 0.0:
             self._repeater = Repeater(self, values["repeat_period"], reader, self._on_silence)
         self._commands = quality.publisher(self, Float64, "controller_command", quality.COMMAND)
-        sensor = Following(
-            self,
-            reader.kind,
-            reader.type_name,
-            "measurement",
-            self._on_measurement,
-            None if self._simulated else self.favour,
-        )
-        measurement = sensor.subscription
-        if not self._simulated:
-            self.favour(measurement)
-        self.create_timer(FOLLOW_EVERY, sensor.follow, clock=STEADY)
+        measurement = Following(self, reader, self._on_measurement).subscription
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         if self._reported is None:

@@ -12,13 +12,12 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from std_msgs.msg import Bool, Float64
@@ -26,18 +25,18 @@ from std_msgs.msg import Bool, Float64
 from relay_autotune.errors import FieldError, NotReadyError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.lifetime import STEADY
+from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import CommandMessage, Reader
-from relay_autotune.nodes.quality import Following
 from relay_autotune.nodes.results import SIGNS_OF_LIFE
 from relay_autotune.nodes.watch import (
+    Following,
     FollowWatch,
     Guard,
     Overtime,
-    Silence,
     namesake,
     second_publisher,
     second_source,
+    silence,
 )
 from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
@@ -46,6 +45,8 @@ from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 # Fast DDS asks for acknowledgements when the publisher's history is full, else every 3 s.
 REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
+# Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
+CYCLES_KEPT = 100
 
 
 class Outlet:
@@ -58,7 +59,7 @@ class Outlet:
     """
 
     def __init__(
-        self, node: Node, messages: CommandMessage, topic: str, *, overridable: bool = False
+        self, node: ServedNode, messages: CommandMessage, topic: str, *, overridable: bool = False
     ) -> None:
         self.messages = messages
         self.publisher: Publisher = quality.publisher(
@@ -89,45 +90,51 @@ class Ends:
     """Publishers and subscriptions of relay_node.
 
     :param node: the node.
+    :param fixed: its fixed parameters by name.
+    :param reader: how the measurement is read from its messages.
+    :param now_ns: returns the time for the stamps of commands [ns].
     :param on_measurement: called with each measurement and the middleware's facts about it.
-    :param on_renewed: called with a subscription that replaces that of the measurement; None: not.
+    :param is_busy: tells whether a tune runs, in which no sample may be missed.
     :param on_result: called with the topic's unresolved name and each model or gains.
     :param on_status: called with each sign of life of the identifier.
-    :param cycles_kept: number of cycles kept for late subscribers (depth of the latched topic).
-    :param reader: how the measurement is read from its messages.
-    :param commands: writes what the relay sends into its message.
-    :param relay_on_setpoint: True if the relay publishes set-points.
-    :param is_reported: True if the controller commands the actuator itself and reports how; the
-        relay then sends nothing but set-points.
     """
 
     def __init__(
         self,
-        node: Node,
+        node: ServedNode,
+        fixed: Mapping[str, Any],
+        reader: Reader,
+        now_ns: Callable[[], int],
         *,
         on_measurement: Callable[[Any, dict[str, Any]], None],
-        on_renewed: Callable[[Subscription], None] | None,
+        is_busy: Callable[[], bool],
         on_result: Callable[[str, Any], None],
         on_status: Callable[[Any], None],
-        cycles_kept: int,
-        reader: Reader,
-        commands: CommandMessage,
-        relay_on_setpoint: bool = False,
-        is_reported: bool = False,
     ) -> None:
+        commands = CommandMessage(
+            fixed["command_type"],
+            fixed["command_field"],
+            fixed["command_message"],
+            taken=fixed["command_others"] == "other_commands",
+            now_ns=now_ns,
+        )
+        self.is_reported = bool(fixed["controller_command_field"])
+        """True if the controller commands the actuator itself and reports how; the relay then
+        sends nothing but set-points."""
         # /diagnostics and the answer to a start report an incompatible QoS.
-        self.is_reported = is_reported
         self.command = Outlet(
-            node, CommandMessage() if is_reported else commands, "command", overridable=True
+            node, CommandMessage() if self.is_reported else commands, "command", overridable=True
         )
         self.setpoint: Outlet | None = None
         """Where set-points go out; None: the relay does not move them."""
-        if relay_on_setpoint:
-            self.setpoint = Outlet(node, commands if is_reported else CommandMessage(), "setpoint")
+        if fixed["relay_on"] == "setpoint":
+            messages = commands if self.is_reported else CommandMessage()
+            self.setpoint = Outlet(node, messages, "setpoint")
         self.relay = self.setpoint or self.command
         """Where the relay's levels go out."""
-        self.own = self.relay if is_reported else self.command
+        self.own = self.relay if self.is_reported else self.command
         """Where the message goes out that the node was given, and that may have to be repeated."""
+        cycles_kept = max(node.get_parameter("max_cycles").value, CYCLES_KEPT)
         self.cycles = quality.publisher(
             node, RelayCycle, "relay_cycle", quality.latched(cycles_kept)
         )
@@ -139,9 +146,7 @@ class Ends:
         )
         self.diagnostics = quality.publisher(node, DiagnosticArray, "/diagnostics", 1)
         self.reader = reader
-        self._sensor = Following(
-            node, reader.kind, reader.type_name, "measurement", on_measurement, on_renewed
-        )
+        self._sensor = Following(node, reader, on_measurement, is_busy)
         self.models, self.gains = (
             quality.subscription(node, kind, name, partial(on_result, name), quality.RESULT)
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
@@ -152,10 +157,6 @@ class Ends:
     def measurement(self) -> Subscription:
         """The subscription of the measurement that is in force."""
         return self._sensor.subscription
-
-    def follow_sensor(self) -> None:
-        """Take the measurement best effort if its publisher offers no more."""
-        self._sensor.follow()
 
     def recorded(self) -> dict[str, Any]:
         """Return the publishers and subscriptions to record, by the topics' unresolved names."""
@@ -200,7 +201,8 @@ class Handover:
 
     def __init__(self, send: Callable[[float], None]) -> None:
         self._send = send
-        self._last = math.nan
+        self.last = math.nan
+        """The controller's last command [u]; NaN before the first."""
         self._arrived = -math.inf
         self._kept: deque[float] = deque(maxlen=_KEPT)
         self._active = False
@@ -213,11 +215,6 @@ class Handover:
     def age(self) -> float:
         """Time since the controller's last command [s]; inf before the first."""
         return time.monotonic() - self._arrived
-
-    @property
-    def last(self) -> float:
-        """The controller's last command [u]; NaN before the first."""
-        return self._last
 
     def is_connected(self, timeout: float) -> bool:
         """Return True if the controller's commands come.
@@ -238,7 +235,7 @@ class Handover:
         if not math.isfinite(command):
             return None
         now = time.monotonic()
-        self._last, self._arrived = command, now
+        self.last, self._arrived = command, now
         if self._active:
             return None
         if not math.isnan(self._left_at):
@@ -252,7 +249,7 @@ class Handover:
 
     def note(self, command: float) -> None:
         """Note a command that the controller has sent to the actuator directly [u]."""
-        self._last, self._arrived = command, time.monotonic()
+        self.last, self._arrived = command, time.monotonic()
         self._kept.append(command)
 
     def take_over(self) -> None:
@@ -291,16 +288,13 @@ class LoopEnds:
 
     :param node: relay_node.
     :param ends: its topics.
-    :param takeover: True if the controller publishes the command itself.
     :param stop: ends a running tune; takes the reason.
     """
 
-    def __init__(
-        self, node: Any, ends: Ends, *, takeover: bool, stop: Callable[[str], None]
-    ) -> None:
+    def __init__(self, node: Any, ends: Ends, stop: Callable[[str], None]) -> None:
         self._node = node
         self._ends = ends
-        self._takeover = takeover
+        self._takeover = takeover = self._value("path") == "takeover"
         self._stop = stop
         self.handover = Handover(ends.command.send)
         # The actuator is there already; the controller may be elsewhere.
@@ -310,7 +304,8 @@ class LoopEnds:
         self._experiment: RelayExperiment | None = None
         self._gives_back = False
         self._driven = False
-        self._silent = ""
+        self.problem = ""
+        """A problem that an operator must act on, or ""."""
         # Time of the last feedback; inf: there is no feedback.
         self._feedback_at = math.inf
         self._follow: FollowWatch | None = None
@@ -369,10 +364,6 @@ class LoopEnds:
         known = self._takeover or self.is_connected
         return self.handover.mean() if known else math.nan
 
-    def problem(self) -> str:
-        """Return a problem that an operator must act on, or ""."""
-        return self._silent
-
     def require_alone(self) -> None:
         """Refuse a start if another node publishes command or measurement, or has this name.
 
@@ -419,21 +410,15 @@ class LoopEnds:
         self.commanded = math.nan
         if self._ends.setpoint is None:
             self.handover.take_over()
-        checks: list[Callable[[], str]] = [
-            Overtime.of(experiment, self._node),
-            self._guard.every_look_at_the_graph(self._several),
-        ]
+        checks: list[Callable[[], str]] = [Overtime.of(experiment, self._node)]
+        of_graph = [self._several]
         if not self._takeover:
-            checks.append(
-                self._guard.every_look_at_the_graph(
-                    lambda: second_publisher(self._node, self._topic)
-                )
-            )
+            of_graph.append(partial(second_publisher, self._node, self._topic))
         if connected:
             timeout = self._value("controller_timeout")
             reported = self._ends.is_reported
             topic = (self._ends.measurement if reported else self._controller).topic_name
-            checks.append(Silence(f"no command on {topic}", timeout, lambda: self.handover.age))
+            checks.append(silence(f"no command on {topic}", timeout, lambda: self.handover.age))
         timeout = self._value("feedback_timeout")
         self._follow = None
         if self._ends.setpoint is None:
@@ -442,13 +427,13 @@ class LoopEnds:
                 self._feedback_at = math.inf
             self._follow = FollowWatch(self._tolerance(experiment), timeout)
             checks.append(
-                Silence(
+                silence(
                     "no command_feedback",
                     2.0 * timeout,
                     lambda: time.monotonic() - self._feedback_at,
                 )
             )
-        self._guard.begin(checks)
+        self._guard.begin(checks, of_graph)
         self._hold.publish(Bool(data=self._ends.setpoint is None))
 
     def _tolerance(self, experiment: RelayExperiment) -> Callable[[], float]:
@@ -495,7 +480,7 @@ class LoopEnds:
     def _on_controller(self, message: Float64) -> None:
         passed = self.handover.hear(message.data)
         if passed is not None:
-            self._driven, self._silent = True, ""
+            self._driven, self.problem = True, ""
         elif self._gives_back and self._experiment is not None and self.is_connected:
             self._experiment.safe_command = self.handover.last
 
@@ -561,8 +546,8 @@ class LoopEnds:
         # The safe command goes out before the log message.
         self._node.hold(safe)
         self.handover.give_back(safe, self._value("return_time"))
-        self._silent = (
+        self.problem = (
             f"{self._controller.topic_name} has been silent for more than {timeout:g} s; the "
             f"command is held at {safe:g} until it comes again"
         )
-        self._node.get_logger().error(self._silent)
+        self._node.get_logger().error(self.problem)

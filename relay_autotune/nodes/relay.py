@@ -25,10 +25,10 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
 from relay_autotune.nodes.goals import Narrator, TuneAction
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.live_types import CommandMessage, reader_of
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import declare, values_of
-from relay_autotune.nodes.quality import FOLLOW_EVERY, NO_REPEAT_AFTER, why_no_publisher
+from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
 from relay_autotune.nodes.readiness import (
     Checklist,
     Readiness,
@@ -41,15 +41,13 @@ from relay_autotune.nodes.tables import (
     FIXED_PARAMETERS,
     TUNE_PARAMETERS,
 )
-from relay_autotune.nodes.watch import Counter, LastSamples, Sensor, losses
+from relay_autotune.nodes.watch import LastSamples, Sensor, losses
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune
 
 # How long the end of the process waits for the acknowledgement of the record.
 ACKNOWLEDGE = Duration(seconds=0.2)
-# Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
-CYCLES_KEPT = 100
 # Where a tune that was started by the service is seen.
 WATCH = "the log of {}, or ros2 topic echo /diagnostics, which tell each second how it goes"
 # Silence of the measurement that is told during a tune [s].
@@ -71,7 +69,6 @@ class RelayNode(ServedNode):
         self._after: Callable[[float], float] | None = None
         self._session: Session | None = None
         self._simulated = bool(self.get_parameter("use_sim_time").value)
-        self._counter = Counter()
         self._last_samples = LastSamples()
         # Amplitude and last cycle of the last tune.
         self._last_cycle: tuple[float, Cycle] | None = None
@@ -83,36 +80,21 @@ class RelayNode(ServedNode):
         self._reported = reported_by(fixed)
         self._ends = Ends(
             self,
+            fixed,
+            self._reader,
+            self._now_ns if self._simulated else time.time_ns,
             on_measurement=self._on_measurement,
-            # With /clock another callback delivers the time of a sample.
-            on_renewed=None if self._simulated else self.favour,
+            is_busy=lambda: self._session is not None,
             on_result=self._on_result,
             on_status=lambda status: self._recordings.told(*said_by(status)),
-            cycles_kept=max(self.get_parameter("max_cycles").value, CYCLES_KEPT),
-            reader=self._reader,
-            commands=CommandMessage(
-                fixed["command_type"],
-                fixed["command_field"],
-                fixed["command_message"],
-                taken=fixed["command_others"] == "other_commands",
-                now_ns=self._now_ns if self._simulated else time.time_ns,
-            ),
-            relay_on_setpoint=fixed["relay_on"] == "setpoint",
-            is_reported=self._reported is not None,
         )
         self._send, self._relay = self._ends.command.send, self._ends.relay.send
-        self._on_setpoint = fixed["relay_on"] == "setpoint"
-        takeover = fixed["path"] == "takeover"
-        self._loop = LoopEnds(self, self._ends, takeover=takeover, stop=self._stop_now)
-        self._sensor = Sensor(
-            self, self._reader, self._counter, repeat=self._on_silence, stop=self._stop_now
-        )
+        self._on_setpoint = self._ends.setpoint is not None
+        self._loop = LoopEnds(self, self._ends, self._stop_now)
+        self._sensor = Sensor(self, self._reader, repeat=self._on_silence, stop=self._stop_now)
         self._readiness = Readiness(self, self._ends, self._sensor, self._loop, self._last_samples)
         self._hear = self._sensor.hear
         self._topic = self._ends.measurement.topic_name
-        if not self._simulated:
-            self.favour(self._ends.measurement)
-        self.create_timer(FOLLOW_EVERY, self._follow_sensor, clock=STEADY)
         self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
         self.create_service(StartTune, "~/start_tune", self._on_start)
@@ -164,7 +146,7 @@ class RelayNode(ServedNode):
                 self._stop_now(
                     f"the controller's command on {self._topic} cannot be read: {error}"
                 )
-        self._counter.add(info["publication_sequence_number"])
+        self._sensor.count(info["publication_sequence_number"])
 
     def _on_silence(self, value: float, ago: float) -> None:
         """Take the last measurement again: a silent sensor means that it has not changed."""
@@ -182,11 +164,6 @@ class RelayNode(ServedNode):
             self._defer_news(session)
         if session.experiment.finished:
             self._leave(session, command)
-
-    def _follow_sensor(self) -> None:
-        # A subscription that is replaced might miss a sample, so not during a tune.
-        if self._session is None:
-            self._ends.follow_sensor()
 
     def _answer_idle(self, value: float) -> None:
         if self._after is not None:
@@ -270,7 +247,6 @@ class RelayNode(ServedNode):
         if not converged:
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
-        self._counter.begin()
         self._last_samples.forget()
         self._alarm = ""
         self._session = session
@@ -441,7 +417,7 @@ class RelayNode(ServedNode):
     def _lost(self) -> int:
         # Sequence numbers of several publishers cannot be distinguished.
         alone = self._ends.measurement.get_publisher_count() <= 1
-        return self._counter.lost if alone else 0
+        return self._sensor.lost if alone else 0
 
     def hold(self, command: float) -> None:
         """Answer each measurement with a command from now on."""
@@ -459,13 +435,13 @@ class RelayNode(ServedNode):
         elif self._sensor.age > self.get_parameter("measurement_timeout").value:
             why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
             problems.append(f"no measurement comes: {why}")
-        problems += filter(None, (self._recordings.problem(), self._loop.problem()))
+        problems += filter(None, (self._recordings.problem(), self._loop.problem))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
         values: dict[str, object] = {
             "state": idle,
             "experiment": "",
-            "rate [Hz]": float(self._counter.since_last_asked()),
-            "age of the last sample [s]": self._counter.age,
+            "rate [Hz]": float(self._sensor.arrivals()),
+            "age of the last sample [s]": self._sensor.since_message,
         }
         summary = self._summary
         if session is not None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
@@ -25,8 +26,9 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import Repetition
 from relay_autotune.experiment.settling import CONSTANT_SAMPLES, RestState, rest_state
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.lifetime import STEADY
+from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import Reader
+from relay_autotune.nodes.quality import who
 
 # Shortest period of a timer, and interval of the graph checks during a tune [s].
 _LEAST_WAIT = 1e-3
@@ -149,45 +151,6 @@ class Repeater:
         return self._repetition.wait(now) <= _ROUNDING
 
 
-class Counter:
-    """Count arrivals: their number, the time since the last, and losses in the middleware."""
-
-    def __init__(self) -> None:
-        self.lost = 0
-        """Samples lost since `begin`, by the publisher's numbers."""
-        self._last_arrival = -math.inf
-        self._arrivals = self._arrivals_before = 0
-        self._sequence = 0
-
-    @property
-    def age(self) -> float:
-        """Time since the last arrival [s]; inf before the first."""
-        return time.monotonic() - self._last_arrival
-
-    def begin(self) -> None:
-        """Count losses, and the age, from here on."""
-        self.lost = 0
-        self._last_arrival = time.monotonic()
-
-    def add(self, number: int | None) -> None:
-        """Take an arrival.
-
-        :param number: its publication sequence number; None: not known.
-        """
-        self._last_arrival = time.monotonic()
-        self._arrivals += 1
-        if number is not None:
-            if number > self._sequence + 1 and self._sequence:
-                self.lost += number - self._sequence - 1
-            self._sequence = number
-
-    def since_last_asked(self) -> int:
-        """Return the number of arrivals since this was last asked."""
-        count = self._arrivals - self._arrivals_before
-        self._arrivals_before = self._arrivals
-        return count
-
-
 class LastSamples:
     """Keep the last measurements with their time of arrival."""
 
@@ -238,12 +201,86 @@ def losses(count: int) -> str:
     return f"{count} {'sample' if count == 1 else 'samples'} lost on the way" if count else ""
 
 
+class Following:
+    """Subscribe to the measurement reliably, and best effort once a publisher offers no more.
+
+    A reliable subscription receives nothing from a best effort publisher, and a best effort one
+    would lose samples of a reliable publisher without need. A reliability that the user gives by
+    ``qos_overrides`` stays as it is. The messages have the fast path of the node, unless another
+    callback, that of /clock, tells the time of a sample.
+
+    :param node: the node.
+    :param reader: how the measurement is read from its messages.
+    :param take: takes each message and the middleware's facts about it.
+    :param is_busy: tells whether the subscription has to stay now, since no sample may be missed.
+    """
+
+    def __init__(
+        self,
+        node: ServedNode,
+        reader: Reader,
+        take: Callable[[Any, dict[str, Any]], None],
+        is_busy: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._node, self._reader = node, reader
+        self._take, self._is_busy = take, is_busy
+        self._favours = not node.get_parameter("use_sim_time").value
+        self.subscription = self._subscribed(quality.MEASUREMENT, overridable=True)
+        """The subscription in force."""
+        given = f"qos_overrides.{self.subscription.topic_name}.subscription.reliability"
+        self._is_given = given in node._parameter_overrides
+        node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
+
+    def _subscribed(self, profile: QoSProfile, *, overridable: bool = False) -> Subscription:
+        found: Subscription = quality.subscription(
+            self._node,
+            self._reader.kind,
+            "measurement",
+            self._take,
+            profile,
+            overridable=overridable,
+        )
+        if self._favours:
+            self._node.favour(found)
+        return found
+
+    def _look(self) -> None:
+        """Subscribe anew if a publisher is there that the subscription cannot hear."""
+        old, profile = self.subscription, self.subscription.qos_profile
+        is_best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        if self._is_busy() or self._is_given or is_best_effort:
+            return
+        name = old.topic_name
+        if self._node.count_publishers(name) <= old.get_publisher_count():
+            return
+        offered = [
+            end
+            for end in self._node.get_publishers_info_by_topic(name)
+            if end.topic_type == self._reader.type_name
+            and end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        ]
+        if not offered:
+            return
+        self.subscription = self._subscribed(
+            QoSProfile(
+                history=profile.history,
+                depth=profile.depth,
+                durability=profile.durability,
+                reliability=ReliabilityPolicy.BEST_EFFORT,
+            )
+        )
+        self._node.destroy_subscription(old)
+        self._node.get_logger().info(
+            f"{name} is taken best effort, as {who(offered[0])} offers it: samples that "
+            f"are lost on the way are counted"
+        )
+
+
 class Sensor:
     """Watch the measurement: by its messages, or with repetition by its publisher.
 
     :param node: the node.
     :param reader: how the measurement is read from its messages.
-    :param counter: counts the messages.
     :param repeat: called as by :class:`Repeater`.
     :param stop: called with the reason when a tune must end.
     """
@@ -252,13 +289,11 @@ class Sensor:
         self,
         node: Any,
         reader: Reader,
-        counter: Counter,
         *,
         repeat: Callable[[float, float], None],
         stop: Callable[[str], None],
     ) -> None:
         self._node = node
-        self._counter = counter
         self._stop = stop
         self.repeat_period = period = float(node.get_parameter("repeat_period").value)
         """Silence after which a value is repeated [s]; 0: never."""
@@ -268,11 +303,39 @@ class Sensor:
         """To be called with each measurement; None: no call needed."""
         self.misread = ""
         """Why the last message could not be read; empty: it could."""
+        self.lost = 0
+        """Samples lost since `watch`, by the publisher's numbers."""
+        self._arrived = -math.inf
+        self._arrivals = self._arrivals_before = 0
+        self._sequence = 0
+
+    def count(self, number: int | None) -> None:
+        """Take the arrival of a message.
+
+        :param number: its publication sequence number; None: not known.
+        """
+        self._arrived = time.monotonic()
+        self._arrivals += 1
+        if number is not None:
+            if number > self._sequence + 1 and self._sequence:
+                self.lost += number - self._sequence - 1
+            self._sequence = number
+
+    def arrivals(self) -> int:
+        """Return the number of messages since this was last asked."""
+        count = self._arrivals - self._arrivals_before
+        self._arrivals_before = self._arrivals
+        return count
+
+    @property
+    def since_message(self) -> float:
+        """Time since the last message [s]; inf before the first."""
+        return time.monotonic() - self._arrived
 
     @property
     def age(self) -> float:
         """Time without a valid value [s]; inf before the first."""
-        age = self._counter.age
+        age = self.since_message
         return age if self._repeater is None else self._repeater.age(age)
 
     def why_dead(self) -> str:
@@ -284,7 +347,8 @@ class Sensor:
         return float(self._node.get_parameter("measurement_timeout").value)
 
     def watch(self) -> None:
-        """Watch on the steady clock until :meth:`rest`."""
+        """Watch on the steady clock until :meth:`rest`, and count losses from here on."""
+        self.lost, self._arrived = 0, time.monotonic()
         wait = self._timeout if self._repeater is None else _LOOK_EVERY
         self._timer = self._node.create_timer(wait, self._look, clock=STEADY)
 
@@ -301,7 +365,7 @@ class Sensor:
             if reason := self.why_dead():
                 self._stop(reason)
             return
-        age = self._counter.age
+        age = self.since_message
         if age < self._timeout:
             _again(self._timer, self._timeout - age)
             return
@@ -317,8 +381,6 @@ def _again(timer: Any, wait: float) -> None:
 # Interval of the checks [s]; the graph is checked once in _GRAPH_EVERY of them.
 LOOK_EVERY = 0.05
 _GRAPH_EVERY = 4
-# Name that the middleware gives to a publisher whose node is not discovered yet.
-_UNKNOWN = "NODE_NAME_UNKNOWN"
 
 # Longest time for which the samples' time may stand still: a multiple of measurement_timeout or
 # repeat_period, and at least a number of seconds. Then the largest ratio of steady time to the
@@ -405,32 +467,26 @@ class Guard:
 
     def __init__(self, node: Node, stop: Callable[[str], None]) -> None:
         self._stop = stop
-        self._looks = 0
-        self._checks: list[Callable[[], str]] = []
         self._timer = node.create_timer(LOOK_EVERY, self._look, clock=STEADY, autostart=False)
 
-    def begin(self, checks: list[Callable[[], str]]) -> None:
-        """Start the checks.
+    def begin(self, checks: list[Callable[[], str]], of_graph: list[Callable[[], str]]) -> None:
+        """Start the checks, which return a reason to end the tune, or "".
 
-        :param checks: each returns a reason to end the tune, or "".
+        :param checks: those of each look.
+        :param of_graph: those of each fourth look, since they query the middleware.
         """
-        self._checks, self._looks = checks, 0
+        self._checks, self._of_graph, self._looks = checks, of_graph, 0
         self._timer.reset()
 
     def end(self) -> None:
         """Stop the checks."""
-        self._checks = []
         self._timer.cancel()
-
-    def every_look_at_the_graph(self, check: Callable[[], str]) -> Callable[[], str]:
-        """Run a check less often, since it queries the middleware."""
-        return lambda: check() if self._looks % _GRAPH_EVERY == 0 else ""
 
     def _look(self) -> None:
         self._looks += 1
-        for check in self._checks:
-            reason = check()
-            if reason:
+        of_graph = self._of_graph if self._looks % _GRAPH_EVERY == 0 else []
+        for check in (*of_graph, *self._checks):
+            if reason := check():
                 self._stop(reason)
                 return
 
@@ -443,11 +499,8 @@ def second_publisher(node: Node, topic: str) -> str:
     """
     if node.count_publishers(topic) <= 1:
         return ""
-    who = _publishers(node, topic)
-    mine = node.get_fully_qualified_name()
-    if mine in who:
-        who.remove(mine)
-    return f"{topic} is also published by {_named(who)}: two of them would fight for the actuator"
+    others = _publishers(node, topic, node.get_fully_qualified_name())
+    return f"{topic} is also published by {others}: two of them would fight for the actuator"
 
 
 def second_source(node: Node, subscription: Subscription) -> str:
@@ -463,7 +516,7 @@ def second_source(node: Node, subscription: Subscription) -> str:
         return ""
     topic = subscription.topic_name
     return (
-        f"{topic} is published by {count} publishers, {_named(_publishers(node, topic))}, "
+        f"{topic} is published by {count} publishers, {_publishers(node, topic)}, "
         f"expected one: the relay would act on a mixture; end the others (a killed one leaves the "
         f"graph after 20 s)"
     )
@@ -482,38 +535,31 @@ def namesake(node: Node) -> str:
     )
 
 
-def _publishers(node: Node, topic: str) -> list[str]:
-    """Return the full names of a topic's publishing nodes, one for each publisher."""
-    return [
-        # A publisher is discovered a little earlier than its node.
-        "a node not known yet"
-        if _UNKNOWN in end.node_name
-        else f"{end.node_namespace.rstrip('/')}/{end.node_name}"
-        for end in node.get_publishers_info_by_topic(topic)
-    ]
+def _publishers(node: Node, topic: str, but: str = "") -> str:
+    """Return the names of a topic's publishing nodes, one for each publisher but one of a node."""
+    names = sorted(map(who, node.get_publishers_info_by_topic(topic)))
+    if but in names:
+        names.remove(but)
+    return " and ".join(names) or "another node"
 
 
-def _named(names: list[str]) -> str:
-    return " and ".join(sorted(names)) or "another node"
-
-
-class Silence:
-    """A limit on the silence of a signal, on the steady clock.
+def silence(what: str, timeout: float, age: Callable[[], float]) -> Callable[[], str]:
+    """Return a check of the silence of a signal, on the steady clock, for :class:`Guard`.
 
     :param what: subject of the sentence.
-    :param timeout: the limit [s].
+    :param timeout: longest silence [s].
     :param age: returns the time since the last message [s].
     """
 
-    def __init__(self, what: str, timeout: float, age: Callable[[], float]) -> None:
-        self._what = what
-        self._timeout = timeout
-        self._age = age
+    def look() -> str:
+        silent = age()
+        return f"{what} for {silent:.3g} s" if silent > timeout else ""
 
-    def __call__(self) -> str:
-        """Return a sentence if the limit is passed, else ""."""
-        silent = self._age()
-        return f"{self._what} for {silent:.3g} s" if silent > self._timeout else ""
+    return look
+
+
+# The steady clock's time [s].
+now = time.monotonic
 
 
 class Overtime:
@@ -567,8 +613,3 @@ class Overtime:
                 f"tells {tune.elapsed:.4g} s: check /clock, or what stamps the measurement"
             )
         return ""
-
-
-def now() -> float:
-    """Return the steady clock's time [s]."""
-    return time.monotonic()
