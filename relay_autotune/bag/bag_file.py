@@ -20,7 +20,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
@@ -53,7 +52,7 @@ from relay_autotune.bag.mcap_records import (
     record_offsets,
     sorted_records,
 )
-from relay_autotune.bag.source import MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, Source, expanding_package
+from relay_autotune.bag.source import MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, Source, expanding
 from relay_autotune.errors import BagError
 
 # Size of the expanded messages that are handed on together [bytes].
@@ -73,10 +72,16 @@ class BagFile:
         self.path = path
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
-        self._largest = largest
-        self._source = Source(path, magic)
+        self.message_counts: dict[int, int] = {}
+        """How many messages of each channel the file says it has, where it says so."""
+        self._source = Source(path, magic, largest)
         self.notes = [*self._source.notes]
         self._refused: set[int] = set()
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -93,9 +98,9 @@ class BagFile:
         """Size of the file, expanded if it is compressed as a whole [bytes]."""
         return self._source.size
 
-    def message_count(self, _channel: int) -> int:
-        """Return how many messages of a channel the file says it has; 0: it does not say."""
-        return 0
+    def _open(self) -> None:
+        """Learn what the file holds."""
+        raise NotImplementedError
 
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:
         """Yield the messages of some channels, a run of them at a time.
@@ -121,19 +126,18 @@ class BagFile:
         :param of: what to say of the channel in that note.
         :raises BagError: if they expand to more than a recording does.
         """
-        if not _are_compressed(messages):
+        # The first of them tells whether they are compressed.
+        if not (len(messages) and messages.payload(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC):
             yield messages
             return
-        zstandard = expanding_package("zstandard")
-        decompressor, view = zstandard.ZstdDecompressor(), memoryview(messages.content)
+        with expanding("zstandard") as zstandard:
+            decompressor = zstandard.ZstdDecompressor()
         parts: list[bytes] = []
         kept: list[int] = []
         size, refusal = 0, ""
-        for number, (begin, end) in enumerate(
-            zip(messages.begin.tolist(), messages.end.tolist(), strict=True)
-        ):
+        for number in range(len(messages)):
             try:
-                part = _expanded(zstandard, decompressor, view[begin:end], self._largest)
+                part = _expanded(decompressor, messages.payload(number), self._source.largest)
             except DamageError as damage:
                 refusal = refusal or str(damage)
                 continue
@@ -154,18 +158,10 @@ class BagFile:
             )
 
 
-def _are_compressed(messages: Messages) -> bool:
-    """Tell by the first of some messages whether they are compressed one by one."""
-    if messages.begin.size == 0:
-        return False
-    begin, end = int(messages.begin[0]), int(messages.end[0])
-    return bytes(messages.content[begin : min(end, begin + len(ZSTD_MAGIC))]) == ZSTD_MAGIC
-
-
-def _expanded(zstandard: ModuleType, decompressor: Any, frame: Content, largest: int) -> bytes:
-    if frame[: len(ZSTD_MAGIC)] != ZSTD_MAGIC:
-        return bytes(frame)
-    try:
+def _expanded(decompressor: Any, frame: bytes, largest: int) -> bytes:
+    if not frame.startswith(ZSTD_MAGIC):
+        return frame
+    with expanding("zstandard") as zstandard:
         # zstd allocates at once the size that the frame declares.
         size = zstandard.frame_content_size(frame)
         if size < 0:
@@ -175,8 +171,6 @@ def _expanded(zstandard: ModuleType, decompressor: Any, frame: Content, largest:
                 f"it declares {size} bytes, more than the {largest} that --max-chunk allows"
             )
         return bytes(decompressor.decompress(frame, max_output_size=size) if size else b"")
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise DamageError(str(error)) from None
 
 
 def _together(messages: Messages, kept: list[int], parts: list[bytes]) -> Messages:
@@ -223,19 +217,13 @@ class McapFile(BagFile):
 
     def __init__(self, path: Path, largest_chunk: int = LARGEST_CHUNK) -> None:
         super().__init__(path, largest_chunk)
-        try:
-            layout = layout_by_summary(self._source) or scan(self._source, largest_chunk)
-        except BaseException:
-            self.close()
-            raise
+
+    def _open(self) -> None:
+        self._layout = layout = layout_by_summary(self._source) or scan(self._source)
         self.channels = layout.declared.channels
         self.metadata = layout.declared.metadata
+        self.message_counts = layout.declared.message_counts or {}
         self.notes += layout.notes
-        self._layout = layout
-
-    def message_count(self, channel: int) -> int:
-        """Return how many messages of a channel the file says it has; 0: it does not say."""
-        return (self._layout.declared.message_counts or {}).get(channel, 0)
 
     def segments(self, channels: Collection[int]) -> list[Segment]:
         """Return the segments that may hold messages of some channels, in the order of the file.
@@ -254,7 +242,7 @@ class McapFile(BagFile):
         # Only the chunks that will be read are checked: on a disk each check takes time.
         if all(is_chunk_there(self._source, segment) for segment in chosen):
             return chosen
-        self._layout = scan(self._source, self._largest)
+        self._layout = scan(self._source)
         for note in self._layout.notes:
             self._note(note)
         found = self._layout.declared.channels
@@ -306,7 +294,7 @@ class McapFile(BagFile):
         size = 0
         for segment in self.segments(wanted):
             try:
-                content = segment_content(self._source, segment, self._largest)
+                content = segment_content(self._source, segment)
             except DamageError as damage:
                 self._note(damage_note(self._source, segment, damage))
                 continue
@@ -406,21 +394,23 @@ class SqliteFile(BagFile):
 
     def __init__(self, path: Path, largest: int = LARGEST_CHUNK) -> None:
         super().__init__(path, largest, SQLITE_MAGIC)
-        if path.with_name(path.name + "-wal").exists():
-            self.notes.append(f"{path.name}-wal holds the end of the recording and is not read")
+
+    def _open(self) -> None:
+        if self.path.with_name(self.path.name + "-wal").exists():
+            self.notes.append(
+                f"{self.path.name}-wal holds the end of the recording and is not read"
+            )
         try:
-            self._database = self._opened()
-            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, largest)
+            self._database = self._connected()
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self._source.largest)
             self._database.text_factory = lambda text: text.decode("utf-8", "replace")
             # A file may define views and functions that never end.
             self._database.execute("PRAGMA trusted_schema = OFF")
             self.channels = self._declared()
         except sqlite3.Error as error:
-            self.close()
-            raise self._unreadable(error) from None
-        except BaseException:
-            self.close()
-            raise
+            raise BagError(
+                f"{self.path} cannot be read as a rosbag2 file in SQLite: {error}"
+            ) from None
 
     def close(self) -> None:
         """Close the file."""
@@ -428,7 +418,7 @@ class SqliteFile(BagFile):
             self._database.close()
         super().close()
 
-    def _opened(self) -> sqlite3.Connection:
+    def _connected(self) -> sqlite3.Connection:
         descriptor = self._source.fileno()
         if os.fstat(descriptor).st_nlink:
             # By its descriptor: what was checked is what is read. Nothing is written to it.
@@ -440,15 +430,9 @@ class SqliteFile(BagFile):
         database.deserialize(self._source.read(0, self.size))
         return database
 
-    def _unreadable(self, error: Exception) -> BagError:
-        return BagError(f"{self.path} cannot be read as a rosbag2 file in SQLite: {error}")
-
-    def _tables(self) -> set[str]:
-        made = self._database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-        return {str(n) for n, sql in made if "VIRTUAL" not in str(sql).upper().split("(")[0]}
-
     def _declared(self) -> dict[int, Channel]:
-        tables = self._tables()
+        made = self._database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+        tables = {str(n) for n, sql in made if "VIRTUAL" not in str(sql).upper().split("(")[0]}
         if not {"topics", "messages"} <= tables:
             raise BagError(
                 f"{self.path} is an SQLite file without the tables topics and messages; expected "

@@ -302,16 +302,14 @@ class _Cursor:
                     "a field of type wstring lies before the one that is wanted; "
                     "its length differs between middlewares, so that it cannot be passed"
                 )
-            self._advance_by_length()
+            # In two steps: reading the length moves the place.
+            length = self._length()
+            self._advance(length)
         elif isinstance(kind, Struct):
             for _, inner in kind.fields:
                 self._skip(inner)
         else:
             self._skip_items(kind.item, self.count(kind))
-
-    def _advance_by_length(self) -> None:
-        length = self._length()
-        self._advance(length)
 
     def _skip_items(self, item: Type, count: Place) -> None:
         """Pass a number of elements of an array or sequence."""
@@ -346,7 +344,6 @@ class _Cursor:
                 return
 
 
-_LENGTH = Number("uint32", "u4")
 # numpy's types as the module struct names them
 _FORMATS = {
     "u1": "B", "i1": "b", "u2": "H", "i2": "h", "u4": "I", "i4": "i", "u8": "Q", "i8": "q",
@@ -412,31 +409,33 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
             f"{channel.schema_encoding!r}; expected 'cdr' with 'ros2msg'"
         )
     root = message_type(channel)
-    messages = []
-    budget = _Budget()
-    for data in payload:
-        try:
-            decoded = _decoded(root, data, budget)
-        except (ValueError, struct.error, MemoryError) as error:
-            raise BagError(
-                f"a message of {channel.topic} does not fit its definition: {first_line(error)}"
-            ) from None
-        messages.append(_with_defaults(decoded, DEFAULTS.get(channel.type, {})))
-    return messages
+    budget, defaults = _Budget(), DEFAULTS.get(channel.type, {})
+    return [
+        _with_defaults(decoded_message(root, data, f" of {channel.topic}", budget), defaults)
+        for data in payload
+    ]
 
 
-def decoded_message(root: Struct, data: bytes) -> Any:
-    """Decode one message of any type.
+def decoded_message(root: Struct, data: bytes, of: str = "", budget: _Budget | None = None) -> Any:
+    """Decode one message of any type; bytes after its end are allowed.
+
+    ROS 2's own serialization leaves some there: it makes room for the alignment of a sequence's
+    elements even if the sequence is empty.
 
     :param root: its type.
     :param data: the serialized message.
+    :param of: what to say of it in an error.
+    :param budget: of the structures and elements; default: one of its own.
     :return: an object with the fields as attributes.
     :raises BagError: if it does not fit its type.
     """
     try:
-        return _decoded(root, data, _Budget())
+        if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < _ENCAPSULATION:
+            raise ValueError("it is not in plain CDR")
+        order, body = "<" if data[1] else ">", memoryview(data)[_ENCAPSULATION:]
+        return _Decoder(body, order, budget or _Budget()).take(root)
     except (ValueError, struct.error, MemoryError) as error:
-        raise BagError(f"a message does not fit its definition: {first_line(error)}") from None
+        raise BagError(f"a message{of} does not fit its definition: {first_line(error)}") from None
 
 
 class _Budget:
@@ -453,17 +452,6 @@ class _Budget:
         self._left -= count
         if self._left < 0:
             raise ValueError(f"more than {MOST_ELEMENTS} structures and elements of lists")
-
-
-def _decoded(root: Struct, data: bytes, budget: _Budget) -> Any:
-    """Decode one message; bytes after its end are allowed.
-
-    ROS 2's own serialization leaves some there: it makes room for the alignment of a sequence's
-    elements even if the sequence is empty.
-    """
-    if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < 4:
-        raise ValueError("it is not in plain CDR")
-    return _Decoder(memoryview(data)[4:], "<" if data[1] else ">", budget).take(root)
 
 
 class _Decoder:
@@ -484,7 +472,7 @@ class _Decoder:
         if isinstance(kind, Struct):
             self._budget.take(1)
             return SimpleNamespace(**{name: self.take(inner) for name, inner in kind.fields})
-        count = self._number(_LENGTH) if kind.count is None else kind.count
+        count = self._number(_UINT32) if kind.count is None else kind.count
         if isinstance(kind.item, Number):
             return self._array(kind.item, count)
         self._budget.take(count)
@@ -508,7 +496,7 @@ class _Decoder:
     def _text(self, kind: Text) -> str:
         if kind.wide:
             raise ValueError("the length of a wstring differs between middlewares")
-        end = self._number(_LENGTH) + self._at
+        end = self._number(_UINT32) + self._at
         if end > len(self._data):
             raise ValueError(f"a text ends {end - len(self._data)} bytes behind the message")
         text = bytes(self._data[self._at : end]).removesuffix(b"\0").decode("utf-8")

@@ -51,17 +51,8 @@ _NUMBERS = {
 _CLOSING = {"(": ")", "{": "}", "[": "]"}
 
 
-def types_from_idl(text: str) -> dict[str, Fields]:
-    """Return the fields of each type, by its name.
-
-    :param text: one or several IDL files, without directives.
-    :raises ValueError: if it makes no sense.
-    """
-    return _Parser(text).types()
-
-
 class _Parser:
-    """Reads definitions one after the other."""
+    """Reads the definitions of one or several IDL files, without directives."""
 
     def __init__(self, text: str) -> None:
         self._tokens: list[str] = []
@@ -79,7 +70,10 @@ class _Parser:
         self._sizes: dict[str, int] = {}
 
     def types(self) -> dict[str, Fields]:
-        """Return what is defined."""
+        """Return the fields of each type, by its name.
+
+        :raises ValueError: if they make no sense.
+        """
         while self._at < len(self._tokens):
             self._definition(())
         return self._found
@@ -95,6 +89,12 @@ class _Parser:
             raise ValueError(f"{token or 'its end'!r} where {expected or 'more'!r} was expected")
         self._at += 1
         return token
+
+    def _accept(self, token: str) -> bool:
+        """Take the next word if it is this one; return whether it was."""
+        found = self._peek() == token
+        self._at += found
+        return found
 
     def _word(self) -> str:
         word = self._take()
@@ -112,8 +112,7 @@ class _Parser:
                 return
 
     def _annotations(self) -> None:
-        while self._peek() == "@":
-            self._take()
+        while self._accept("@"):
             self._scoped()
             if self._peek() == "(":
                 self._pass_over("(")
@@ -128,9 +127,8 @@ class _Parser:
             if len(inner) > DEEPEST_TYPE:
                 raise ValueError(f"modules more than {DEEPEST_TYPE} deep")
             self._take("{")
-            while self._peek() != "}":
+            while not self._accept("}"):
                 self._definition(inner)
-            self._take("}")
         elif what == "struct":
             self._struct(scope)
         elif what == "typedef":
@@ -152,17 +150,14 @@ class _Parser:
         fields: list[tuple[str, Type]] = []
         while True:
             self._annotations()
-            if self._peek() == "}":
+            if self._accept("}"):
                 break
-            kind = self._type(scope, 0)
-            while True:
+            kind, more = self._type(scope, 0), True
+            while more:
                 field = self._word()
                 fields.append((field, self._array(kind, scope)))
-                if self._peek() != ",":
-                    break
-                self._take()
+                more = self._accept(",")
             self._take(";")
-        self._take("}")
         self._found[name] = tuple(fields)
 
     def _constant(self, scope: tuple[str, ...]) -> None:
@@ -178,8 +173,7 @@ class _Parser:
     def _array(self, kind: Type, scope: tuple[str, ...]) -> Type:
         """Return the type with the sizes that follow a name."""
         counts = []
-        while self._peek() == "[":
-            self._take()
+        while self._accept("["):
             counts.append(self._count(scope))
             self._take("]")
             if len(counts) > DEEPEST_TYPE:
@@ -200,11 +194,9 @@ class _Parser:
     # --- types
 
     def _scoped(self) -> str:
-        if self._peek() == "::":
-            self._take()
+        self._accept("::")
         parts = [self._word()]
-        while self._peek() == "::":
-            self._take()
+        while self._accept("::"):
             parts.append(self._word())
         return "/".join(parts)
 
@@ -219,20 +211,16 @@ class _Parser:
     def _type(self, scope: tuple[str, ...], depth: int) -> Type:
         if depth > DEEPEST_TYPE:
             raise ValueError(f"sequences more than {DEEPEST_TYPE} deep")
-        word = self._peek()
-        if word == "sequence":
-            self._take()
+        if self._accept("sequence"):
             self._take("<")
             item = self._type(scope, depth + 1)
-            if self._peek() == ",":
-                self._take()
+            if self._accept(","):
                 self._count(scope)
             self._take(">")
             return Repeated(item, None)
-        if word in ("string", "wstring"):
-            self._take()
-            if self._peek() == "<":
-                self._take()
+        word = self._peek()
+        if self._accept("string") or self._accept("wstring"):
+            if self._accept("<"):
                 self._count(scope)
                 self._take(">")
             return Text(wide=word == "wstring")
@@ -394,39 +382,33 @@ def message_type(channel: Channel) -> Struct:
         raise BagError(
             f"the messages of {channel.topic} are encoded as {channel.encoding!r}; expected 'cdr'"
         )
+    try:
+        return _Tree(_parsed(channel)).struct(channel.type, 0)
+    except ValueError as error:
+        raise BagError(
+            f"the definition of {channel.type or 'the messages'} in the recording, of "
+            f"{channel.topic}, makes no sense: {first_line(error)}"
+        ) from None
+
+
+def _parsed(channel: Channel) -> Mapping[str, Fields]:
+    """Return the fields of the types in a channel's definition.
+
+    :raises ValueError: if it makes no sense.
+    """
     if len(channel.definition) > LARGEST_DEFINITION:
-        raise _senseless(channel, f"it has {len(channel.definition)} bytes")
+        raise ValueError(f"it has {len(channel.definition)} bytes")
     try:
         text = channel.definition.decode("utf-8").replace("\r\n", "\n")
     except UnicodeDecodeError:
-        raise _senseless(channel, "it is not UTF-8") from None
-    types = _parsed(channel, text)
-    try:
-        return _Tree(types).struct(channel.type, 0)
-    except ValueError as error:
-        raise _senseless(channel, str(error)) from None
-
-
-def _parsed(channel: Channel, text: str) -> Mapping[str, Fields]:
+        raise ValueError("it is not UTF-8") from None
     if not text.strip():
-        raise _senseless(channel, "it is empty")
-    try:
-        if channel.schema_encoding == "ros2msg":
-            return types_from_ros2msg(text, channel.type)
-        if channel.schema_encoding in ("ros2idl", "omgidl"):
-            return types_from_idl(_IDL_DIRECTIVE.sub("", _IDL_HEADING.sub("", text)))
-    except ValueError as error:
-        raise _senseless(channel, first_line(error)) from None
-    raise _senseless(
-        channel, f"it is in {channel.schema_encoding!r}; expected 'ros2msg' or 'ros2idl'"
-    )
-
-
-def _senseless(channel: Channel, why: str) -> BagError:
-    return BagError(
-        f"the definition of {channel.type or 'the messages'} in the recording, of "
-        f"{channel.topic}, makes no sense: {why}"
-    )
+        raise ValueError("it is empty")
+    if channel.schema_encoding == "ros2msg":
+        return types_from_ros2msg(text, channel.type)
+    if channel.schema_encoding in ("ros2idl", "omgidl"):
+        return _Parser(_IDL_DIRECTIVE.sub("", _IDL_HEADING.sub("", text))).types()
+    raise ValueError(f"it is in {channel.schema_encoding!r}; expected 'ros2msg' or 'ros2idl'")
 
 
 def first_line(error: Exception) -> str:

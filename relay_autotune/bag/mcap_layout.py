@@ -43,7 +43,7 @@ from relay_autotune.bag.mcap_records import (
     text,
     unsigned,
 )
-from relay_autotune.bag.source import MAGIC, Source, expanding_package, file_records, record_body
+from relay_autotune.bag.source import MAGIC, Source, expanding, file_records, record_body
 
 # What a chunk takes beside its content, compressed or not.
 _CHUNK_OVERHEAD = 1 << 20
@@ -57,7 +57,7 @@ class Segment:
     :param end: where its last one ends, or the file if that ends before.
     :param whole: whether all of it is there.
     :param is_chunk: whether it is a chunk.
-    :param channels: those of its messages; None: not known.
+    :param channels: those of its messages, where it was gone through.
     :param index_end: where the message indexes that follow it end; 0: there are none.
     """
 
@@ -65,7 +65,7 @@ class Segment:
     end: int
     whole: bool
     is_chunk: bool
-    channels: frozenset[int] | None = None
+    channels: frozenset[int] = frozenset()
     index_end: int = 0
 
 
@@ -136,29 +136,46 @@ class Layout:
     index: ChunkIndex | None = None
 
     def holding(self, channels: frozenset[int]) -> list[Segment]:
-        """Return the segments that may hold messages of some channels."""
-        if self.index is not None:
-            return self.index.holding(channels)
-        return [s for s in self.segments if s.channels is None or s.channels & channels]
+        """Return the segments that hold messages of some channels, where it was gone through."""
+        return [s for s in self.segments if s.channels & channels]
 
 
-def segment_content(source: Source, segment: Segment, largest: int) -> Content:
-    """Return the records of a segment.
+# Times of the first and the last message, size of the content, its checksum.
+_HEAD = struct.Struct("<QQQI")
 
-    :param largest: size that a chunk may have [bytes].
+
+def segment_content(source: Source, segment: Segment) -> Content:
+    """Return the records of a segment; of a cut chunk the part that can be read.
+
     :raises DamageError: if nothing of it can be used.
     :raises BagError: if the chunks of the file together expand to more than a recording does.
     """
+    begin, end, largest = segment.start, segment.end, source.largest
     if not segment.is_chunk:
-        return source.read(segment.start, segment.end)
-    if segment.end - segment.start > largest + _CHUNK_OVERHEAD:
+        return source.read(begin, end)
+    if end - begin > largest + _CHUNK_OVERHEAD:
         raise DamageError(
-            f"a chunk takes {segment.end - segment.start} bytes, more than the {largest} that "
-            f"--max-chunk allows"
+            f"a chunk takes {end - begin} bytes, more than the {largest} that --max-chunk allows"
         )
-    body = source.read(segment.start + RECORD.size, segment.end)
-    whole = segment.whole and len(body) == segment.end - segment.start - RECORD.size
-    content = chunk_content(body, whole=whole, largest=largest)
+    body = source.read(begin + RECORD.size, end)
+    whole = segment.whole and len(body) == end - begin - RECORD.size
+    if len(body) < _HEAD.size + 12:
+        raise DamageError("the head of a chunk is cut")
+    _, _, size, crc = _HEAD.unpack_from(body)
+    compression, at = text(body, _HEAD.size)
+    stored = unsigned(body, at, "<Q")
+    data = memoryview(body)[at + 8 :]
+    if size > largest:
+        raise DamageError(
+            f"a chunk declares {size} bytes, more than the {largest} that --max-chunk allows"
+        )
+    if whole and stored != len(data):
+        raise DamageError("the lengths of a chunk contradict each other")
+    content = _expand(data, compression, size, whole=whole)
+    if whole and len(content) != size:
+        raise DamageError(f"a chunk declares {size} bytes, but does not hold that many")
+    if whole and crc and zlib.crc32(content) != crc:
+        raise DamageError("the checksum of a chunk is wrong")
     source.count_expanded(len(content))
     return content
 
@@ -177,36 +194,7 @@ def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
     )
 
 
-# Times of the first and the last message, size of the content, its checksum.
-_HEAD = struct.Struct("<QQQI")
-
-
-def chunk_content(body: bytes, *, whole: bool, largest: int) -> bytes | memoryview:
-    """Return the records inside of a chunk.
-
-    :param body: the chunk's record without opcode and length, or as much as the file has of it.
-    :param whole: whether that is all of it; if not, the part that can be read is returned.
-    :param largest: size that the content may have [bytes].
-    :raises DamageError: if nothing of it can be used.
-    """
-    if len(body) < _HEAD.size + 12:
-        raise DamageError("the head of a chunk is cut")
-    _, _, size, crc = _HEAD.unpack_from(body)
-    compression, at = text(body, _HEAD.size)
-    stored = unsigned(body, at, "<Q")
-    data = memoryview(body)[at + 8 :]
-    if size > largest:
-        raise DamageError(
-            f"a chunk declares {size} bytes, more than the {largest} that --max-chunk allows"
-        )
-    if whole and stored != len(data):
-        raise DamageError("the lengths of a chunk contradict each other")
-    content = _expand(data, compression, size, whole=whole)
-    if whole and len(content) != size:
-        raise DamageError(f"a chunk declares {size} bytes, but does not hold that many")
-    if whole and crc and zlib.crc32(content) != crc:
-        raise DamageError("the checksum of a chunk is wrong")
-    return content
+_PACKAGES = {"zstd": "zstandard", "lz4": "lz4.frame"}
 
 
 def _expand(data: memoryview, compression: str, size: int, *, whole: bool) -> bytes | memoryview:
@@ -216,43 +204,22 @@ def _expand(data: memoryview, compression: str, size: int, *, whole: bool) -> by
     """
     if compression == "":
         return data
-    if compression == "zstd":
-        return _whole_zstd(data, size) if whole else _part_of_zstd(data, size)
-    if compression == "lz4":
-        return _expand_lz4(data, size)
-    raise DamageError(f"a chunk is compressed with {compression!r}; known are zstd and lz4")
-
-
-def _whole_zstd(data: memoryview, size: int) -> bytes:
-    zstandard = expanding_package("zstandard")
-    if size == 0:
-        return b""
-    try:
+    if compression not in _PACKAGES:
+        raise DamageError(f"a chunk is compressed with {compression!r}; known are zstd and lz4")
+    with expanding(_PACKAGES[compression], "a chunk cannot be decompressed") as package:
+        if compression == "lz4":
+            found = package.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif not whole:
+            decompressor = package.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+            found = decompressor.stream_reader(data).read(size + 1)
+        elif size == 0:
+            found = b""
         # zstd allocates at once the size that the frame declares.
-        if zstandard.frame_content_size(data) not in (-1, size):
+        elif package.frame_content_size(data) not in (-1, size):
             raise DamageError("a chunk and its compressed content differ in their size")
-        content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise DamageError(f"a chunk cannot be decompressed ({error})") from None
-    return bytes(content)
-
-
-def _part_of_zstd(data: memoryview, size: int) -> bytes:
-    zstandard = expanding_package("zstandard")
-    try:
-        decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
-        with decompressor.stream_reader(data) as stream:
-            return bytes(stream.read(size + 1))
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise DamageError(f"a chunk cannot be decompressed ({error})") from None
-
-
-def _expand_lz4(data: memoryview, size: int) -> bytes:
-    frame = expanding_package("lz4.frame")
-    try:
-        return bytes(frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
-    except (RuntimeError, EOFError, MemoryError) as error:
-        raise DamageError(f"a chunk cannot be decompressed ({error})") from None
+        else:
+            found = package.ZstdDecompressor().decompress(data, max_output_size=size)
+    return bytes(found)
 
 
 # Size of the pieces in which records outside of chunks are read [bytes].
@@ -265,9 +232,8 @@ _INSIDE = (SCHEMA, CHANNEL, MESSAGE)
 class _Scan:
     """Goes through a file, and looks into each chunk once its message indexes have passed."""
 
-    def __init__(self, source: Source, largest: int) -> None:
+    def __init__(self, source: Source) -> None:
         self.source = source
-        self.largest = largest
         self.layout = Layout()
         self.count = 0
         self.first: int | None = None
@@ -342,7 +308,7 @@ class _Scan:
         """Learn what a chunk declares, and the channels of its messages."""
         channels: frozenset[int] = frozenset()
         try:
-            content = segment_content(self.source, segment, self.largest)
+            content = segment_content(self.source, segment)
             listed = indexed_offsets(self.source.read(segment.end, segment.index_end))
             places = np.concatenate([*listed.values()]) if listed else None
             channels = self._declare(content, record_offsets(content, places)[0])
@@ -377,7 +343,7 @@ class _Scan:
             after = position + RECORD.size + length
             if after > self.source.size:
                 return position
-            if length <= self.largest:
+            if length <= self.source.largest:
                 piece = self.source.read(position, after)
             return self._take_loose(piece, position, after)
         outside = np.flatnonzero(~np.isin(every_byte(piece, "u1")[offsets], _INSIDE))
@@ -392,13 +358,10 @@ class _Scan:
         return end
 
 
-def scan(source: Source, largest: int) -> Layout:
-    """Return what a file holds by going through it, without its index.
-
-    :param largest: size that a chunk may have [bytes].
-    """
+def scan(source: Source) -> Layout:
+    """Return what a file holds by going through it, without its index."""
     source.look_again()
-    return _Scan(source, largest).run()
+    return _Scan(source).run()
 
 
 # A chunk index up to its list of message indexes: times of the first and the last message, start

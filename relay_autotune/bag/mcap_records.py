@@ -9,6 +9,7 @@ Layout: https://mcap.dev/spec. Every length is checked against what is there bef
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -226,6 +227,18 @@ class Messages:
     publish_time: IntArray
     begin: IntArray
     end: IntArray
+
+    def __len__(self) -> int:
+        return int(self.begin.size)
+
+    def payload(self, number: int, most: int = sys.maxsize) -> bytes:
+        """Return a copy of one of them, serialized, or of its beginning.
+
+        :param number: of the message.
+        :param most: size of the copy [bytes].
+        """
+        begin, end = int(self.begin[number]), int(self.end[number])
+        return bytes(self.content[begin : min(end, begin + most)])
 
 
 def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> NDArray[Any]:

@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 from relay_autotune.bag.limits import (
     FREE_DISK,
+    LARGEST_CHUNK,
     LARGEST_SUMMARY,
     LARGEST_WINDOW,
     MOST_EXPANSION,
@@ -84,11 +85,12 @@ class Source:
 
     :param path: the file; it may be compressed as a whole with zstd.
     :param magic: the bytes with which it has to begin.
+    :param largest: size that a chunk, or a message outside of chunks, may have [bytes].
     :raises BagError: if it is missing, unreadable, empty or something else.
     """
 
-    def __init__(self, path: Path, magic: bytes = MAGIC) -> None:
-        self.path = path
+    def __init__(self, path: Path, magic: bytes = MAGIC, largest: int = LARGEST_CHUNK) -> None:
+        self.path, self.largest = path, largest
         self.notes: list[str] = []
         self._expanded = 0
         self._magic = magic
@@ -185,32 +187,36 @@ class Source:
 
     def _expand(self) -> None:
         """Expand a file that is compressed as a whole into a temporary file."""
-        zstandard = expanding_package("zstandard")
         compressed = os.fstat(self._file.fileno()).st_size
         most = max(UNSUSPICIOUS, MOST_EXPANSION * compressed)
         # close() closes it, which deletes it.
         expanded = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
         try:
             room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK
-            decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
             self._file.seek(0)
-            with decompressor.stream_reader(self._file, closefd=False) as stream:
-                written = 0
-                while piece := self._piece(stream):
-                    written += len(piece)
-                    if written > most:
-                        raise BagError(
-                            f"{self.path} expands to more than {most} bytes, over "
-                            f"{MOST_EXPANSION} times its size; expected a recording"
-                        )
-                    if written > room:
-                        raise BagError(
-                            f"{self.path} expands to more than the {max(room, 0)} bytes that "
-                            f"are free in {tempfile.gettempdir()}; set TMPDIR to a larger disk"
-                        )
-                    expanded.write(piece)
-            if not written and not self.notes:
-                self.notes.append(f"{self.path.name} ends before anything can be expanded")
+            written = 0
+            try:
+                with expanding("zstandard") as zstandard:
+                    decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+                    stream = decompressor.stream_reader(self._file, closefd=False)
+                    while piece := stream.read(1 << 20):
+                        written += len(piece)
+                        if written > most:
+                            raise BagError(
+                                f"{self.path} expands to more than {most} bytes, over "
+                                f"{MOST_EXPANSION} times its size; expected a recording"
+                            )
+                        if written > room:
+                            raise BagError(
+                                f"{self.path} expands to more than the {max(room, 0)} bytes that "
+                                f"are free in {tempfile.gettempdir()}; set TMPDIR to a larger disk"
+                            )
+                        expanded.write(piece)
+                if not written:
+                    self.notes.append(f"{self.path.name} ends before anything can be expanded")
+            except DamageError as damage:
+                # What came before is a recording that ends there.
+                self.notes.append(f"{self.path.name} cannot be expanded to its end ({damage})")
             expanded.flush()
         except OSError as error:
             expanded.close()
@@ -220,14 +226,6 @@ class Source:
             raise
         self._file.close()
         self._file = expanded
-
-    def _piece(self, stream: BinaryIO) -> bytes:
-        try:
-            return stream.read(1 << 20)
-        except expanding_package("zstandard").ZstdError as error:
-            # What came before is a recording that ends there.
-            self.notes.append(f"{self.path.name} cannot be expanded to its end ({error})")
-            return b""
 
 
 def file_records(source: Source, position: int, stop: int) -> Iterator[tuple[int, int, int]]:
@@ -257,17 +255,27 @@ def record_body(source: Source, begin: int, end: int) -> bytes:
     return source.read(begin, end)
 
 
-def expanding_package(name: str) -> ModuleType:
-    """Return a package that expands, imported only where a compressed recording is met.
+@contextlib.contextmanager
+def expanding(name: str, what: str = "") -> Iterator[ModuleType]:
+    """Give a package that expands, imported only where a compressed recording is met.
 
     :param name: such as ``zstandard`` or ``lz4.frame``.
+    :param what: cannot be expanded if the package raises an error, for the message.
+    :raises DamageError: in place of the package's own errors.
     :raises BagError: if it is not installed.
     """
     try:
-        return import_module(name)
+        package = import_module(name)
     except ImportError:
-        package = name.split(".", 1)[0]
+        package_name = name.split(".", 1)[0]
         raise BagError(
-            f"the recording is compressed; to read it install the Python package {package}, "
-            f"with: pip install {package}"
+            f"the recording is compressed; to read it install the Python package {package_name}, "
+            f"with: pip install {package_name}"
         ) from None
+    own: tuple[type[Exception], ...] = (RuntimeError, EOFError, MemoryError)
+    if name == "zstandard":
+        own = (package.ZstdError, MemoryError)
+    try:
+        yield package
+    except own as error:
+        raise DamageError(f"{what} ({error})" if what else str(error)) from None

@@ -131,9 +131,9 @@ class Topics:
         root, found = self.root_of(topic), []
         key, channel = self._channels(topic)[0]
         for _, _, messages in self._messages({(key, channel.id): None}):
-            for begin, end in zip(messages.begin.tolist(), messages.end.tolist(), strict=True):
+            for number in range(len(messages)):
                 with suppress(BagError):
-                    found.append(decoded_message(root, bytes(messages.content[begin:end])))
+                    found.append(decoded_message(root, messages.payload(number)))
                 if len(found) == count:
                     return found
         return found
@@ -184,11 +184,7 @@ class Topics:
         }
         found: list[tuple[int, Any]] = []
         for key, _, messages in self._messages(wanted):
-            payload = [
-                bytes(messages.content[begin:end])
-                for begin, end in zip(messages.begin.tolist(), messages.end.tolist(), strict=True)
-            ]
-            decoded = decode_messages(wanted[key], payload)
+            decoded = decode_messages(wanted[key], map(messages.payload, range(len(messages))))
             found += zip(messages.log_time.tolist(), decoded, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
 
@@ -263,7 +259,7 @@ class Topics:
     def _expected(self, name: str) -> int:
         """Return how many messages of a topic the files say they have, within reason."""
         counts = [
-            min(self.files[number].message_count(channel.id), self.files[number].size)
+            min(self.files[number].message_counts.get(channel.id, 0), self.files[number].size)
             for number, channel in self._channels(split_name(name)[0])
         ]
         return min(sum(counts), MOST_EXPECTED)
@@ -302,8 +298,7 @@ def _why_unfit(path: Path, messages: Messages, good: NDArray[np.bool_]) -> str:
     """Return why the first message without the number has none, "" where it cannot be said."""
     if bool(good.all()):
         return ""
-    k = int(np.argmin(good))
-    return path.why(bytes(messages.content[int(messages.begin[k]) : int(messages.end[k])]))
+    return path.why(messages.payload(int(np.argmin(good))))
 
 
 def _stamps(stamp: tuple[Path, Path], messages: Messages) -> tuple[IntArray, NDArray[np.bool_]]:

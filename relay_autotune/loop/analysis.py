@@ -89,34 +89,24 @@ def inverted(values: ComplexArray, duration: float | FloatArray, jump: float = 0
     return np.asarray(found + jump * np.exp(-decay * time) if jump else found)
 
 
-@dataclass(frozen=True)
-class ClosedLoopTransforms:
-    """Transfer functions from set-point and load to measurement and command.
+def measurement_from_load(
+    law: ControlLaw, model: TransferFunction, s: ComplexArray
+) -> ComplexArray:
+    """Return ``G/(1 + C G)`` of a closed loop.
 
     :param law: the controller.
     :param model: the process, with all dead time of the loop.
+    :param s: rad/s, any shape.
     """
+    g = model(s)
+    return np.asarray(g / (1.0 + law(s) * g))
 
-    law: ControlLaw
-    model: TransferFunction
 
-    def measurement_from_load(self, s: ComplexArray) -> ComplexArray:
-        """Return ``G/(1 + C G)``."""
-        g = self.model(s)
-        return np.asarray(g / (1.0 + self.law(s) * g))
-
-    def measurement_from_setpoint(self, s: ComplexArray) -> ComplexArray:
-        """Return ``G F/(1 + C G)``, F from set-point to command."""
-        return np.asarray(self.measurement_from_load(s) * self.law.from_setpoint(s))
-
-    def first_command(self) -> float:
-        """Return the command just after a unit step of the set-point [u]."""
-        far = np.array([1e9 / self._shortest()], dtype=np.complex128)
-        return float(self.law.from_setpoint(far)[0].real)
-
-    def _shortest(self) -> float:
-        constants = [abs(c) for t in self.law.characteristic(self.model) for c in t.time_constants]
-        return min([c for c in (*constants, self.model.dead_time) if c > 0.0], default=1.0)
+def _first_command(law: ControlLaw, model: TransferFunction) -> float:
+    """Return the command just after a unit step of the set-point [u]."""
+    constants = [abs(c) for t in law.characteristic(model) for c in t.time_constants]
+    shortest = min([c for c in (*constants, model.dead_time) if c > 0.0], default=1.0)
+    return float(law.from_setpoint(np.array([1e9 / shortest], dtype=np.complex128))[0].real)
 
 
 def integral_gain(law: ControlLaw, frequency: float) -> float:
@@ -159,7 +149,6 @@ def step_responses(
     :param duration: s.
     :param points: number of instants.
     """
-    to = ClosedLoopTransforms(law, model)
     s = abscissae(duration, points)
     # All four responses follow from these three functions at the same frequencies.
     g, c, f = model(s), law(s), law.from_setpoint(s)
@@ -170,7 +159,7 @@ def step_responses(
         return inverted(values / s, duration, jump)
 
     return (
-        StepResponse(time, step(g / rest * f), step(f / rest, to.first_command())),
+        StepResponse(time, step(g / rest * f), step(f / rest, _first_command(law, model))),
         StepResponse(time, step(g / rest), step(-c * g / rest)),
     )
 
@@ -183,13 +172,13 @@ def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> 
     :param frequency: about which the loop is closed [rad/s].
     :raises TuningError: if the responses do not die away in any reasonable time.
     """
-    to = ClosedLoopTransforms(law, model)
     rest = np.array([1e-9 * frequency], dtype=np.complex128)
+    to_load = measurement_from_load(law, model, rest)
+    to_setpoint = to_load * law.from_setpoint(rest)
     integral = integral_gain(law, frequency)
     final, offset = 1.0, 0.0
     if integral == 0.0:
-        final = float(to.measurement_from_setpoint(rest)[0].real)
-        offset = float(to.measurement_from_load(rest)[0].real)
+        final, offset = float(to_setpoint[0].real), float(to_load[0].real)
     duration = horizon(law, model, frequency)
     # Twenty instants per period of this frequency, if the number of points allows it.
     finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
@@ -208,9 +197,8 @@ def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> 
     iae_load = 1.0 / integral if integral else math.inf
     iae_setpoint = math.inf
     if abs(1.0 - final) < NO_OFFSET:
-        whole = (1.0 - to.measurement_from_setpoint(rest)) / rest
-        iae_setpoint = float(whole[0].real)
-    first = abs(to.first_command())
+        iae_setpoint = float(((1.0 - to_setpoint) / rest)[0].real)
+    first = abs(_first_command(law, model))
     return figures_of(setpoint, load, final, (iae_setpoint, iae_load), first)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -343,15 +343,4 @@ class InternalModelLaw:
 
         :param model: the process.
         """
-        inside, forward = self.inside, self.forward
-        negative = TransferFunction(
-            -inside.gain, inside.zeros, inside.time_constants, inside.integrators, inside.dead_time
-        )
-        through = TransferFunction(
-            forward.gain * model.gain,
-            forward.zeros + model.zeros,
-            forward.time_constants + model.time_constants,
-            forward.integrators + model.integrators,
-            forward.dead_time + model.dead_time,
-        )
-        return negative, through
+        return replace(self.inside, gain=-self.inside.gain), self.forward * model

@@ -160,14 +160,12 @@ class PidLaw:
 
 
 class SampledPid:
-    """A PI or PID controller that is called once for each sample.
+    """A PI or PID controller that is called once for each sample, from rest.
 
     :param controller: the gains.
     :param period: period of the samples [s].
     :param low: least command [u].
     :param high: largest command [u].
-    :param offset: initial value of the integral [u].
-    :param measurement: initial value of the filter [y].
     :raises TuningError: if the period is not positive or the limits leave no range.
     """
 
@@ -178,14 +176,12 @@ class SampledPid:
         *,
         low: float = -math.inf,
         high: float = math.inf,
-        offset: float = 0.0,
-        measurement: float = 0.0,
     ) -> None:
         require_period(period)
         self.period = period
         self._limits = Limits(low, high)
         self._motion = filter_matrices(controller.tf, period)
-        self._law = PidLaw(measurement, offset)
+        self._law = PidLaw(0.0, 0.0)
         self._gains = controller
 
     def step(self, setpoint: float, measurement: float) -> float:

@@ -125,6 +125,16 @@ class TransferFunction:
             value = np.asarray(value / (1.0 + t * s))
         return value
 
+    def __mul__(self, other: TransferFunction) -> TransferFunction:
+        """Return both in series."""
+        return TransferFunction(
+            self.gain * other.gain,
+            self.zeros + other.zeros,
+            self.time_constants + other.time_constants,
+            self.integrators + other.integrators,
+            self.dead_time + other.dead_time,
+        )
+
     def phase(self, frequency: ArrayLike) -> NDArray[np.float64]:
         """Return the phase of ``process_sign * G(j w)`` without jumps [rad].
 

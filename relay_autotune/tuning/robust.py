@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import ClosedLoopTransforms, abscissae, inverted
+from relay_autotune.loop.analysis import abscissae, inverted, measurement_from_load
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import NoiseLimit, Optimum
@@ -234,9 +234,8 @@ def with_setpoint_weight(
     if model.is_stable:
         reset += 1.0 / abs(controller.i * model.gain)
     duration = _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
-    to = ClosedLoopTransforms(controller, model)
     at = abscissae(duration, _POINTS)
-    through = to.measurement_from_load(at) / at
+    through = measurement_from_load(controller, model, at) / at
     proportional = inverted(controller.kc * through, duration)
     integral = inverted(controller.i * through / at, duration)
     highest = np.array([float((integral + b * proportional).max()) for b in _WEIGHTS])
