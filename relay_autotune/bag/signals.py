@@ -137,11 +137,7 @@ class SignalReader:
         """Why a message has no value, as far as it says."""
 
     def take(
-        self,
-        values: NDArray[Any],
-        good: NDArray[np.bool_],
-        times: IntArray,
-        log_times: IntArray,
+        self, values: NDArray[Any], good: NDArray[np.bool_], times: IntArray, log_times: IntArray
     ) -> None:
         """Add messages, shape (n,) each.
 

@@ -23,12 +23,7 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import Procedure, State
 from relay_autotune.record.record import Outcome, Record
 
-__all__ = [
-    "ExperimentParameters",
-    "RelayExperiment",
-    "SafePolicy",
-    "State",
-]
+__all__ = ["ExperimentParameters", "RelayExperiment", "SafePolicy", "State"]
 
 _OUTCOMES = {
     State.COMPLETED: Outcome.COMPLETED,

@@ -148,10 +148,7 @@ class Oscillation:
             # limit of the next stay.
             was_shifted = self._shifts > 0
             self._answers = self._turns.add(
-                t,
-                relay.last_stay,
-                self._balance,
-                counts=relay.switches > 1 and not was_shifted,
+                t, relay.last_stay, self._balance, counts=relay.switches > 1 and not was_shifted
             )
             self._learn(0.0 if was_shifted else relay.last_stay)
             self._shifts = 0
@@ -359,7 +356,7 @@ class Oscillation:
                 f"max_cycles, {p.max_cycles}, reached; the last {p.min_cycles} cycles do not "
                 f"agree within {100.0 * p.cycle_tolerance:g} %"
                 if self._until_converged
-                else f"max_cycles, {p.max_cycles}, reached",
+                else f"max_cycles, {p.max_cycles}, reached"
             )
         else:
             swing = max(c.peak_max - c.peak_min for c in self._run.cycles)

@@ -99,14 +99,10 @@ class ExperimentParameters:
         open_ended=True,
     )
     measurement_min: float = quantity(
-        -math.inf,
-        "y",
-        "The experiment is aborted when the measurement falls below this.",
+        -math.inf, "y", "The experiment is aborted when the measurement falls below this."
     )
     measurement_max: float = quantity(
-        math.inf,
-        "y",
-        "The experiment is aborted when the measurement rises above this.",
+        math.inf, "y", "The experiment is aborted when the measurement rises above this."
     )
     max_deviation: float = quantity(
         0.0,
@@ -115,16 +111,8 @@ class ExperimentParameters:
         "once that is known; 0: no limit.",
         lower=0.0,
     )
-    command_min: float = quantity(
-        -math.inf,
-        "u",
-        "Lowest command that may be sent.",
-    )
-    command_max: float = quantity(
-        math.inf,
-        "u",
-        "Highest command that may be sent.",
-    )
+    command_min: float = quantity(-math.inf, "u", "Lowest command that may be sent.")
+    command_max: float = quantity(math.inf, "u", "Highest command that may be sent.")
     command_rate: float = quantity(
         0.0,
         "u/s",

@@ -184,10 +184,7 @@ class StepFigures:
         "", "After a step of the set-point, relative to it.", math.nan, lower=0.0
     )
     settling_time: float = told(
-        "s",
-        "Until the measurement stays within 2 % of a new set-point.",
-        math.nan,
-        lower=0.0,
+        "s", "Until the measurement stays within 2 % of a new set-point.", math.nan, lower=0.0
     )
     effort_setpoint: float = told(
         "u/y",

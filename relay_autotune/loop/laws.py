@@ -105,10 +105,7 @@ class Integral(enum.Enum):
         :param period: h [s].
         """
         half = 0.5 * period
-        return Rational(
-            (half * (1.0 + self.value), half * (1.0 - self.value)),
-            (1.0, -1.0),
-        )
+        return Rational((half * (1.0 + self.value), half * (1.0 - self.value)), (1.0, -1.0))
 
 
 class Slope(enum.Enum):
@@ -185,9 +182,7 @@ _ON_MEASUREMENT = Smoothing(
     on_measurement=True,
 )
 _FIRST_ORDER = Smoothing(
-    "first order, on the derivative",
-    lambda tf, period: tf if tf > period else 0.0,
-    _first_order,
+    "first order, on the derivative", lambda tf, period: tf if tf > period else 0.0, _first_order
 )
 _MEAN = Smoothing(
     "mean of the last N differences",
@@ -626,8 +621,7 @@ _ROWS = (
         (
             *_gains("pid_Kp pid_Ki pid_Kd", of=_of_255),
             Setting(
-                "smooth_time",
-                lambda law: max(law.gains.tf, law.period) if law.gains.td else None,
+                "smooth_time", lambda law: max(law.gains.tf, law.period) if law.gains.td else None
             ),
         ),
         delay=1,

@@ -182,10 +182,7 @@ class Quadratic:
     def derivatives(self, theta: FloatArray) -> list[Polynomial]:
         """Return the derivatives of :meth:`polynomial` by both parameters."""
         t, zeta = math.exp(theta[0]), math.exp(theta[1])
-        return [
-            np.array((0.0, 2.0 * zeta * t, 2.0 * t * t)),
-            np.array((0.0, 2.0 * zeta * t, 0.0)),
-        ]
+        return [np.array((0.0, 2.0 * zeta * t, 2.0 * t * t)), np.array((0.0, 2.0 * zeta * t, 0.0))]
 
     def constants(self, theta: FloatArray) -> list[complex]:
         """Return the two time constants, a conjugate pair where zeta < 1 [s]."""

@@ -16,11 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import ModelError
-from relay_autotune.process.model_parameters import (
-    exactly,
-    oscillating_pair,
-    positive,
-)
+from relay_autotune.process.model_parameters import exactly, oscillating_pair, positive
 from relay_autotune.text import digits
 
 _MINUS, _TIMES = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}"

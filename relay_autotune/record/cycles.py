@@ -477,10 +477,7 @@ _AVERAGED = tuple(f.name for f in fields(CycleFeatures))
 
 
 def limit_cycle(
-    source: Record | Sequence[Cycle],
-    *,
-    min_cycles: int = MIN_CYCLES,
-    tolerance: float = TOLERANCE,
+    source: Record | Sequence[Cycle], *, min_cycles: int = MIN_CYCLES, tolerance: float = TOLERANCE
 ) -> LimitCycle:
     """Average the cycles of the limit cycle.
 
