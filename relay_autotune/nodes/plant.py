@@ -23,7 +23,7 @@ from relay_autotune.nodes.quality import QUIET_AFTER_GO, REPEAT_AFTER
 from relay_autotune.process.structures import FIELDS, TABLE, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
-from relay_autotune.quantities import Quantity
+from relay_autotune.quantities import Quantity, declared
 
 MODES = ("realtime", "clock", "lockstep")
 
@@ -51,20 +51,12 @@ PARAMETERS = (
     ),
     Quantity("dead_time", 0.0, "s", 0.0).means("Dead time of the process."),
     Quantity("sample_period", 0.1, "s", 1e-5).means("Time between samples."),
-    Quantity("noise_std", 0.0, "y", 0.0).means("Standard deviation of white noise."),
     Quantity("seed", 0, "", 0).means("Seed of the noise."),
-    Quantity("quantisation", 0.0, "y", 0.0).means("Resolution of the sensor; 0: none."),
     Quantity("operating_point", ()).means("Measurement [y] and command [u] at rest, y0 and u0."),
-    Quantity("load_time", 0.0, "s", 0.0).means("When a load step enters before the process."),
-    Quantity("load_size", 0.0, "u").means("Height of the load step; 0: none."),
-    Quantity("drift", 0.0, "y/s").means("Slope added to the measurement."),
+    *declared(Disturbances),
     Quantity("command_min", -math.inf, "u").means("Lower limit of the actuator."),
     Quantity("command_max", math.inf, "u").means("Upper limit of the actuator."),
-    Quantity("stiction", 0.0, "u", 0.0).means("Band in which the actuator sticks."),
-    Quantity("dead_band", 0.0, "u", 0.0).means("Play of the actuator."),
-    Quantity("falling_gain", 1.0, "", 1e-3, 1e3).means(
-        "Factor on the command's part below rest, for a process that cools slower than it heats."
-    ),
+    *declared(Actuator),
     Quantity("jitter", 0.0, "s", 0.0).means(
         "Largest delay of a sample after its time, evenly spread, in the mode realtime."
     ),
@@ -108,19 +100,15 @@ def process_from(values: dict[str, Any]) -> VirtualProcess:
             point[1],
             minimum=values["command_min"],
             maximum=values["command_max"],
-            dead_band=values["dead_band"],
-            stiction=values["stiction"],
-            falling_gain=values["falling_gain"],
+            **_declared_of(Actuator, values),
         ),
-        disturbances=Disturbances(
-            noise_std=values["noise_std"],
-            quantisation=values["quantisation"],
-            load_time=values["load_time"],
-            load_size=values["load_size"],
-            drift=values["drift"],
-        ),
+        disturbances=Disturbances(**_declared_of(Disturbances, values)),
         seed=values["seed"],
     )
+
+
+def _declared_of(kind: type, values: dict[str, Any]) -> dict[str, Any]:
+    return {each.name: values[each.name] for each in declared(kind)}
 
 
 def model_from(values: dict[str, Any]) -> TransferFunction:

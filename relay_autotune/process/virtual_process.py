@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 
 from relay_autotune.errors import ModelError, ParameterError
 from relay_autotune.process.response import Modes
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.quantities import check, quantity
 
 
+@dataclass
 class Actuator:
     """Turn commands into positions; it keeps the position between calls.
 
@@ -32,45 +34,37 @@ class Actuator:
     :param initial: position at the start [u].
     :param minimum: lower limit of the position [u]; -inf: none.
     :param maximum: upper limit of the position [u]; inf: none.
-    :param dead_band: width of the play [u], >= 0.
-    :param stiction: width of the band in which it sticks [u], >= 0.
-    :param falling_gain: factor on the position's distance below ``initial``, > 0; 1: no effect.
-    :raises ParameterError: if the limits cross, or a width is negative or not finite.
+    :raises ParameterError: if the limits cross, or a value is out of its range.
     """
 
-    def __init__(
-        self,
-        initial: float,
-        *,
-        minimum: float = -math.inf,
-        maximum: float = math.inf,
-        dead_band: float = 0.0,
-        stiction: float = 0.0,
-        falling_gain: float = 1.0,
-    ) -> None:
-        if not minimum < maximum:
+    initial: float
+    _: KW_ONLY
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    dead_band: float = quantity(0.0, "u", "Play of the actuator.", lower=0.0)
+    stiction: float = quantity(0.0, "u", "Band in which the actuator sticks.", lower=0.0)
+    falling_gain: float = quantity(
+        1.0,
+        "",
+        "Factor on the command's part below rest, for a process that cools slower than it heats.",
+        lower=1e-3,
+        upper=1e3,
+    )
+    position: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.minimum < self.maximum:
             raise ParameterError(
                 f"the actuator's lower limit must be below its upper one, "
-                f"found {minimum:g} and {maximum:g}"
+                f"found {self.minimum:g} and {self.maximum:g}"
             )
-        for name, width in (("dead_band", dead_band), ("stiction", stiction)):
-            if not (math.isfinite(width) and width >= 0.0):
-                raise ParameterError(f"{name} must be finite and not negative, found {width}")
-        if not (math.isfinite(falling_gain) and falling_gain > 0.0):
-            raise ParameterError(f"falling_gain must be finite and > 0, found {falling_gain}")
-        if not minimum <= initial <= maximum:
+        check(self, ParameterError)
+        if not self.minimum <= self.initial <= self.maximum:
             raise ParameterError(
-                f"the actuator cannot start at {initial:g}, outside its limits "
-                f"{minimum:g} to {maximum:g}"
+                f"the actuator cannot start at {self.initial:g}, outside its limits "
+                f"{self.minimum:g} to {self.maximum:g}"
             )
-        self._minimum = minimum
-        self._maximum = maximum
-        self._half_play = 0.5 * dead_band
-        self._stiction = stiction
-        self._follower = initial
-        self._initial = initial
-        self._falling_gain = falling_gain
-        self.position = initial
+        self._follower = self.position = self.initial
 
     def move(self, command: float) -> float:
         """Give a command and return the resulting input of the process [u].
@@ -79,19 +73,18 @@ class Actuator:
         """
         if not math.isfinite(command):
             return self.acting
-        wanted = min(max(command, self._minimum), self._maximum)
-        half = self._half_play
-        follower = min(max(self._follower, wanted - half), wanted + half)
-        self._follower = follower
-        if self._stiction == 0.0 or abs(follower - self.position) > self._stiction:
-            self.position = follower
+        wanted = min(max(command, self.minimum), self.maximum)
+        half = 0.5 * self.dead_band
+        self._follower = min(max(self._follower, wanted - half), wanted + half)
+        if self.stiction == 0.0 or abs(self._follower - self.position) > self.stiction:
+            self.position = self._follower
         return self.acting
 
     @property
     def acting(self) -> float:
         """Input of the process at the present position [u]."""
-        below = min(self.position - self._initial, 0.0)
-        return self.position + (self._falling_gain - 1.0) * below
+        below = min(self.position - self.initial, 0.0)
+        return self.position + (self.falling_gain - 1.0) * below
 
 
 class Plant:
@@ -145,28 +138,17 @@ class Disturbances:
     >>> Disturbances(noise_std=0.02, load_time=60.0, load_size=0.5).load_size
     0.5
 
-    :param noise_std: standard deviation of white Gaussian noise on each sample [y], >= 0.
-    :param quantisation: step of the sensor's resolution [y], >= 0; 0: none.
-    :param load_time: instant of a load step, which adds to the actuator's position [s], >= 0.
-    :param load_size: its height [u]; 0: no load step.
-    :param drift: slope of the measurement that no command causes [y/s].
     :raises ParameterError: if a value is out of its range.
     """
 
-    noise_std: float = 0.0
-    quantisation: float = 0.0
-    load_time: float = 0.0
-    load_size: float = 0.0
-    drift: float = 0.0
+    noise_std: float = quantity(0.0, "y", "Standard deviation of white noise.", lower=0.0)
+    quantisation: float = quantity(0.0, "y", "Resolution of the sensor; 0: none.", lower=0.0)
+    load_time: float = quantity(0.0, "s", "When a load step enters before the process.", lower=0.0)
+    load_size: float = quantity(0.0, "u", "Height of the load step; 0: none.")
+    drift: float = quantity(0.0, "y/s", "Slope added to the measurement.")
 
     def __post_init__(self) -> None:
-        for name in ("noise_std", "quantisation", "load_time"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ParameterError(f"{name} must be finite and not negative, found {value}")
-        for name in ("load_size", "drift"):
-            if not math.isfinite(getattr(self, name)):
-                raise ParameterError(f"{name} must be finite, found {getattr(self, name)}")
+        check(self, ParameterError)
 
 
 class VirtualProcess:

@@ -60,8 +60,8 @@ def test_the_position_stays_near_the_command_and_within_limits(
     [
         ({"minimum": 1.0, "maximum": 1.0}, "lower limit must be below"),
         ({"minimum": 1.0}, "cannot start at 0"),
-        ({"dead_band": -1.0}, "dead_band must be finite and not negative, found -1.0"),
-        ({"stiction": math.nan}, "stiction must be finite"),
+        ({"dead_band": -1.0}, "dead_band is -1, expected at least 0 u"),
+        ({"stiction": math.nan}, "stiction is nan, expected at least 0 u"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: dict[str, float], said: str) -> None:

@@ -70,11 +70,11 @@ def test_quantisation_leaves_multiples_of_its_step() -> None:
 
 @pytest.mark.parametrize("name", ["noise_std", "quantisation", "load_time"])
 def test_a_negative_size_is_refused(name: str) -> None:
-    with pytest.raises(ParameterError, match=f"{name} must be finite and not negative"):
+    with pytest.raises(ParameterError, match=f"{name} is -0.1, expected at least 0"):
         Disturbances(**{name: -0.1})
 
 
 @pytest.mark.parametrize("name", ["load_size", "drift"])
 def test_an_infinite_disturbance_is_refused(name: str) -> None:
-    with pytest.raises(ParameterError, match=f"{name} must be finite"):
+    with pytest.raises(ParameterError, match=f"{name} is inf, expected a finite number"):
         Disturbances(**{name: math.inf})
