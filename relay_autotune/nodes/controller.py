@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
@@ -39,9 +38,10 @@ from relay_autotune.nodes.gains_place import (
     reported_by,
     said,
 )
+from relay_autotune.nodes.goals import serve
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.tables import (
     CONTROLLER_PARAMETERS,
@@ -151,11 +151,11 @@ class ControllerNode(ServedNode):
         self.create_subscription(ModelMessage, "transfer_function", self._on_model, quality.RESULT)
         # The loop must keep running while these services wait for the disk or another node.
         waiting = ReentrantCallbackGroup()
-        self.create_service(Trigger, "~/apply", self._on_apply, callback_group=waiting)
-        self.create_service(Trigger, "~/discard", self._on_discard)
-        self.create_service(Trigger, "~/revert", self._on_revert, callback_group=waiting)
-        self.create_service(SetBool, "~/automatic", self._on_automatic)
-        self.add_on_set_parameters_callback(self._on_set)
+        serve(self, Trigger, "~/apply", lambda _: self._apply(), callback_group=waiting)
+        serve(self, Trigger, "~/discard", self._discard)
+        serve(self, Trigger, "~/revert", lambda _: self._keeper.revert(), callback_group=waiting)
+        serve(self, SetBool, "~/automatic", self._switch)
+        ask_before_changes(self, self._require_settable)
         self.add_post_set_parameters_callback(self._after_set)
         rate = self._rate
         under = "" if rate is None else f"{rate.law.name} {rate.period:g} s"
@@ -290,19 +290,13 @@ class ControllerNode(ServedNode):
         if self._held:
             self._verifier.interrupt("a tune has begun")
 
-    def _on_automatic(
-        self, request: SetBool.Request, response: SetBool.Response
-    ) -> SetBool.Response:
+    def _switch(self, request: SetBool.Request) -> str:
         if not request.data:
             self._verifier.interrupt("the controller was switched to manual")
         self._pid.switch(automatic=request.data)
-        response.success = self._pid.is_automatic == request.data
-        response.message = (
-            ("automatic" if request.data else f"manual: {self._pid.command:g} is held")
-            if response.success
-            else "there are no gains yet: the command is held"
-        )
-        return response
+        if self._pid.is_automatic != request.data:
+            raise TuningError("there are no gains yet: the command is held")
+        return "automatic" if request.data else f"manual: {self._pid.command:g} is held"
 
     # Gains.
 
@@ -367,18 +361,15 @@ class ControllerNode(ServedNode):
 
     async def _apply_and_tell(self) -> None:
         try:
-            done, reason = await self._apply()
+            self.get_logger().info(await self._apply())
+        except RelayAutotuneError as error:
+            self.get_logger().error(str(error))
         finally:
             self._applying = False
-        # A line of code has one severity; with another one the logger raises.
-        if done:
-            self.get_logger().info(reason)
-        else:
-            self.get_logger().error(reason)
 
-    async def _apply(self) -> tuple[bool, str]:
+    async def _apply(self) -> str:
         if self._pending is None:
-            return False, f"{NONE_WAIT}; {self._refused}" if self._refused else NONE_WAIT
+            raise TuningError(f"{NONE_WAIT}; {self._refused}" if self._refused else NONE_WAIT)
         name, gains = pending = self._pending
         try:
             # The record may have come after the gains.
@@ -391,30 +382,18 @@ class ControllerNode(ServedNode):
                 )
             done = await self._keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
-            return False, f"the gains of {name} are not in force: {error}"
+            raise TuningError(f"the gains of {name} are not in force: {error}") from error
         self._predictors.applied(self._place.set_of(gains), name)
         # Newer gains may have arrived meanwhile.
         if self._pending is pending:
             self._pending = None
-        return True, f"gains of {name}: {done}; ~/revert brings back those before"
+        return f"gains of {name}: {done}; ~/revert brings back those before"
 
-    async def _on_apply(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = await self._apply()
-        return response
-
-    def _on_discard(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._pending is not None
-        response.message = "discarded" if self._pending is not None else "no gains wait"
-        self._pending, self._refused = None, ""
-        return response
-
-    async def _on_revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.message = await self._keeper.revert()
-            response.success = True
-        except RelayAutotuneError as error:
-            response.message = str(error)
-        return response
+    def _discard(self, _: Trigger.Request) -> str:
+        waiting, self._pending, self._refused = self._pending, None, ""
+        if waiting is None:
+            raise TuningError("no gains wait")
+        return "discarded"
 
     def _use(self, kept: GainSet | None) -> None:
         """Put gains in force, and into the parameters."""
@@ -543,25 +522,19 @@ class ControllerNode(ServedNode):
         """Return the gains of the parameters as the history keeps them."""
         return None if gains is None else self._place.set_of(gains)
 
-    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+    def _require_settable(self, changes: list[Parameter]) -> None:
         if self._following:
-            return SetParametersResult(successful=True)
-        try:
-            if self._verifier.is_running:
-                raise ParameterError("parameters stay as they are while a verification runs")
-            values = merged(self, (*GAINS, *OTHERS), changes)
-            limits_from(values)
-            range_from(values)
-            gains, bounds = gains_from(values), bounds_from(values, self._rate)
-            if gains is not None:
-                bounds.require(gains)
-            if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
-                self._keeper.require_editable(
-                    self._place.set_of(gains) if gains is not None else None
-                )
-        except RelayAutotuneError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+            return
+        if self._verifier.is_running:
+            raise ParameterError("parameters stay as they are while a verification runs")
+        values = merged(self, (*GAINS, *OTHERS), changes)
+        limits_from(values)
+        range_from(values)
+        gains, bounds = gains_from(values), bounds_from(values, self._rate)
+        if gains is not None:
+            bounds.require(gains)
+        if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
+            self._keeper.require_editable(self._own(gains))
 
     def _after_set(self, changes: list[Parameter]) -> None:
         if self._following:

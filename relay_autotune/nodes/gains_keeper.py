@@ -20,8 +20,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
-from rclpy.timer import Timer
 
 from relay_autotune.control.gains_history import (
     AT_WORK,
@@ -213,7 +213,13 @@ class GainsKeeper:
         # The state that the place must still reach, and whether it may hold foreign gains.
         self._goal: GainsHistory | None = None
         self._anothers = True
-        self._timer: Timer | None = None
+        self._retry = node.create_timer(
+            _ASK_AGAIN,
+            self._again,
+            callback_group=ReentrantCallbackGroup(),
+            clock=STEADY,
+            autostart=False,
+        )
         self._reported = ""
         found = journal.load()
         if found is None:
@@ -222,7 +228,7 @@ class GainsKeeper:
             self.history = found
             if (goal := found.after_interruption()) is not found:
                 self._goal = goal
-                self._ask_later(0.0)
+                self._retry.reset()
         else:
             self.history = found.after_restart(given)
         if self._goal is None:
@@ -372,7 +378,7 @@ class GainsKeeper:
             await self._place.put(goal.gains)
         except RelayAutotuneError as error:
             self._say(str(error))
-            self._ask_later(_ASK_AGAIN)
+            self._retry.reset()
             return
         self.history, self._goal, self._reported = goal, None, ""
         if kept := await self._kept(goal):
@@ -383,30 +389,21 @@ class GainsKeeper:
             self._reported = problem
             self._node.get_logger().error(f"the gains of before are not in force: {problem}")
 
-    def _ask_later(self, wait: float) -> None:
-        if self._timer is None:
-            self._timer = self._node.create_timer(max(wait, 1e-3), self._ask_again, clock=STEADY)
-
-    def _ask_again(self) -> None:
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
-
-        async def again() -> None:
-            if self._goal is None:
-                return
-            if self._busy:
-                self._ask_later(_ASK_AGAIN)
-                return
-            self._busy = True
-            try:
-                await self._settle()
-            finally:
-                self._busy = False
-            if not self._open():
-                self._node.get_logger().info(f"{self._place.said(self.history.gains)} again")
-
-        self._node.executor.create_task(again)
+    async def _again(self) -> None:
+        """Try once more to reach the goal state, unless a request is at work."""
+        self._retry.cancel()
+        if self._goal is None:
+            return
+        if self._busy:
+            self._retry.reset()
+            return
+        self._busy = True
+        try:
+            await self._settle()
+        finally:
+            self._busy = False
+        if not self._open():
+            self._node.get_logger().info(f"{self._place.said(self.history.gains)} again")
 
     # The disk.
 

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Actions that run: one goal at a time, what it tells, its end; the action ~/tune."""
+"""Services and actions: one goal at a time, what it tells, its end; the action ~/tune."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
+from rclpy.node import Node
 
+from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
@@ -88,6 +90,29 @@ class OneGoal:
         if self.running is not None and goal.goal_id == self.running.goal_id:
             self._node.executor.create_task(self._cancel)
         return CancelResponse.ACCEPT
+
+
+def serve(node: Node, kind: Any, name: str, work: Callable[[Any], Any], **options: Any) -> None:
+    """Serve a service whose answer is whether it succeeded, and a sentence, such as a Trigger.
+
+    :param node: the node.
+    :param kind: class of the service.
+    :param name: its name.
+    :param work: takes a request; returns the sentence, or a coroutine of it, or raises
+        RelayAutotuneError with the reason to refuse.
+    :param options: of `Node.create_service`.
+    """
+
+    async def answer(request: Any, response: Any) -> Any:
+        try:
+            said = work(request)
+            response.message = said if isinstance(said, str) else await said
+            response.success = True
+        except RelayAutotuneError as error:
+            response.message = str(error)
+        return response
+
+    node.create_service(kind, name, answer, **options)
 
 
 def conclude(goal: Any, result: Any, *, succeeded: bool) -> None:

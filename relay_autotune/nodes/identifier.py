@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 
 from relay_autotune.analysis import (
@@ -38,7 +36,7 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.nodes.lifetime import ServedNode, run
-from relay_autotune.nodes.parameters import declare, merged, values_of
+from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import Refusals, SignsOfLife
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.result import Analysis
@@ -101,7 +99,7 @@ class IdentifierNode(ServedNode):
             RelayExperiment, "relay_progress", self._on_progress, quality.RESULT
         )
         self.create_service(Identify, "~/identify", self._on_identify)
-        self.add_on_set_parameters_callback(self._on_set)
+        ask_before_changes(self, lambda given: task_from(merged(self, PARAMETERS, given)))
         self.get_logger().info(
             f"ready: waiting for {self.resolve_topic_name('relay_experiment')}; model and gains "
             f"go to {self._models.topic_name} and {self._gains.topic_name}"
@@ -214,8 +212,9 @@ class IdentifierNode(ServedNode):
         try:
             if progress is not None and progress.experiment_id != self._ended:
                 record = record_from_message(progress)
-                fit = self._running_fit.fit
-                work = partial(fit, record, self._task(), *_sought(progress))
+                # The quantity whose interval ends the experiment, and the wanted width.
+                sought = progress.sought or ULTIMATE_GAIN, progress.sought_width
+                work = partial(self._running_fit.fit, record, self._task(), *sought)
                 return _Fit(work, partial(self._fitted, record.experiment_id))
             new, self._cycles_are_new = self._cycles_are_new, False
             if new and self._cycles:
@@ -288,18 +287,6 @@ class IdentifierNode(ServedNode):
                 f"{identification.method}, gain {identification.model.gain:.6g}, "
                 f"dead time {identification.model.dead_time:.6g} s"
             )
-
-    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        try:
-            task_from(merged(self, PARAMETERS, changes))
-        except RelayAutotuneError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-
-def _sought(progress: Any) -> tuple[str, float]:
-    """Return the quantity whose interval ends an experiment, and the wanted width."""
-    return progress.sought or ULTIMATE_GAIN, progress.sought_width
 
 
 def _model_message(

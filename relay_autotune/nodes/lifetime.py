@@ -236,7 +236,7 @@ def run(
     :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
     """
     words = sys.argv[1:] if args is None else list(args)
-    own, ros = _apart(words)
+    own = _outside_of_ros(words)
     if {"-h", "--help"} & set(own):
         # A pager may have been closed early.
         with suppress(BrokenPipeError):
@@ -249,7 +249,7 @@ def run(
             f"{' '.join(own)} has no effect outside of --ros-args; expected such as "
             f"{name} --ros-args -p NAME:=VALUE; --help lists the names",
         )
-    for word in _without_flag(ros):
+    for word in _without_flag(words):
         return _refuse(
             name,
             f"{word} has no flag before it; type -p {word} for a parameter, -r {word} to rename "
@@ -291,27 +291,22 @@ def _refuse(name: str, why: str) -> int:
     return 2
 
 
-def _apart(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return what stands outside of ``--ros-args`` ... ``--``, and what within."""
-    own: list[str] = []
-    ros: list[str] = []
-    within = False
+def _outside_of_ros(words: Sequence[str]) -> list[str]:
+    """Return what stands outside of ``--ros-args`` ... ``--``."""
+    own, within = list[str](), False
     for word in words:
         if word == "--ros-args":
             within = True
         elif within and word == "--":
             within = False
-        else:
-            (ros if within else own).append(word)
-    return own, ros
+        elif not within:
+            own.append(word)
+    return own
 
 
-def _without_flag(ros: Sequence[str]) -> list[str]:
-    """Return the words that look like NAME:=VALUE and follow no flag that takes one.
-
-    :param ros: what stands between ``--ros-args`` and ``--``.
-    """
-    pairs = itertools.pairwise(("", *ros))
+def _without_flag(words: Sequence[str]) -> list[str]:
+    """Return the words that look like NAME:=VALUE and follow no flag that takes one."""
+    pairs = itertools.pairwise(("", *words))
     return [word for before, word in pairs if ":=" in word and before not in _FLAGS_OF_RULES]
 
 

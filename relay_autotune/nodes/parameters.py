@@ -8,15 +8,20 @@ from __future__ import annotations
 import difflib
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from relay_autotune.errors import ParameterError
+from relay_autotune.errors import ParameterError, RelayAutotuneError
 from relay_autotune.quantities import Quantity
 
 # Parameters that rclpy adds to every node.
@@ -130,6 +135,23 @@ def merged(node: Node, table: Sequence[Quantity], changes: Iterable[Parameter]) 
         _check(entry, change.value)
         values[change.name] = change.value
     return values
+
+
+def ask_before_changes(node: Node, require: Callable[[list[Parameter]], object]) -> None:
+    """Ask before each change of a node's parameters.
+
+    :param node: the node.
+    :param require: takes the changes; raises RelayAutotuneError with the reason to refuse them.
+    """
+
+    def asked(changes: list[Parameter]) -> SetParametersResult:
+        try:
+            require(changes)
+        except RelayAutotuneError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(asked)
 
 
 def _check(entry: Quantity, value: Any) -> None:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from relay_autotune.errors import NotReadyError, ParameterError, RelayAutotuneError
+from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
@@ -428,28 +428,25 @@ def _is_beyond_known(parameters: ExperimentParameters, baseline: float) -> bool:
     return too_high or too_low
 
 
-def why_not_settable(node: Node, changes: Sequence[RosParameter], running: str) -> str:
-    """Return why parameters cannot be changed now, "" if they can.
+def require_settable(node: Node, changes: Sequence[RosParameter], running: str) -> None:
+    """Refuse a change of parameters that is not possible now.
 
     :param node: relay_node.
     :param changes: the changes about to be made.
     :param running: id of the running tune; empty: no tune runs.
+    :raises RelayAutotuneError: with the reason.
     """
     names = {entry.name for entry in TUNE_PARAMETERS}
     if running and any(change.name in names for change in changes):
-        return (
+        raise NotReadyError(
             f"parameters stay as they are while tune {running} runs; wait for its end or call "
             f"{node.get_fully_qualified_name()}/abort"
         )
-    try:
-        values = merged(node, TUNE_PARAMETERS, changes)
-        experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
-        # A start request may still give the amplitude; then all is checked at the start.
-        if experiment["amplitude"] > 0.0:
-            ExperimentParameters(**experiment).validate()
-    except ParameterError as error:
-        return str(error)
-    return ""
+    values = merged(node, TUNE_PARAMETERS, changes)
+    experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
+    # A start request may still give the amplitude; then all is checked at the start.
+    if experiment["amplitude"] > 0.0:
+        ExperimentParameters(**experiment).validate()
 
 
 def _look_at_rest(checks: Checklist, samples: LastSamples) -> None:

@@ -13,9 +13,7 @@ from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import FieldError, NotReadyError, RelayAutotuneError
@@ -23,17 +21,17 @@ from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
-from relay_autotune.nodes.goals import Narrator, TuneAction
+from relay_autotune.nodes.goals import Narrator, TuneAction, serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
-from relay_autotune.nodes.parameters import declare, values_of
+from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
 from relay_autotune.nodes.readiness import (
     Checklist,
     Readiness,
     Ready,
-    why_not_settable,
+    require_settable,
 )
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
@@ -98,12 +96,12 @@ class RelayNode(ServedNode):
         self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
         self.create_service(StartTune, "~/start_tune", self._on_start)
-        self.create_service(Trigger, "~/abort", self._on_abort)
+        serve(self, Trigger, "~/abort", self._abort)
         self._action = TuneAction(self, self._request, partial(self._stop_now, "cancelled"))
         self._awaits_results: Session | None = None
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
-        self.add_on_set_parameters_callback(self._on_set)
+        ask_before_changes(self, lambda given: require_settable(self, given, self._running))
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(
             f"ready: {self._ends.measurement.topic_name} in, {self._ends.command.topic} out; "
@@ -277,23 +275,19 @@ class RelayNode(ServedNode):
         self._ends.cycles.publish(message)
         self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _abort(self, _: Trigger.Request) -> str:
         session = self._session
         if session is None:
-            response.success = False
-            response.message = "no tune is running"
-            return response
+            raise NotReadyError("no tune is running")
         acknowledged = self._stop(session, "aborted on request")
         but = "" if acknowledged else ", but was not acknowledged"
         safe = session.experiment.after_end(math.nan)
-        response.success = True
-        response.message = f"tune {session.id} aborted; the safe command {safe:g} is out{but}"
-        return response
+        return f"tune {session.id} aborted; the safe command {safe:g} is out{but}"
 
-    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        running = "" if self._session is None else self._session.id
-        problem = why_not_settable(self, changes, running)
-        return SetParametersResult(successful=not problem, reason=problem)
+    @property
+    def _running(self) -> str:
+        """Id of the running tune; empty: no tune runs."""
+        return "" if self._session is None else self._session.id
 
     def _on_result(self, name: str, message: Any) -> None:
         session = self._session
