@@ -8,7 +8,7 @@ descriptors, command-line flags with their help, and the tables of the guide fol
 
     @dataclass(frozen=True)
     class DesignOptions:
-        ms: float = quantity(1.4, "", "Largest Ms.", lower=1.2, upper=4.0)
+        ms: float = quantity(1.4, lower=1.2, upper=4.0).means("Largest Ms.")
 
         def __post_init__(self) -> None:
             check(self, TuningError)
@@ -124,20 +124,31 @@ class Quantity:
         return self.lower <= value <= self.upper
 
 
+@dataclass(frozen=True)
+class _Field:
+    """The field of a dataclass as it is declared, before it is said what it means.
+
+    :param default: MISSING: it has none.
+    :param metadata: of the field, for the sentence that says what it means.
+    """
+
+    default: Any
+    metadata: Callable[[str], dict[str, Any]]
+
+    def means(self, sentence: str) -> Any:
+        """Return the field of a dataclass.
+
+        :param sentence: for people.
+        """
+        return field(default=self.default, metadata=self.metadata(sentence))
+
+
 def quantity(
-    default: float | int | bool | str,
-    unit: str,
-    description: str,
-    lower: float = -math.inf,
-    upper: float = math.inf,
-    *,
-    open_ended: bool = False,
-    choices: tuple[str, ...] = (),
-    flag: str = "",
-) -> Any:
+    default: float | int | bool | str, unit: str = "", *others: Any, **named: Any
+) -> _Field:
     """Declare the field of a dataclass as a quantity; the arguments are :class:`Quantity`'s."""
-    found = Quantity("", default, unit, lower, upper, open_ended, choices, flag, description)
-    return field(default=default, metadata={_DECLARED: found})
+    found = Quantity("", default, unit, *others, **named)
+    return _Field(default, lambda sentence: {_DECLARED: found.means(sentence)})
 
 
 @cache
@@ -233,16 +244,16 @@ class Told:
 
 
 def told(
-    unit: str, meaning: str, default: Any = MISSING, *, nan: bool | None = None, **carried: Any
-) -> Any:
+    unit: str = "", default: Any = MISSING, *, nan: bool | None = None, **carried: Any
+) -> _Field:
     """Declare the field of a dataclass as one of a result; the arguments are :class:`Told`'s.
 
     :param nan: None: NaN is allowed where it is the default.
     """
     if nan is None:
         nan = isinstance(default, float) and math.isnan(default)
-    words = {"unit": unit, "meaning": meaning, "default": default, "nan": nan, **carried}
-    return field(default=default, metadata={_TOLD: words})
+    words = {"unit": unit, "default": default, "nan": nan, **carried}
+    return _Field(default, lambda sentence: {_TOLD: words | {"meaning": sentence}})
 
 
 def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _Getter]:

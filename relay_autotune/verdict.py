@@ -106,20 +106,17 @@ class Check:
 class Finding:
     """What one check found."""
 
-    name: str = told("", "Name of the check.")
-    title: str = told("", "Title of the check.")
-    what: str = told("", "The measured quantity.")
-    value: float = told("", "The measured number; NaN: not computed.", nan=True, null=math.inf)
-    unit: str = told("", "Unit of value and limit.")
-    limit: float = told(
-        "",
-        "Largest value of a check that passes; where it failed, of one that does not fail.",
-        nan=True,
-        null=math.inf,
+    name: str = told().means("Name of the check.")
+    title: str = told().means("Title of the check.")
+    what: str = told().means("The measured quantity.")
+    value: float = told(nan=True, null=math.inf).means("The measured number; NaN: not computed.")
+    unit: str = told().means("Unit of value and limit.")
+    limit: float = told(nan=True, null=math.inf).means(
+        "Largest value of a check that passes; where it failed, of one that does not fail."
     )
-    result: Result = told("", "Result of the check.")
-    sentence: str = told("", "Meaning of a result that did not pass; empty: it passed.", "")
-    remedy: str = told("", "What to do then.", "")
+    result: Result = told().means("Result of the check.")
+    sentence: str = told("", "").means("Meaning of a result that did not pass; empty: it passed.")
+    remedy: str = told("", "").means("What to do then.")
 
     @property
     def said(self) -> str:

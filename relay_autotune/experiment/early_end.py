@@ -36,11 +36,13 @@ class FitProgress:
     :raises ParameterError: if a number is outside its possible range.
     """
 
-    ultimate_gain: float = told("u/y", "K_u.", math.nan)
-    ultimate_gain_std: float = told("u/y", "Its standard deviation.", math.nan)
-    ms: float = told("", "Ms that the gains designed on the model would have.", math.nan)
-    ms_low: float = told("", "Lower end of its 95 % interval.", math.nan)
-    ms_high: float = told("", "Upper end; inf: some of the loops would be unstable.", math.nan)
+    ultimate_gain: float = told("u/y", math.nan).means("K_u.")
+    ultimate_gain_std: float = told("u/y", math.nan).means("Its standard deviation.")
+    ms: float = told("", math.nan).means("Ms that the gains designed on the model would have.")
+    ms_low: float = told("", math.nan).means("Lower end of its 95 % interval.")
+    ms_high: float = told("", math.nan).means(
+        "Upper end; inf: some of the loops would be unstable."
+    )
 
     def __post_init__(self) -> None:
         problem = ""

@@ -21,130 +21,74 @@ class ExperimentParameters:
     0.3
     """
 
-    amplitude: float = quantity(
-        0.0,
-        "u",
+    amplitude: float = quantity(0.0, "u", lower=0.0).means(
         "Half the distance of the two command levels; 0: the tune finds it between command_min "
-        "and command_max, from small to large.",
-        lower=0.0,
+        "and command_max, from small to large."
     )
-    target_amplitude: float = quantity(
-        0.0,
-        "y",
+    target_amplitude: float = quantity(0.0, "y", lower=0.0).means(
         "For amplitude 0: half the swing of the measurement that is large enough; 0: when the "
-        "oscillation stands clear of noise, hysteresis and resolution.",
-        lower=0.0,
+        "oscillation stands clear of noise, hysteresis and resolution."
     )
-    bias: float = quantity(
-        0.0,
-        "u",
-        "Offset of the middle of the two levels from the baseline; 0: bias_ratio decides.",
+    bias: float = quantity(0.0, "u").means(
+        "Offset of the middle of the two levels from the baseline; 0: bias_ratio decides."
     )
-    bias_ratio: float = quantity(
-        0.3,
-        "",
+    bias_ratio: float = quantity(0.3, lower=-1.0, upper=1.0, open_ended=True).means(
         "Bias as a fraction of the amplitude, used if bias is 0; a biased relay also determines "
-        "the static gain, 0 makes the relay symmetric.",
-        lower=-1.0,
-        upper=1.0,
-        open_ended=True,
+        "the static gain, 0 makes the relay symmetric."
     )
-    hysteresis: float = quantity(
-        0.0,
-        "y",
+    hysteresis: float = quantity(0.0, "y", lower=0.0).means(
         "Half width of the band about the set-point in which the relay does not switch; "
-        "0: three times the measured noise standard deviation.",
-        lower=0.0,
+        "0: three times the measured noise standard deviation."
     )
-    setpoint: float = quantity(
-        math.nan,
-        "y",
-        "Measurement about which the relay switches; NaN: the measured mean at the start.",
+    setpoint: float = quantity(math.nan, "y").means(
+        "Measurement about which the relay switches; NaN: the measured mean at the start."
     )
-    process_gain_sign: int = quantity(
-        0,
-        "",
+    process_gain_sign: int = quantity(0, lower=-1, upper=1).means(
         "1 if a higher command raises the measurement in the end, -1 if it lowers it; "
-        "0: found by the kick.",
-        lower=-1,
-        upper=1,
+        "0: found by the kick."
     )
-    settle_time: float = quantity(
-        0.0,
-        "s",
-        "Time at the baseline before the kick; 0: until the measurement is steady.",
-        lower=0.0,
+    settle_time: float = quantity(0.0, "s", lower=0.0).means(
+        "Time at the baseline before the kick; 0: until the measurement is steady."
     )
-    min_cycles: int = quantity(
-        3,
-        "",
-        "Number of successive cycles that must agree before the experiment ends.",
-        lower=2,
-        upper=1000,
+    min_cycles: int = quantity(3, lower=2, upper=1000).means(
+        "Number of successive cycles that must agree before the experiment ends."
     )
-    max_cycles: int = quantity(
-        12,
-        "",
-        "Number of cycles after which the experiment ends, whether they agree or not.",
-        lower=2,
-        upper=1000,
+    max_cycles: int = quantity(12, lower=2, upper=1000).means(
+        "Number of cycles after which the experiment ends, whether they agree or not."
     )
-    cycle_tolerance: float = quantity(
-        0.02,
-        "",
+    cycle_tolerance: float = quantity(0.02, lower=0.0, upper=1.0, open_ended=True).means(
         "Largest difference of half periods and of peaks between agreeing cycles, as a fraction "
-        "of the half period and of the amplitude; widened by noise and by the sample interval.",
-        lower=0.0,
-        upper=1.0,
-        open_ended=True,
+        "of the half period and of the amplitude; widened by noise and by the sample interval."
     )
-    measurement_min: float = quantity(
-        -math.inf, "y", "The experiment is aborted when the measurement falls below this."
+    measurement_min: float = quantity(-math.inf, "y").means(
+        "The experiment is aborted when the measurement falls below this."
     )
-    measurement_max: float = quantity(
-        math.inf, "y", "The experiment is aborted when the measurement rises above this."
+    measurement_max: float = quantity(math.inf, "y").means(
+        "The experiment is aborted when the measurement rises above this."
     )
-    max_deviation: float = quantity(
-        0.0,
-        "y",
+    max_deviation: float = quantity(0.0, "y", lower=0.0).means(
         "The experiment is aborted when the measurement is further than this from the set-point, "
-        "once that is known; 0: no limit.",
-        lower=0.0,
+        "once that is known; 0: no limit."
     )
-    command_min: float = quantity(-math.inf, "u", "Lowest command that may be sent.")
-    command_max: float = quantity(math.inf, "u", "Highest command that may be sent.")
-    command_rate: float = quantity(
-        0.0,
-        "u/s",
+    command_min: float = quantity(-math.inf, "u").means("Lowest command that may be sent.")
+    command_max: float = quantity(math.inf, "u").means("Highest command that may be sent.")
+    command_rate: float = quantity(0.0, "u/s", lower=0.0).means(
         "Fastest change of the relay's command; the safe command at the end is still a step; 0: "
-        "no limit.",
-        lower=0.0,
+        "no limit."
     )
-    extra_delay: float = quantity(
-        0.0,
-        "s",
-        "Dead time that the relay adds to its switches, for the second test of the method li.",
-        lower=0.0,
+    extra_delay: float = quantity(0.0, "s", lower=0.0).means(
+        "Dead time that the relay adds to its switches, for the second test of the method li."
     )
-    max_half_cycle: float = quantity(
-        0.0,
-        "s",
+    max_half_cycle: float = quantity(0.0, "s", lower=0.0).means(
         "Longest stay of the relay at one level; 0: ten times the longest so far, and more for "
-        "a biased relay.",
-        lower=0.0,
+        "a biased relay."
     )
-    max_duration: float = quantity(
-        0.0,
-        "s",
+    max_duration: float = quantity(0.0, "s", lower=0.0).means(
         "Longest duration of the whole experiment; 0: each of its parts has a limit scaled to "
-        "what was seen before.",
-        lower=0.0,
+        "what was seen before."
     )
-    sample_period: float = quantity(
-        0.0,
-        "s",
-        "Period of the samples, if they have no time of their own; 0: the time is their stamp.",
-        lower=0.0,
+    sample_period: float = quantity(0.0, "s", lower=0.0).means(
+        "Period of the samples, if they have no time of their own; 0: the time is their stamp."
     )
 
     @property

@@ -28,29 +28,21 @@ class Known:
     :raises ParameterError: if a value is out of its range, or the gain is zero.
     """
 
-    gain: float = quantity(
-        math.nan,
-        "y/u",
+    gain: float = quantity(math.nan, "y/u").means(
         "Static gain of the process, in y/(u s) if it integrates; NaN: to be found, which atv, "
-        "and chang with unequal lags, cannot do.",
+        "and chang with unequal lags, cannot do."
     )
-    dead_time: float = quantity(
-        math.nan, "s", "Dead time of the process; NaN: to be found.", lower=0.0
+    dead_time: float = quantity(math.nan, "s", lower=0.0).means(
+        "Dead time of the process; NaN: to be found."
     )
-    structure: str = quantity(
-        "",
-        "",
-        "Structure of the model; empty: chosen by the method.",
-        choices=("", *TABLE),
+    structure: str = quantity("", choices=("", *TABLE)).means(
+        "Structure of the model; empty: chosen by the method."
     )
-    order: int = quantity(
-        0, "", "Number of equal lags, for lag_n; 0: to be found.", lower=0, upper=_MOST_LAGS
+    order: int = quantity(0, lower=0, upper=_MOST_LAGS).means(
+        "Number of equal lags, for lag_n; 0: to be found."
     )
-    loss: str = quantity(
-        LOSSES[0],
-        "",
-        "Loss function of the waveform fit; huber and tukey tolerate many outliers.",
-        choices=LOSSES,
+    loss: str = quantity(LOSSES[0], choices=LOSSES).means(
+        "Loss function of the waveform fit; huber and tukey tolerate many outliers."
     )
 
     def __post_init__(self) -> None:

@@ -27,12 +27,12 @@ DETERMINED = 0.2
 class Combination:
     """A combination of parameters with its uncertainty; NaN: not estimated."""
 
-    name: str = told("", "In terms of the parameters.", message="combinations")
-    unit: str = told("", "Unit of the value.", message="combination_units")
-    value: float = told("", "Its value.", nan=True)
-    std: float = told("", "Its standard deviation.", math.nan, lower=0.0)
-    ci95_low: float = told("", "Lower end of its 95 % interval.", math.nan, document="ci95")
-    ci95_high: float = told("", "Upper end.", math.nan, document="ci95")
+    name: str = told(message="combinations").means("In terms of the parameters.")
+    unit: str = told(message="combination_units").means("Unit of the value.")
+    value: float = told(nan=True).means("Its value.")
+    std: float = told("", math.nan, lower=0.0).means("Its standard deviation.")
+    ci95_low: float = told("", math.nan, document="ci95").means("Lower end of its 95 % interval.")
+    ci95_high: float = told("", math.nan, document="ci95").means("Upper end.")
 
     @property
     def determined(self) -> bool:
@@ -126,13 +126,15 @@ class Validation:
     the noise of the record's curve subtracted.
     """
 
-    period: float = told("", "Difference of the whole period.", math.nan)
-    period_high: float = told("", "Difference of the time with the command high.", math.nan)
-    period_low: float = told("", "Difference of the time with the command low.", math.nan)
-    peak_max: float = told("", "Difference of the highest measurement.", math.nan)
-    peak_min: float = told("", "Difference of the lowest measurement.", math.nan)
-    shape: float = told("", "Root mean square difference of the two curves.", math.nan, lower=0.0)
-    reason: str = told("", "Why there is no limit cycle; empty if there is one.", "")
+    period: float = told("", math.nan).means("Difference of the whole period.")
+    period_high: float = told("", math.nan).means("Difference of the time with the command high.")
+    period_low: float = told("", math.nan).means("Difference of the time with the command low.")
+    peak_max: float = told("", math.nan).means("Difference of the highest measurement.")
+    peak_min: float = told("", math.nan).means("Difference of the lowest measurement.")
+    shape: float = told("", math.nan, lower=0.0).means(
+        "Root mean square difference of the two curves."
+    )
+    reason: str = told("", "").means("Why there is no limit cycle; empty if there is one.")
 
     @property
     def worst(self) -> float:
@@ -149,30 +151,23 @@ class FitReport:
     ``noise_to_signal`` is N2 of Wang et al. 1997, and ``noise_to_signal_power`` their N1.
     """
 
-    residual_rms: float = told(
-        "y", "Root mean square of measurement minus model.", math.nan, lower=0.0, column=2
+    residual_rms: float = told("y", math.nan, lower=0.0, column=2).means(
+        "Root mean square of measurement minus model."
     )
-    noise_std: float = told("y", "Noise measured before the test.", math.nan, lower=0.0)
-    fit: float = told(
-        "", "1 - rms(residual)/rms(measurement about its mean).", math.nan, upper=1.0, column=1
+    noise_std: float = told("y", math.nan, lower=0.0).means("Noise measured before the test.")
+    fit: float = told("", math.nan, upper=1.0, column=1).means(
+        "1 - rms(residual)/rms(measurement about its mean)."
     )
-    whiteness_p: float = told(
-        "",
-        "Probability of a residual this correlated if it were white (Ljung and Box).",
-        math.nan,
-        lower=0.0,
-        upper=1.0,
+    whiteness_p: float = told("", math.nan, lower=0.0, upper=1.0).means(
+        "Probability of a residual this correlated if it were white (Ljung and Box)."
     )
-    prediction: float = told(
-        "y",
-        "Root mean square error over the last cycle, predicted from those before.",
-        math.nan,
-        lower=0.0,
+    prediction: float = told("y", math.nan, lower=0.0).means(
+        "Root mean square error over the last cycle, predicted from those before."
     )
-    noise_to_signal: float = told(
-        "", "mean|residual|/mean|model about the operating point|.", math.nan, lower=0.0
+    noise_to_signal: float = told("", math.nan, lower=0.0).means(
+        "mean|residual|/mean|model about the operating point|."
     )
-    noise_to_signal_power: float = told("", "The same of mean squares.", math.nan, lower=0.0)
+    noise_to_signal_power: float = told("", math.nan, lower=0.0).means("The same of mean squares.")
 
 
 @dataclass(frozen=True)
@@ -182,8 +177,8 @@ class Rival:
     The estimate has a covariance where the support is worth it.
     """
 
-    estimate: Estimate = told("", "The structure's best fit; documents have its model alone.")
-    support: float = told("", "Its weight among all structures tried.", lower=0.0, upper=1.0)
+    estimate: Estimate = told().means("The structure's best fit; documents have its model alone.")
+    support: float = told(lower=0.0, upper=1.0).means("Its weight among all structures tried.")
 
     @property
     def model(self) -> TransferFunction:
@@ -206,63 +201,49 @@ class Identification:
     selected model (Thyagarajan and Yu 2003, eqs 29 and 30).
     """
 
-    method: str = told("", "Name in the registry.", word=True, column=1)
-    estimate: Estimate = told("", "The parameters of the model and their covariance.")
-    ci95_low: FloatArray = told(
-        "", "Lower ends of the 95 % intervals, shape (p,).", nan=True, document="ci95"
+    method: str = told(word=True, column=1).means("Name in the registry.")
+    estimate: Estimate = told().means("The parameters of the model and their covariance.")
+    ci95_low: FloatArray = told(nan=True, document="ci95").means(
+        "Lower ends of the 95 % intervals, shape (p,)."
     )
-    ci95_high: FloatArray = told("", "Upper ends, shape (p,).", nan=True, document="ci95")
-    fit: FitReport = told("", "Quality of the fit.", FitReport())
-    validation: Validation | None = told(
-        "",
-        "How the limit cycle of the model differs from the record's; None: not compared.",
-        None,
-        prefix="validation_",
+    ci95_high: FloatArray = told(nan=True, document="ci95").means("Upper ends, shape (p,).")
+    fit: FitReport = told("", FitReport()).means("Quality of the fit.")
+    validation: Validation | None = told("", None, prefix="validation_").means(
+        "How the limit cycle of the model differs from the record's; None: not compared."
     )
-    integrated_error: float = told(
-        "rad/s",
-        "Difference from the selected model; NaN: it is that model, or not computed.",
-        math.nan,
-        lower=0.0,
+    integrated_error: float = told("rad/s", math.nan, lower=0.0).means(
+        "Difference from the selected model; NaN: it is that model, or not computed."
     )
-    points: tuple[FrequencyPoint, ...] = told(
-        "",
-        "Measured points of the frequency response, by rising frequency.",
-        (),
-        prefix="point_",
+    points: tuple[FrequencyPoint, ...] = told("", (), prefix="point_").means(
+        "Measured points of the frequency response, by rising frequency."
     )
-    ultimate_gain: float = told(
-        "u/y", "K_u with the sign of the process; NaN: the model has none.", math.nan, column=1
+    ultimate_gain: float = told("u/y", math.nan, column=1).means(
+        "K_u with the sign of the process; NaN: the model has none."
     )
-    ultimate_gain_std: float = told(
-        "u/y", "Its standard deviation; NaN: not estimated.", math.nan, lower=0.0, column=1
+    ultimate_gain_std: float = told("u/y", math.nan, lower=0.0, column=1).means(
+        "Its standard deviation; NaN: not estimated."
     )
-    ultimate_frequency: float = told(
-        "rad/s", "w_u; NaN: the model has none.", math.nan, lower=0.0, column=1
+    ultimate_frequency: float = told("rad/s", math.nan, lower=0.0, column=1).means(
+        "w_u; NaN: the model has none."
     )
-    ultimate_frequency_std: float = told(
-        "rad/s", "Its standard deviation; NaN: not estimated.", math.nan, lower=0.0, column=1
+    ultimate_frequency_std: float = told("rad/s", math.nan, lower=0.0, column=1).means(
+        "Its standard deviation; NaN: not estimated."
     )
-    warnings: tuple[str, ...] = told("", "Sentences that the user must read.", ())
-    undetermined: tuple[str, ...] = told(
-        "", "Parameters whose 95 % interval is wider than 20 % of the value.", ()
+    warnings: tuple[str, ...] = told("", ()).means("Sentences that the user must read.")
+    undetermined: tuple[str, ...] = told("", ()).means(
+        "Parameters whose 95 % interval is wider than 20 % of the value."
     )
-    combinations: tuple[Combination, ...] = told(
-        "",
-        "Where a parameter is not determined, what the data determine all the same.",
-        (),
-        prefix="combination_",
+    combinations: tuple[Combination, ...] = told("", (), prefix="combination_").means(
+        "Where a parameter is not determined, what the data determine all the same."
     )
-    advice: tuple[str, ...] = told("", "Then, what test would determine it, each a sentence.", ())
-    support: float = told(
-        "",
-        "Weight of this structure among all that were tried; 1: no other was.",
-        1.0,
-        lower=0.0,
-        upper=1.0,
+    advice: tuple[str, ...] = told("", ()).means(
+        "Then, what test would determine it, each a sentence."
     )
-    rivals: tuple[Rival, ...] = told(
-        "", "Other structures with some support, the best first.", (), message=None
+    support: float = told("", 1.0, lower=0.0, upper=1.0).means(
+        "Weight of this structure among all that were tried; 1: no other was."
+    )
+    rivals: tuple[Rival, ...] = told("", (), message=None).means(
+        "Other structures with some support, the best first."
     )
     # The model's measurement at the record's samples, with all that was estimated beside the
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the

@@ -35,11 +35,11 @@ class Controller:
     :raises TuningError: if a value is not finite, kc is zero or a time is negative.
     """
 
-    kc: float = told("u/y", "Proportional gain, with the sign of the process.", column=1)
-    ti: float = told("s", "Integral time; 0: no integral action.", lower=0.0, column=1)
-    td: float = told("s", "Derivative time.", 0.0, lower=0.0, column=1)
-    tf: float = told("s", "Time constant of the filter; 0: none.", 0.0, lower=0.0, column=1)
-    b: float = told("", "Set-point weight.", 1.0, column=1)
+    kc: float = told("u/y", column=1).means("Proportional gain, with the sign of the process.")
+    ti: float = told("s", lower=0.0, column=1).means("Integral time; 0: no integral action.")
+    td: float = told("s", 0.0, lower=0.0, column=1).means("Derivative time.")
+    tf: float = told("s", 0.0, lower=0.0, column=1).means("Time constant of the filter; 0: none.")
+    b: float = told("", 1.0, column=1).means("Set-point weight.")
 
     def __post_init__(self) -> None:
         numbers = (self.kc, self.ti, self.td, self.tf, self.b)
@@ -136,29 +136,21 @@ class Controller:
 class Margins:
     """Margins of a stable loop."""
 
-    ms: float = told("", "Largest magnitude of the sensitivity function.", lower=0.0, column=1)
-    mt: float = told(
-        "", "Largest magnitude of the complementary sensitivity function.", lower=0.0, column=1
+    ms: float = told(lower=0.0, column=1).means("Largest magnitude of the sensitivity function.")
+    mt: float = told(lower=0.0, column=1).means(
+        "Largest magnitude of the complementary sensitivity function."
     )
-    gain_margin: float = told(
-        "",
-        "Factor by which the loop's gain may grow; inf: any.",
-        lower=0.0,
-        null=math.inf,
-        column=1,
+    gain_margin: float = told(lower=0.0, null=math.inf, column=1).means(
+        "Factor by which the loop's gain may grow; inf: any."
     )
-    phase_margin: float = told(
-        "rad", "Phase that the loop may lose.", lower=0.0, null=math.inf, column=1
+    phase_margin: float = told("rad", lower=0.0, null=math.inf, column=1).means(
+        "Phase that the loop may lose."
     )
-    delay_margin: float = told(
-        "s", "Dead time that may be added; inf: any.", lower=0.0, null=math.inf, column=1
+    delay_margin: float = told("s", lower=0.0, null=math.inf, column=1).means(
+        "Dead time that may be added; inf: any."
     )
-    gain_margin_low: float = told(
-        "",
-        "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below.",
-        math.nan,
-        lower=0.0,
-        after="iae_load",
+    gain_margin_low: float = told("", math.nan, lower=0.0, after="iae_load").means(
+        "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below."
     )
 
 
@@ -166,34 +158,24 @@ class Margins:
 class StepFigures:
     """Features of the responses of a loop to unit steps."""
 
-    iae_load: float = told(
-        "y s/u",
+    iae_load: float = told("y s/u", lower=0.0, null=math.inf, column=1).means(
         "Integral of the absolute error after a unit step of the load at the process input; inf: "
-        "without integral action.",
-        lower=0.0,
-        null=math.inf,
-        column=1,
+        "without integral action."
     )
-    iae_setpoint: float = told(
-        "s",
-        "Integral of the absolute error after a unit step of the set-point.",
-        math.nan,
-        lower=0.0,
+    iae_setpoint: float = told("s", math.nan, lower=0.0).means(
+        "Integral of the absolute error after a unit step of the set-point."
     )
-    overshoot: float = told(
-        "", "After a step of the set-point, relative to it.", math.nan, lower=0.0
+    overshoot: float = told("", math.nan, lower=0.0).means(
+        "After a step of the set-point, relative to it."
     )
-    settling_time: float = told(
-        "s", "Until the measurement stays within 2 % of a new set-point.", math.nan, lower=0.0
+    settling_time: float = told("s", math.nan, lower=0.0).means(
+        "Until the measurement stays within 2 % of a new set-point."
     )
-    effort_setpoint: float = told(
-        "u/y",
-        "Total variation of the command after a unit step of the set-point.",
-        math.nan,
-        lower=0.0,
+    effort_setpoint: float = told("u/y", math.nan, lower=0.0).means(
+        "Total variation of the command after a unit step of the set-point."
     )
-    effort_load: float = told(
-        "", "Total variation of the command after a unit step of the load.", math.nan, lower=0.0
+    effort_load: float = told("", math.nan, lower=0.0).means(
+        "Total variation of the command after a unit step of the load."
     )
 
 
@@ -204,12 +186,9 @@ class Performance(StepFigures, Margins):
     :raises TuningError: if a number is negative, or one that is always computed is NaN.
     """
 
-    noise_gain: float = told(
-        "u/y",
+    noise_gain: float = told("u/y", math.nan, lower=0.0).means(
         "Standard deviation of the command over that of white noise in the samples of the "
-        "measurement; without a sampling period the largest gain at any frequency.",
-        math.nan,
-        lower=0.0,
+        "measurement; without a sampling period the largest gain at any frequency."
     )
 
     def __post_init__(self) -> None:
@@ -228,31 +207,19 @@ class Gains(Performance, Controller):
     Ms 1.95, gain margin 2.25
     """
 
-    rule: str = told("", "Name in the registry.", after="", word=True, column=1)
-    form: str = told("", "Form in which the rule is stated.", "isa", after="rule")
-    ms_95: float = told(
-        "",
-        "Ms that 95 % of the models within the uncertainty stay below; NaN: not estimated.",
-        nan=True,
-        after="ms",
-        column=1,
+    rule: str = told(after="", word=True, column=1).means("Name in the registry.")
+    form: str = told("", "isa", after="rule").means("Form in which the rule is stated.")
+    ms_95: float = told(nan=True, after="ms", column=1).means(
+        "Ms that 95 % of the models within the uncertainty stay below; NaN: not estimated."
     )
-    law: str = told(
-        "",
-        "Law that they are for; left out: controller_node's, as a continuous controller.",
-        "",
-        word=True,
-        optional=True,
+    law: str = told("", "", word=True, optional=True).means(
+        "Law that they are for; left out: controller_node's, as a continuous controller."
     )
-    law_period: float = told(
-        "s",
-        "Sampling period at which that law runs; left out: no law was named.",
-        0.0,
-        lower=0.0,
-        optional=True,
+    law_period: float = told("s", 0.0, lower=0.0, optional=True).means(
+        "Sampling period at which that law runs; left out: no law was named."
     )
-    reason: str = told("", "Why this rule and these gains, a sentence for people.")
-    warnings: tuple[str, ...] = told("", "What the user must know before using them.", ())
+    reason: str = told().means("Why this rule and these gains, a sentence for people.")
+    warnings: tuple[str, ...] = told("", ()).means("What the user must know before using them.")
 
     def __post_init__(self) -> None:
         Controller.__post_init__(self)

@@ -41,14 +41,10 @@ class Actuator:
     _: KW_ONLY
     minimum: float = -math.inf
     maximum: float = math.inf
-    dead_band: float = quantity(0.0, "u", "Play of the actuator.", lower=0.0)
-    stiction: float = quantity(0.0, "u", "Band in which the actuator sticks.", lower=0.0)
-    falling_gain: float = quantity(
-        1.0,
-        "",
-        "Factor on the command's part below rest, for a process that cools slower than it heats.",
-        lower=1e-3,
-        upper=1e3,
+    dead_band: float = quantity(0.0, "u", lower=0.0).means("Play of the actuator.")
+    stiction: float = quantity(0.0, "u", lower=0.0).means("Band in which the actuator sticks.")
+    falling_gain: float = quantity(1.0, lower=1e-3, upper=1e3).means(
+        "Factor on the command's part below rest, for a process that cools slower than it heats."
     )
     position: float = field(init=False)
 
@@ -141,11 +137,13 @@ class Disturbances:
     :raises ParameterError: if a value is out of its range.
     """
 
-    noise_std: float = quantity(0.0, "y", "Standard deviation of white noise.", lower=0.0)
-    quantisation: float = quantity(0.0, "y", "Resolution of the sensor; 0: none.", lower=0.0)
-    load_time: float = quantity(0.0, "s", "When a load step enters before the process.", lower=0.0)
-    load_size: float = quantity(0.0, "u", "Height of the load step; 0: none.")
-    drift: float = quantity(0.0, "y/s", "Slope added to the measurement.")
+    noise_std: float = quantity(0.0, "y", lower=0.0).means("Standard deviation of white noise.")
+    quantisation: float = quantity(0.0, "y", lower=0.0).means("Resolution of the sensor; 0: none.")
+    load_time: float = quantity(0.0, "s", lower=0.0).means(
+        "When a load step enters before the process."
+    )
+    load_size: float = quantity(0.0, "u").means("Height of the load step; 0: none.")
+    drift: float = quantity(0.0, "y/s").means("Slope added to the measurement.")
 
     def __post_init__(self) -> None:
         check(self, ParameterError)

@@ -469,8 +469,8 @@ class LimitCycle(CycleFeatures):
 
     # Standard deviation of each of the features between the cycles, by name; 0 for one cycle.
     std: dict[str, float] = field(default_factory=dict)
-    cycles: tuple[int, ...] = told("", "Indices of the cycles averaged.", ())
-    converged: bool = told("", "True if they agree.", False)
+    cycles: tuple[int, ...] = told("", ()).means("Indices of the cycles averaged.")
+    converged: bool = told("", False).means("True if they agree.")
 
 
 _AVERAGED = tuple(f.name for f in fields(CycleFeatures))

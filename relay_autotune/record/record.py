@@ -107,26 +107,30 @@ class RelaySettings:
     ``setpoint + hysteresis`` and high when it falls to ``setpoint - hysteresis``.
     """
 
-    setpoint: float = told(
-        "y", "Measurement about which the relay switches.", nan=True, lower=-LARGEST, upper=LARGEST
+    setpoint: float = told("y", nan=True, lower=-LARGEST, upper=LARGEST).means(
+        "Measurement about which the relay switches."
     )
-    baseline: float = told("u", "Command of the operating point.", lower=-LARGEST, upper=LARGEST)
-    amplitude: float = told(
-        "u", "Half the distance of the two levels, mu.", lower=0.0, upper=LARGEST
+    baseline: float = told("u", lower=-LARGEST, upper=LARGEST).means(
+        "Command of the operating point."
     )
-    bias: float = told(
-        "u", "Offset of their middle from the baseline, mu0.", 0.0, lower=-LARGEST, upper=LARGEST
+    amplitude: float = told("u", lower=0.0, upper=LARGEST).means(
+        "Half the distance of the two levels, mu."
     )
-    hysteresis: float = told(
-        "y", "Half width of the switching band, epsilon.", 0.0, nan=True, lower=0.0, upper=LARGEST
+    bias: float = told("u", 0.0, lower=-LARGEST, upper=LARGEST).means(
+        "Offset of their middle from the baseline, mu0."
     )
-    extra_delay: float = told(
-        "s", "Dead time that the relay added.", 0.0, lower=0.0, upper=LARGEST
+    hysteresis: float = told("y", 0.0, nan=True, lower=0.0, upper=LARGEST).means(
+        "Half width of the switching band, epsilon."
     )
-    sample_period: float = told(
-        "s", "Nominal period of the samples; 0: by their stamps.", 0.0, lower=0.0, upper=LARGEST
+    extra_delay: float = told("s", 0.0, lower=0.0, upper=LARGEST).means(
+        "Dead time that the relay added."
     )
-    reverse_acting: bool = told("", "True if a higher command lowers the measurement.", False)
+    sample_period: float = told("s", 0.0, lower=0.0, upper=LARGEST).means(
+        "Nominal period of the samples; 0: by their stamps."
+    )
+    reverse_acting: bool = told("", False).means(
+        "True if a higher command lowers the measurement."
+    )
 
     @property
     def high(self) -> float:
@@ -146,31 +150,33 @@ class CycleFeatures:
     The times with the command high and low are T_u1 and T_u2 of Wang et al.
     """
 
-    period: float = told("s", "Whole period.", nan=True)
-    period_high: float = told("s", "Time with the command high.", nan=True)
-    period_low: float = told("s", "Time with the command low.", nan=True)
-    peak_max: float = told("y", "Highest measurement, absolute.", nan=True)
-    peak_min: float = told("y", "Lowest measurement, absolute.", nan=True)
-    time_to_peak_max: float = told(
-        "s", "From the switch that turns the measurement down to the maximum.", nan=True
+    period: float = told("s", nan=True).means("Whole period.")
+    period_high: float = told("s", nan=True).means("Time with the command high.")
+    period_low: float = told("s", nan=True).means("Time with the command low.")
+    peak_max: float = told("y", nan=True).means("Highest measurement, absolute.")
+    peak_min: float = told("y", nan=True).means("Lowest measurement, absolute.")
+    time_to_peak_max: float = told("s", nan=True).means(
+        "From the switch that turns the measurement down to the maximum."
     )
-    time_to_peak_min: float = told(
-        "s", "From the switch that turns the measurement up to the minimum.", nan=True
+    time_to_peak_min: float = told("s", nan=True).means(
+        "From the switch that turns the measurement up to the minimum."
     )
-    mean_measurement: float = told("y", "Time average of the measurement.", nan=True, message=None)
-    mean_command: float = told("u", "Time average of the command.", nan=True, message=None)
+    mean_measurement: float = told("y", nan=True, message=None).means(
+        "Time average of the measurement."
+    )
+    mean_command: float = told("u", nan=True, message=None).means("Time average of the command.")
 
 
 @dataclass(frozen=True)
 class Cycle(CycleFeatures):
     """One whole cycle, from a switch to the high level to the next such switch."""
 
-    index: int = told("", "Number of the cycle in its experiment, from 0.")
-    start: float = told(
-        "s", "Time of the switch that begins it, on the record's time axis.", message=None
+    index: int = told().means("Number of the cycle in its experiment, from 0.")
+    start: float = told("s", message=None).means(
+        "Time of the switch that begins it, on the record's time axis."
     )
-    converged: bool = told("", "True if it agrees with the cycles before it.", False)
-    disturbed: bool = told("", "True if it should be left out of averages.", False)
+    converged: bool = told("", False).means("True if it agrees with the cycles before it.")
+    disturbed: bool = told("", False).means("True if it should be left out of averages.")
 
 
 @dataclass(frozen=True)

@@ -150,82 +150,46 @@ class DesignOptions:
     :raises TuningError: if a value is out of its range.
     """
 
-    controller: str = quantity(
-        "auto",
-        "",
-        "What is designed; auto: PI, unless the rule finds PID worth it.",
-        choices=CONTROLLERS,
+    controller: str = quantity("auto", choices=CONTROLLERS).means(
+        "What is designed; auto: PI, unless the rule finds PID worth it."
     )
-    ms: float = quantity(1.4, "", "Largest Ms, for robust and unstable.", *MS_RANGE)
-    mt: float = quantity(
-        math.nan,
-        "",
-        "Largest Mt, above 1, for robust; NaN: 1.4, of an integrating process 1.26.",
-        lower=1.0,
-        open_ended=True,
+    ms: float = quantity(1.4, "", *MS_RANGE).means("Largest Ms, for robust and unstable.")
+    mt: float = quantity(math.nan, lower=1.0, open_ended=True).means(
+        "Largest Mt, above 1, for robust; NaN: 1.4, of an integrating process 1.26."
     )
-    setpoint_weight: float = quantity(
-        math.nan, "", "Set-point weight b; NaN: the rule's own.", lower=0.0, upper=1.0
+    setpoint_weight: float = quantity(math.nan, lower=0.0, upper=1.0).means(
+        "Set-point weight b; NaN: the rule's own."
     )
-    sample_period: float = quantity(
-        0.0,
-        "s",
+    sample_period: float = quantity(0.0, "s", lower=0.0).means(
         "Sampling period of the controller, half of which counts as dead time; 0: the "
-        "recording's, or continuous where there is no recording.",
-        lower=0.0,
+        "recording's, or continuous where there is no recording."
     )
-    loop_delay: float = quantity(
-        0.0,
-        "s",
-        "Dead time that the controller's loop adds to the process.",
-        lower=0.0,
+    loop_delay: float = quantity(0.0, "s", lower=0.0).means(
+        "Dead time that the controller's loop adds to the process."
     )
-    noise_std: float = quantity(
-        math.nan,
-        "y",
-        "Standard deviation of the measurement noise; NaN: the recording's, or not known.",
-        lower=0.0,
+    noise_std: float = quantity(math.nan, "y", lower=0.0).means(
+        "Standard deviation of the measurement noise; NaN: the recording's, or not known."
     )
-    amplitude: float = quantity(
-        math.nan,
-        "u",
-        "How far the command may move; NaN: the relay's amplitude, or not known.",
-        lower=0.0,
+    amplitude: float = quantity(math.nan, "u", lower=0.0).means(
+        "How far the command may move; NaN: the relay's amplitude, or not known."
     )
-    noise_share: float = quantity(
-        0.1,
-        "",
+    noise_share: float = quantity(0.1, lower=0.0, open_ended=True).means(
         "Largest standard deviation of the noise in the command that derivative action may cause, "
-        "as a fraction of the amplitude.",
-        lower=0.0,
-        open_ended=True,
+        "as a fraction of the amplitude."
     )
-    filter_ratio: float = quantity(10.0, "", "Largest td/tf.", lower=0.0, open_ended=True)
+    filter_ratio: float = quantity(10.0, lower=0.0, open_ended=True).means("Largest td/tf.")
     closed_loop_time: float = quantity(
-        math.nan,
-        "s",
-        "Lambda of imc, simc and unstable; NaN: the rule's own.",
-        lower=0.0,
-        open_ended=True,
-        flag="lambda",
-    )
+        math.nan, "s", lower=0.0, open_ended=True, flag="lambda"
+    ).means("Lambda of imc, simc and unstable; NaN: the rule's own.")
     phase_peak: float = quantity(
-        math.radians(-120.0),
-        "rad",
-        "Phase of the loop at its peak, for luyben2003.",
-        lower=-math.pi,
-        upper=-0.5 * math.pi,
-        open_ended=True,
+        math.radians(-120.0), "rad", lower=-math.pi, upper=-0.5 * math.pi, open_ended=True
+    ).means("Phase of the loop at its peak, for luyben2003.")
+    resonance: float = quantity(2.0, "dB", lower=0.0, open_ended=True).means(
+        "Closed-loop resonance, for luyben2003."
     )
-    resonance: float = quantity(
-        2.0, "dB", "Closed-loop resonance, for luyben2003.", lower=0.0, open_ended=True
-    )
-    law: str = quantity(
-        "",
-        "",
+    law: str = quantity("", choices=("", *LAWS)).means(
         "Law that the gains are for, exact at the sampling period, such as pid_controller; not "
-        "given: controller_node's, with half a period as dead time.",
-        choices=("", *LAWS),
+        "given: controller_node's, with half a period as dead time."
     )
 
     def __post_init__(self) -> None:

@@ -28,13 +28,10 @@ _SMALL_ANGLE = 0.2
 class FrequencyPoint:
     """The process at one frequency."""
 
-    frequency: float = told("rad/s", "w.", nan=True)
-    value: complex = told("y/u", "G(j w).", nan=True)
-    std: float = told(
-        "y/u",
-        "Standard deviation of its real and of its imaginary part; NaN: not estimated.",
-        math.nan,
-        lower=0.0,
+    frequency: float = told("rad/s", nan=True).means("w.")
+    value: complex = told("y/u", nan=True).means("G(j w).")
+    std: float = told("y/u", math.nan, lower=0.0).means(
+        "Standard deviation of its real and of its imaginary part; NaN: not estimated."
     )
 
 
