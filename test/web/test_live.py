@@ -238,6 +238,7 @@ def test_an_open_page_draws_so_many_points_at_most_and_none_while_it_is_hidden(t
         tab.wait(f"Number(document.body.dataset.measured) >= {newest() - 1e-3}")
 
 
+@pytest.mark.browser
 def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tmp_path):
     live = Live("/relay_node")
     live.tell(phase="tuning", state="relay", setpoint=40.0, hysteresis=0.1)
