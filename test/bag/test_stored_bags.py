@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from analysed import analysed_once
 from made_bags import REPOSITORY, assert_same_record
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
-from relay_autotune.analysis import analyse
 from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.reader import interrupted_experiment, read_experiments
 from relay_autotune.bag.signals import Selection
@@ -70,7 +70,7 @@ def test_the_samples_are_those_that_were_recorded(name):
 @pytest.mark.parametrize("name", FOUND)
 def test_the_process_is_found_again(name):
     said, true, tolerance = FOUND[name]
-    model = analyse(the_record(name)).model
+    model = analysed_once(the_record(name)).model
     np.testing.assert_allclose(model.values, said, rtol=1e-6)
     np.testing.assert_allclose(model.values, true, rtol=tolerance)
 
@@ -78,7 +78,7 @@ def test_the_process_is_found_again(name):
 @pytest.mark.parametrize("name", ["biased_relay", "unbiased_relay_with_noise"])
 def test_replay_says_what_the_live_identifier_said(name):
     gains = live_result(name, "relay_autotune_msgs/msg/PidGains")
-    found = analyse(the_record(name))
+    found = analysed_once(the_record(name))
     model = live_result(name, "relay_autotune_msgs/msg/TransferFunction")
     assert list(model.parameters) == list(found.model.parameters)
     np.testing.assert_allclose(

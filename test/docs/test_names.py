@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 import yaml
+from analysed import analysed_once
 from pages import GUIDE, PAGES, ROOT, block_noted, blocks, commands, rows, spans
 from parameter_values import check_parameter_file, check_value
 
-from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import apply_gains, csv_to_bag, replay, tune_loop
 from relay_autotune.exchange.document import document
@@ -228,7 +228,7 @@ def test_every_interface_is_in_the_guide() -> None:
 
 def test_the_guide_has_the_fields_of_the_document() -> None:
     bag = ROOT / "bags/biased_relay"
-    found = document(str(bag), [analyse(read_experiments(bag).experiments[0])])
+    found = document(str(bag), [analysed_once(read_experiments(bag).experiments[0])])
     (experiment,) = found["experiments"]
     model = experiment["models"][0]
     for column, fields in {

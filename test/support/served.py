@@ -15,9 +15,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from analysed import analysed_once
 from tornado.websocket import websocket_connect
 
-from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.report.case import case_of
 from relay_autotune.result import Analysis
@@ -35,7 +35,7 @@ HOSTILE = "<img src=x onerror=\"document.title='taken'\"><script>document.title=
 def analysed(name: str = "unbiased_relay_with_noise") -> Analysis:
     """Return the analysis of a bag that comes with the package."""
     (record,) = read_experiments(REPOSITORY / "bags" / name).experiments
-    return analyse(record)
+    return analysed_once(record)
 
 
 def subject_of(analysis: Analysis, name: str = "a bag") -> Subject:

@@ -7,9 +7,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from analysed import analysed_once
 from served import analysed, subject_of
 
-from relay_autotune.analysis import analyse
 from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message
@@ -60,7 +60,7 @@ def test_doubtful_gains_are_sent_only_when_they_are_accepted_and_say_so(monkeypa
 def test_an_experiment_that_was_aborted_has_no_gains_to_send():
     aborted = replace(analysed().record, outcome=Outcome.ABORTED, reason="a button")
     with pytest.raises(TuningError, match="aborted"):
-        sent(subject_of(analyse(aborted)), replace(CALM, doubtful=True))
+        sent(subject_of(analysed_once(aborted)), replace(CALM, doubtful=True))
 
 
 @pytest.mark.parametrize("wish", [replace(CALM, of=1), replace(CALM, of=-1), Wish("apply")])

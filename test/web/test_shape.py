@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from analysed import analysed_once
 from served import REPOSITORY, analysed, subject_of
 
 from relay_autotune import tuning
@@ -154,7 +155,7 @@ def test_our_own_law_is_compared_with_the_weight_that_is_asked_for(analysis):
 
 
 def test_an_aborted_experiment_gives_no_gains(analysis):
-    aborted = analyse(replace(analysis.record, outcome=Outcome.ABORTED, reason="a button"))
+    aborted = analysed_once(replace(analysis.record, outcome=Outcome.ABORTED, reason="a button"))
     assert aborted.shaping is None
     shown = subject_of(aborted)
     with pytest.raises(TuningError, match="aborted"):
