@@ -256,8 +256,11 @@ def test_torn_anywhere_it_gives_what_came_before_or_a_sentence(tmp_path, compres
     data = whole.read_bytes()
     torn = tmp_path / "torn.mcap"
     longest = 0
+    torn.touch()
     for size in range(len(data) + 1):
-        torn.write_bytes(data[:size])
+        # One byte more: a file that is written anew each time waits for the disk.
+        with torn.open("ab") as file:
+            file.write(data[size - 1 : size] if size else b"")
         try:
             recording = read_experiments(torn)
         except BagError as error:

@@ -45,6 +45,7 @@ def interrupted(name: str, words: list[str], delay: float) -> tuple[int, str]:
     return process.returncode, said
 
 
+@pytest.mark.parametrize("moments", [2, pytest.param(8, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("name", "words", "ends"),
     [
@@ -53,9 +54,9 @@ def interrupted(name: str, words: list[str], delay: float) -> tuple[int, str]:
         ("plant_node", PLANT, {-signal.SIGINT, 0}),
     ],
 )
-def test_no_traceback_at_any_moment(name, words, ends):
+def test_no_traceback_at_any_moment(name, words, ends, moments):
     rng = random.Random(name)
-    for _ in range(4):
+    for _ in range(moments):
         status, said = interrupted(name, words, rng.uniform(0.01, 0.7))
         assert status in ends, said
         assert "Traceback" not in said

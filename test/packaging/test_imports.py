@@ -5,6 +5,7 @@
 
 import ast
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -41,21 +42,24 @@ def package_of(module: str) -> str:
     return module.split(".")[1] if "." in module else "__init__"
 
 
-def imports_of(file: Path):
-    """Yield the modules that a file imports, with whether that happens when it is loaded."""
+@cache
+def imports_of(file: Path) -> list[tuple[str, bool]]:
+    """Return the modules that a file imports, with whether that happens when it is loaded."""
     tree = ast.parse(file.read_text())
     later = set()
     for node in ast.walk(tree):
         checking = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         if checking or isinstance(node, ast.FunctionDef):
             later |= set(ast.walk(node))
+    found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, node not in later) for alias in node.names)
+            found += [(alias.name, node not in later) for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module, node not in later
+            found.append((node.module, node not in later))
             if (ROOT / node.module.replace(".", "/")).is_dir():
-                yield from ((f"{node.module}.{a.name}", node not in later) for a in node.names)
+                found += [(f"{node.module}.{a.name}", node not in later) for a in node.names]
+    return found
 
 
 def files_of(package: str) -> list[Path]:
