@@ -1,24 +1,30 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the commands have in common: arguments, messages and the way they end."""
+"""What the commands have in common: options, messages, the way they end, the page of --web."""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import os
+import re
 import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.terminal import broken, width
-from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.errors import MissingPackageError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.quantities import Quantity
 from relay_autotune.text import visible
+
+if TYPE_CHECKING:
+    pass
+
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
 # From best to worst; a command for several bags ends with the worst of their statuses.
@@ -55,8 +61,20 @@ def finite(text: str) -> float:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
     if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"expected a finite number, found {text}")
+        raise argparse.ArgumentTypeError(f"expected a finite number, found {text.strip()}")
     return value
+
+
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
+
+
+def with_negative(arguments: Iterable[str]) -> list[str]:
+    """Return the command line so that argparse takes -1e-3 for a number, not for an option.
+
+    :param arguments: those of the command line.
+    """
+    # An argument that begins with a blank is no option.
+    return [f" {each}" if _NEGATIVE.match(each) else each for each in arguments]
 
 
 def say(program: str, text: str) -> None:
@@ -200,3 +218,41 @@ def as_typed(
 
 def _typed(value: Any) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value).strip()
+
+
+_LOOPBACK = "127.0.0.1"
+
+
+def add_web(
+    parser: argparse.ArgumentParser,
+    what: str = "also serve a page to shape the gains, until Ctrl-C",
+) -> None:
+    """Add the options of the page.
+
+    :param parser: of the command.
+    :param what: the page does.
+    """
+    group = parser.add_argument_group("a page in the browser")
+    group.add_argument("--web", action="store_true", help=what)
+    group.add_argument(
+        "--web-address", default=_LOOPBACK, metavar="HOST[:PORT]",
+        help="where it is served (%(default)s, any free port); other than on this machine's own "
+        "address it asks for a token, which is part of the address that is printed",
+    )  # fmt: skip
+
+
+def check_web(options: argparse.Namespace) -> None:
+    """Refuse a page that cannot be served, before any work is done.
+
+    :param options: with those of :func:`add_web`.
+    :raises MissingPackageError: if the package that serves it is not installed.
+    :raises SelectionError: if its address is none.
+    """
+    if importlib.util.find_spec("tornado") is None:
+        raise MissingPackageError(
+            "--web needs the Python package tornado; install it with: pip install tornado, or "
+            "apt install python3-tornado"
+        )
+    from relay_autotune.web.address import address_of
+
+    address_of(options.web_address)

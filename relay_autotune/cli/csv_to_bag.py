@@ -14,8 +14,8 @@ from pathlib import Path
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.cli.analysis_arguments import add_times
 from relay_autotune.cli.arguments import DONE, finite, guarded, say
+from relay_autotune.cli.jobs import add_times
 from relay_autotune.errors import BagError, SelectionError
 
 PROGRAM = "csv_to_bag"

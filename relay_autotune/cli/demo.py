@@ -23,10 +23,9 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.models import model_fields
 from relay_autotune.process.transfer_function import TransferFunction, process_text
-from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.report import write_page, write_picture
-from relay_autotune.report.case import case_of
+from relay_autotune.report.case import Case, case_of
 from relay_autotune.result import Analysis
 from relay_autotune.text import digits
 
@@ -201,7 +200,8 @@ def _finish(output: Path, live: Any) -> int:
     found = analyse(recording.experiments[0])
     if found.model is None or found.best_gains is None:
         raise DemoError(f"nothing was identified: {found.reason}")
-    _compare(found)
+    case = case_of(found, str(output / "bag"), truth=TRUTH)
+    _compare(case)
     gains = found.best_gains
     same = (live.kc, live.ti, live.ms) == (gains.kc, gains.ti, gains.ms)
     print(
@@ -211,7 +211,6 @@ def _finish(output: Path, live: Any) -> int:
     result = document(str(output / "bag"), [found])
     result["truth"] = model_fields(TRUTH)
     (output / "result.json").write_text(to_json(result) + "\n")
-    case = case_of(found, str(output / "bag"), truth=TRUTH)
     write_picture(case, output / "figure.png", title=picture_title(found))
     write_page([case], output / "report.html", title=PAGE_TITLE)
     print(f"Left in {output}/: bag/, result.json, figure.png, report.html")
@@ -228,37 +227,18 @@ def picture_title(found: Analysis) -> str:
     return f"Relay test: {found.model.model}  (true: {TRUTH})"
 
 
-def _compare(found: Analysis) -> None:
-    model, gains, truth = found.model, found.best_gains, ultimate_point(TRUTH)
+def _compare(case: Case) -> None:
+    model, gains = case.model, case.best_gains
     assert model is not None
     assert gains is not None
-    assert truth is not None
-    true = (TRUTH.gain, TRUTH.time_constants[0].real, TRUTH.dead_time)
     print("The process and what was identified (waveform fit):")
     print("                      true   identified     95 % interval          error")
-    rows = [
-        (name, value, estimate, (low, high))
-        for name, value, estimate, low, high in zip(
-            ("gain y/u", "time constant s", "dead time s"),
-            true,
-            model.values,
-            model.ci95_low,
-            model.ci95_high,
-            strict=True,
-        )
-    ]
-    for name, value, estimate, std in (
-        ("K_u u/y", truth.gain, model.ultimate_gain, model.ultimate_gain_std),
-        ("w_u rad/s", truth.frequency, model.ultimate_frequency, model.ultimate_frequency_std),
-    ):
-        rows.append(
-            (name, value, estimate, (estimate - NORMAL_95 * std, estimate + NORMAL_95 * std))
-        )
-    for name, value, estimate, (low, high) in rows:
-        interval = f"{digits(low)} to {digits(high)}"
-        error = 100.0 * (estimate / value - 1.0)
-        found_text = f"{digits(estimate):>10}     {interval:<20} {error:+.2f} %"
-        print(f"  {name:<16} {value:>7.4g}   {found_text}")
+    names = ("gain y/u", "time constant s", "dead time s", "K_u u/y", "w_u rad/s")
+    for name, found in zip(names, (*model.estimates, *model.ultimate), strict=True):
+        interval = f"{digits(found.low)} to {digits(found.high)}"
+        error = 100.0 * (found.value / found.truth - 1.0)
+        found_text = f"{digits(found.value):>10}     {interval:<20} {error:+.2f} %"
+        print(f"  {name:<16} {found.truth:>7.4g}   {found_text}")
     kind, derivative = ("PID", f", td {digits(gains.td)} s") if gains.td else ("PI", "")
     print(f"{kind} gains ({gains.reason}):")
     print(

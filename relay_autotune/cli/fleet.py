@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from relay_autotune.cli.arguments import DONE, deserved, worst
-from relay_autotune.cli.replay_bag import Done, Job, died, work
+from relay_autotune.cli.jobs import Done, Job, died, work
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
@@ -231,7 +231,7 @@ def _pyarrow() -> Any:
 _CONNECT_S = 10.0
 _PRELOADED = [
     f"relay_autotune.{name}"
-    for name in ("threads", "analysis", "bag.reader", "cli.replay_bag", "exchange.document")
+    for name in ("threads", "analysis", "bag.reader", "cli.jobs", "exchange.document")
 ]
 
 Work = Callable[[Job], Done]

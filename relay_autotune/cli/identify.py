@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import itertools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from relay_autotune.cli.arguments import DONE, finite, guarded
+from relay_autotune.cli.arguments import DONE, finite, guarded, with_negative
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
 from relay_autotune.errors import ParameterError, SelectionError, look_up
@@ -330,21 +329,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    given = _joined(list(sys.argv[1:] if arguments is None else arguments))
-    options = _parser().parse_args(given)
+    given = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(with_negative(given))
     return guarded(PROGRAM, lambda: _run(options))
-
-
-def _joined(arguments: list[str]) -> list[str]:
-    """Join an option and a negative number after it; argparse would take -1e-3 for an option."""
-    joined: list[str] = []
-    for before, argument in itertools.pairwise(["", *arguments]):
-        negative = argument[:1] == "-" and argument[1:2] in tuple("0123456789.")
-        if negative and before[:2] == "--" and "=" not in before:
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -19,9 +19,16 @@ import yaml
 from relay_autotune.cli.apply_gains import apply_at, beside
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
 from relay_autotune.cli.export import Target
-from relay_autotune.cli.new_loop import PROGRAM, START_WITHIN
-from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, own_node, ros_arguments
-from relay_autotune.cli.terminal import Working, agrees, asked, labelled, number_of, pair_of, width
+from relay_autotune.cli.own_nodes import (
+    PROGRAM,
+    START_WITHIN,
+    OwnNodes,
+    own_namespace,
+    own_node,
+    ranges,
+    ros_arguments,
+)
+from relay_autotune.cli.terminal import Working, agrees, asked, number_of, pair_of, tell, width
 from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
@@ -272,8 +279,7 @@ class JointTune:
             "relay_on": "setpoint",
             "setpoint": self._loop.state.reference,
             # The levels are references, which have the limits of the measurement.
-            "command_min": self._within[0],
-            "command_max": self._within[1],
+            **ranges(None, self._within),
         }
 
     def _at_controller(self) -> tuple[dict[str, str], dict[str, Any]]:
@@ -286,8 +292,7 @@ class JointTune:
             "command_type": COMMAND_TYPE,
             "command_field": loop.reference_field,
             "command_message": json.dumps(loop.reference_alone),
-            "measurement_min": self._within[0],
-            "measurement_max": self._within[1],
+            **ranges(self._within, None),
         }
 
     def _opened_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
@@ -304,7 +309,6 @@ class JointTune:
         }
         held = json.dumps([0.0 if math.isnan(value) else value for value in self._held])
         place = self._forward.needs.index(loop.interface)
-        low, high = self._command_within or (-math.inf, math.inf)
         values = {
             "measurement_type": kind,
             "measurement_field": field,
@@ -312,10 +316,7 @@ class JointTune:
             "command_field": f"data[{place}]",
             "command_message": json.dumps(f"{{data: {held}}}"),
             "baseline": self._baseline,
-            "measurement_min": self._within[0],
-            "measurement_max": self._within[1],
-            "command_min": low,
-            "command_max": high,
+            **ranges(self._within, self._command_within),
             "use_sim_time": loop.is_simulated,
         }
         if loop.measured == "position" and loop.commanded != "position":
@@ -511,7 +512,7 @@ class JointTune:
                 f"follows",
             ),
         ):
-            print("\n".join(labelled(label, text, width())))
+            tell(label, text)
         if loop.follows:
             # In one line, so that it can be copied.
             print(f"  {self._short_trajectory(gains.settling_time)}")

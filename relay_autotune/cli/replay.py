@@ -12,11 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from relay_autotune.bag.reader import may_be_recording
-from relay_autotune.cli.analysis_arguments import add_analysis, add_export, export_target, jobs_of
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, guarded, say, worst
+from relay_autotune.cli.arguments import DONE, DOUBTFUL, add_web, check_web, guarded, say, worst
 from relay_autotune.cli.export import write
-from relay_autotune.cli.page import add_web, check_web, show
-from relay_autotune.cli.replay_bag import Done, Job, replay
+from relay_autotune.cli.jobs import (
+    Done,
+    Job,
+    add_analysis,
+    add_export,
+    export_target,
+    jobs_of,
+    replay,
+    show,
+)
 from relay_autotune.cli.report import (
     add_present,
     as_asked,

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.analysis import analyse
-from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
@@ -29,7 +28,7 @@ from relay_autotune.cli.arguments import (
     say,
     typed_as,
 )
-from relay_autotune.cli.replay_bag import Job, analysed
+from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of
 from relay_autotune.cli.terminal import ProgressLine, Stages
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller

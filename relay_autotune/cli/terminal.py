@@ -110,6 +110,15 @@ def labelled(
     return [f"{head if i == 0 else '':<{indent}}{part}".rstrip() for i, part in enumerate(parts)]
 
 
+def tell(label: str, text: str) -> None:
+    """Print text beside its label, on lines as wide as the terminal.
+
+    :param label: stands on the first line.
+    :param text: see :func:`broken`.
+    """
+    print("\n".join(labelled(label, text, width())), flush=True)
+
+
 def in_columns(rows: Sequence[Sequence[str]], columns: int) -> list[str]:
     """Return a table: the first cell of each row to the left, the others to the right.
 

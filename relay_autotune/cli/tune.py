@@ -12,21 +12,23 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from relay_autotune.cli.analysis_arguments import (
-    add_design,
-    add_export,
-    design_options,
-    export_target,
+from relay_autotune.cli.arguments import (
+    DONE,
+    NOTHING_FOUND,
+    add_web,
+    check_web,
+    finite,
+    guarded,
+    say,
+    with_negative,
 )
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded, say
 from relay_autotune.cli.export import exported, write
-from relay_autotune.cli.page import add_web, check_web, show
+from relay_autotune.cli.jobs import add_design, add_export, design_options, export_target, show
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.cli.terminal import in_columns, labelled, width
 from relay_autotune.errors import ModelError, SelectionError, TuningError
@@ -251,12 +253,9 @@ def _coefficients(name: str, values: Any) -> list[float]:
 
 
 _HEADINGS = ("kc", "ti", "td", "Ms", "Mt", "GM", "PM", "IAE")
-_NAMES = {"parallel": ("p", "i", "d"), "isa": _HEADINGS[:3], "series": _HEADINGS[:3]}
-_UNITS = {
-    "parallel": ("u/y", "u/(y s)", "u s/y"),
-    "isa": ("u/y", "s", "s"),
-    "series": ("u/y", "s", "s"),
-}
+# The numbers of gains in each form, with their units.
+_ISA = {"kc": "u/y", "ti": "s", "td": "s"}
+_NUMBERS = {"isa": _ISA, "series": _ISA, "parallel": {"p": "u/y", "i": "u/(y s)", "d": "u s/y"}}
 _UNITS_JUDGED = ("", "", "", "deg", "y s/u")
 
 
@@ -284,11 +283,8 @@ def further_forms(gains: Gains, form: str) -> list[tuple[str, str]]:
     if form != "series":
         return []
     series = series_form(gains)
-    numbers = (
-        f"kc {digits(series.kc)} u/y   ti {digits(series.ti)} s   "
-        f"td {digits(series.td)} s   alpha {digits(series.alpha, 3)}"
-    )
-    return [("series form", numbers)]
+    numbers = "   ".join(f"{n} {digits(getattr(series, n))} {unit}" for n, unit in _ISA.items())
+    return [("series form", f"{numbers}   alpha {digits(series.alpha, 3)}")]
 
 
 def side_by_side(
@@ -308,11 +304,11 @@ def side_by_side(
     """
     rows: list[tuple[str, ...]] = []
     if gains:
-        rows.append(("", *_NAMES[form], *_HEADINGS[3:]))
+        rows.append(("", *_NUMBERS[form], *_HEADINGS[3:]))
         for k, each in enumerate(gains):
             mark = "* " if k == recommended else "  "
             rows.append((mark + each.rule, *_in_form(each, form), *_judged(each)))
-        rows.append(("", *_UNITS[form], *_UNITS_JUDGED))
+        rows.append(("", *_NUMBERS[form].values(), *_UNITS_JUDGED))
     if inside:
         rows.append(("",) * 9)
         rows.append(("with a model inside", *("",) * 8))
@@ -346,17 +342,11 @@ def _judged(found: Gains | Performance) -> tuple[str, ...]:
 
 
 def _in_form(gains: Gains, form: str) -> tuple[str, ...]:
-    if form == "parallel":
-        found = gains.p, gains.i, gains.d
-    elif form == "series":
-        try:
-            series = series_form(gains)
-        except TuningError:
-            return "no", "series", "form"
-        found = series.kc, series.ti, series.td
-    else:
-        found = gains.kc, gains.ti, gains.td
-    return tuple(digits(x) for x in found)
+    try:
+        found = series_form(gains) if form == "series" else gains
+    except TuningError:
+        return "no", "series", "form"
+    return tuple(digits(getattr(found, name)) for name in _NUMBERS[form])
 
 
 PROGRAM = "tune"
@@ -380,8 +370,6 @@ Examples:
   replay --json bag | tune - --export pid_controller --dof heater > gains.yaml
 """
 
-_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
-
 
 class _Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line."""
@@ -398,9 +386,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: the exit status.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    # argparse takes -1e-3 for an option, but not an argument that begins with a blank.
     parser = _parser()
-    options = parser.parse_args([f" {a}" if _NEGATIVE.match(a) else a for a in given])
+    options = parser.parse_args(with_negative(given))
     return guarded(PROGRAM, lambda: _run(parser, options))
 
 

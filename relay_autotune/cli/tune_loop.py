@@ -16,9 +16,6 @@ doubtful. With --verify it is 1, too, where the gains did not pass.
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import shlex
 import signal
 import sys
 import time
@@ -26,26 +23,17 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from typing import TYPE_CHECKING
 
-from relay_autotune.cli.after_tune import (
-    PATIENCE,
-    HandedOver,
-    hand_over,
-    left,
-    left_its_limits,
-    prefix,
-    repeated,
-)
 from relay_autotune.cli.arguments import (
-    DONE,
     NOTHING_FOUND,
     USAGE,
-    deserved,
+    add_web,
+    check_web,
     finite,
     guarded,
     say,
 )
 from relay_autotune.cli.export import EXPORTS
-from relay_autotune.cli.new_loop import (
+from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
     add_joint,
@@ -53,29 +41,14 @@ from relay_autotune.cli.new_loop import (
     is_new_loop,
     is_of_joint,
     nodes_for,
+    own_namespace,
     with_flags,
 )
-from relay_autotune.cli.own_nodes import own_namespace
-from relay_autotune.cli.page import add_web, check_web
 from relay_autotune.cli.terminal import Help, Working, agrees, width
-from relay_autotune.cli.tune_view import (
-    TICK,
-    Paint,
-    Shown,
-    check_lines,
-    document,
-    follow,
-    next_commands,
-    result_lines,
-    wants_colour,
-)
-from relay_autotune.errors import ParameterError, RelayAutotuneError
-from relay_autotune.verdict import Verdict
+from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
+from relay_autotune.errors import ParameterError
 
 if TYPE_CHECKING:
-    from relay_autotune.cli.joint_tune import JointTune
-    from relay_autotune.cli.own_nodes import OwnNodes
-    from relay_autotune.loop.gains import Controller
     from relay_autotune.nodes.tune_client import TuneClient
 # Parts of the checklist's lines on rest while few samples have come, and on the model while
 # identifier_node is not discovered.
@@ -255,12 +228,15 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
                 shown.clear()
         finally:
             wait_again()
+        # Imported here, because it loads slowly and must not delay a tune.
+        from relay_autotune.cli.after_tune import AfterTune
+
         # The tune is over, so a signal may end the command at once.
         for number in heeded:
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
-            return _conclude(client, options, nodes, joint)
+            return AfterTune(client, options, _parser(), nodes, joint).conclude()
         except OSError:
             # The terminal is closed.
             if signal.SIGHUP in interrupted:
@@ -287,118 +263,6 @@ def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float)
         say(PROGRAM, f"{client.name} refuses: {client.result.reason}")
         return False
     return agrees("Start the tune?", yes=options.yes)
-
-
-def _conclude(
-    client: TuneClient,
-    options: argparse.Namespace,
-    nodes: OwnNodes | None,
-    joint: JointTune | None,
-) -> int:
-    """Show the result, and hand the gains over; return the exit status.
-
-    :param client: with the result.
-    :param options: of the command line.
-    :param nodes: of this command; None: they were there.
-    :param joint: to whose controller the gains go; None: it is a loop of two topics.
-    """
-    result, cancelled = client.result, client.cancelled
-    for refused in sorted(client.refused):
-        say(PROGRAM, refused)
-    if not result.experiment.experiment_id:
-        return _nothing_started(client, options)
-    outside = left_its_limits(client, options)
-    if not options.json:
-        paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-        new = nodes is not None and joint is None
-        told = left(result, options.at, outside) if new else ""
-        print("\n".join(result_lines(result, cancelled, paint, width(), told)), flush=True)
-    flags, report = _afterwards(client, options, joint)
-    # Gains of nodes that end with this command cannot be asked for later.
-    controllers = client.controllers() if nodes is None else []
-    done = HandedOver()
-    if options.json:
-        print(json.dumps(document(result, client.name, cancelled, report)))
-    else:
-        if nodes is not None and result.gains.experiment_id:
-            done = hand_over(client, options, _parser(), nodes, joint)
-        steps = done.steps + next_commands(result, controllers, prefix(), flags, report)
-        steps += repeated(result, options, _parser(), done.proven, outside)
-        if steps:
-            print("\nNext:")
-        for what, command in steps:
-            print(f"  {what:<26} {command}")
-    complete = result.gains.experiment_id or options.record_only
-    written = report or not options.report
-    found = client.succeeded and complete and written and done.proven is not False
-    return deserved(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
-
-
-def _nothing_started(client: TuneClient, options: argparse.Namespace) -> int:
-    """Print the result of a dry run, or why the node refuses."""
-    reason, checks = client.result.reason, list(client.result.checks)
-    if options.json:
-        told = {"accepted": client.succeeded, "reason": reason, "checks": checks}
-        print(json.dumps({"node": client.name} | told))
-    elif checks:
-        print("\n".join(check_lines(checks, width())))
-    if client.succeeded and not options.json:
-        again = [word for word in options.typed if word != "--dry-run"]
-        print(f"\nNext:\n  {'start it':<26} {prefix()}{shlex.join((PROGRAM, *again))}")
-    if not client.succeeded:
-        say(PROGRAM, f"{client.name} refuses: {reason}")
-    return DONE if client.succeeded else NOTHING_FOUND
-
-
-def _present(client: TuneClient, joint: JointTune | None) -> Controller | None:
-    """Return the gains in force in the loop's controller; None: they are not known."""
-    from relay_autotune.nodes.gains_client import GainsClient
-
-    try:
-        if joint is not None:
-            return joint.present()
-        for name in client.controllers()[:1]:
-            with GainsClient("", name, beside=client) as loop:
-                return loop.in_force()
-    except RelayAutotuneError:
-        # The report is as good without them.
-        pass
-    return None
-
-
-def _afterwards(
-    client: TuneClient, options: argparse.Namespace, joint: JointTune | None
-) -> tuple[str, str]:
-    """Write the report if it is wanted; return the flags for `replay`, and the report's name."""
-    result = client.result
-    with Working("asking identifier_node for its parameters"):
-        # Imported here, because it loads slowly and must not delay a tune.
-        from relay_autotune.cli.report import defaults, flags_of, report_of_tune
-
-        values = None if options.record_only else client.identifier_values(PATIENCE)
-    flags = flags_of(values) if values is not None else ""
-    if not options.report:
-        return flags, ""
-    try:
-        if values is None:
-            say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
-        with Working("writing the report"):
-            told = report_of_tune(
-                client.record(PATIENCE),
-                values or defaults(),
-                result,
-                result.bag or client.name,
-                options.report,
-                _present(client, joint),
-            )
-    except RelayAutotuneError as error:
-        say(PROGRAM, f"no report: {error}")
-        return flags, ""
-    if told:
-        say(PROGRAM, told)
-    if not options.json:
-        print(f"  {'report':<16} {options.report}")
-    return flags, str(options.report)
 
 
 if __name__ == "__main__":

@@ -17,14 +17,14 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from relay_autotune.cli.apply_gains import verdict_lines
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, worst
 from relay_autotune.cli.export import Target, exported, exports_of
-from relay_autotune.cli.new_loop import PROGRAM
+from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.terminal import WIDEST
 from relay_autotune.cli.tune_view import (
@@ -196,10 +196,9 @@ class _LoopOnPage:
         result = self._client.check(self._options.amplitude)
         accepted = self._client.succeeded
         self._live.forget_wishes()
-        self._live.tell(
-            phase="idle",
-            status="a tune can start" if accepted else f"refused: {result.reason}",
-            tone="good" if accepted else "bad",
+        self._live.rest(
+            "a tune can start" if accepted else f"refused: {result.reason}",
+            good=accepted,
             checks=tuple(check_lines(list(result.checks), WIDEST)),
             checked=self._live.told.checked + 1,
             accepted=accepted,
@@ -226,7 +225,7 @@ class _LoopOnPage:
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
         if not result.experiment.experiment_id:
-            live.tell(phase="idle", status=f"refused: {result.reason}", tone="bad")
+            live.rest(f"refused: {result.reason}", good=False)
             return NOTHING_FOUND
         lines = result_lines(result, client.cancelled, Paint())
         print("\n".join(lines), flush=True)
@@ -242,11 +241,7 @@ class _LoopOnPage:
             self._add_subject(result)
         done = client.succeeded and bool(result.gains.experiment_id)
         live.forget_wishes()
-        live.tell(
-            phase="idle",
-            tone="good" if done else "bad",
-            status="the tune is complete" if done else f"no gains: {result.reason}",
-        )
+        live.rest("the tune is complete" if done else f"no gains: {result.reason}", good=done)
         return deserved(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
 
     # The progress of a tune, see `follow`.
@@ -355,6 +350,7 @@ _LOOK_EVERY = 3.0
 _COLUMNS = 60
 
 
+@dataclass
 class GainsPage:
     """Gains of the page in the loop's controller_node.
 
@@ -365,22 +361,15 @@ class GainsPage:
     :param leave: returns True when a verification is to end.
     """
 
-    def __init__(
-        self,
-        client: TuneClient,
-        live: Live,
-        page: Page,
-        number: int,
-        leave: Callable[[], bool],
-    ) -> None:
-        self._client = client
-        self._live = live
-        self._page, self._number = page, number
-        self._leave = leave
-        self._controller: GainsClient | None = None
-        self._looked = -math.inf
-        # The usual step [y]; None: to be read anew.
-        self._step: float | None = None
+    client: TuneClient
+    live: Live
+    page: Page
+    number: int
+    leave: Callable[[], bool]
+    _controller: GainsClient | None = None
+    _looked: float = -math.inf
+    # The usual step [y]; None: to be read anew.
+    _step: float | None = None
 
     def close(self) -> None:
         """Leave the controller."""
@@ -395,15 +384,15 @@ class GainsPage:
 
     def look(self) -> None:
         """Read the gains in force, and show them beside the new ones."""
-        found = self._client.controllers()
+        found = self.client.controllers()
         if self._controller is None or self._controller.name not in found:
             self.close()
             if found:
-                self._controller = GainsClient("", found[0], beside=self._client)
-        controller, told = self._controller, self._live.told
+                self._controller = GainsClient("", found[0], beside=self.client)
+        controller, told = self._controller, self.live.told
         if controller is None:
             if told.controller:
-                self._live.tell(controller="", present="", step=math.nan)
+                self.live.tell(controller="", present="", step=math.nan)
         else:
             try:
                 present = controller.in_force()
@@ -417,9 +406,9 @@ class GainsPage:
             said = _said(present)
             now = {"controller": controller.name, "present": said, "step": self._step}
             if any(getattr(told, name) != value for name, value in now.items()):
-                self._live.tell(**now)
-            for subject in self._page.subjects:
-                if subject.loop == self._number and subject.case.present != present:
+                self.live.tell(**now)
+            for subject in self.page.subjects:
+                if subject.loop == self.number and subject.case.present != present:
                     subject.case = replace(subject.case, present=present)
         self._looked = time.monotonic()
 
@@ -433,7 +422,7 @@ class GainsPage:
 
         :param wish: to apply, verify or revert.
         """
-        live, controller = self._live, self._controller
+        live, controller = self.live, self._controller
         live.forget_wishes()
         try:
             if controller is None:
@@ -441,15 +430,15 @@ class GainsPage:
             controller.find(_FOUND_WITHIN)
             self._do(wish, controller)
         except RelayAutotuneError as error:
-            live.tell(phase="idle", tone="bad", status=str(error))
+            live.rest(str(error), good=False)
         live.forget_wishes()
         self.look()
 
     def _do(self, wish: Wish, controller: GainsClient) -> None:
-        live = self._live
+        live = self.live
         if wish.what == REVERT:
             live.tell(phase="applying", tone="", status="bringing back the gains before", proof=())
-            live.tell(phase="idle", tone="good", status=controller.ask("revert"))
+            live.rest(controller.ask("revert"), good=True)
             return
         settles = 0.0
         with controller.accepting_doubtful() if wish.doubtful else nullcontext():
@@ -467,15 +456,15 @@ class GainsPage:
             if wish.step:
                 self._verify(wish, controller, settles)
             else:
-                live.tell(phase="idle", tone="good", status=f"{told}; they are not verified")
+                live.rest(f"{told}; they are not verified", good=True)
 
     def _message(self, wish: Wish) -> tuple[Any, float]:
         """Return the gains that the page shows as a message, and how long they take to settle."""
-        if wish.asked is None or not 0 <= wish.of < len(self._page.subjects):
+        if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
             raise TuningError("there are no such gains")
-        subject: Subject = self._page.subjects[wish.of]
-        if subject.loop != self._number:
-            raise TuningError(f"the gains are for another loop than {self._live.told.node}")
+        subject: Subject = self.page.subjects[wish.of]
+        if subject.loop != self.number:
+            raise TuningError(f"the gains are for another loop than {self.live.told.node}")
         shaped = subject.shaped(wish.asked)
         gains, judgement = shaped.gains, shaped.judgement
         if judgement.verdict is not Verdict.TRUSTED and not wish.doubtful:
@@ -485,18 +474,17 @@ class GainsPage:
         return message, gains.settling_time if math.isfinite(gains.settling_time) else 0.0
 
     def _verify(self, wish: Wish, controller: GainsClient, settles: float) -> None:
-        live = self._live
+        live = self.live
         live.tell(phase="verifying", tone="warn", proof=())
         live.show("proof", [])
         result = controller.prove(
-            wish.step, 0.0, settles, _REST_WITHIN, lambda text: live.tell(status=text), self._leave
+            wish.step, 0.0, settles, _REST_WITHIN, lambda text: live.tell(status=text), self.leave
         )
         live.show("proof", [_document(step) for step in controller.steps_of(result)])
         present = controller.in_force()
-        live.tell(
-            phase="idle",
-            tone="good" if result.passed else "bad",
-            status=f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
+        live.rest(
+            f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
+            good=result.passed,
             proof=tuple(verdict_lines(result, present, _COLUMNS)),
         )
 

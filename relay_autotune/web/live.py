@@ -139,6 +139,15 @@ class Live:
             self._told = replace(self._told, **changed)
             self._is_new = True
 
+    def rest(self, status: str, *, good: bool, **changed: Any) -> None:
+        """Tell that nothing is done any more, and how the last thing went.
+
+        :param status: a sentence.
+        :param good: whether it went well.
+        :param changed: other fields of `Told`.
+        """
+        self.tell(phase="idle", status=status, tone="good" if good else "bad", **changed)
+
     def show(self, name: str, document: Any) -> None:
         """Show curves that change seldom.
 

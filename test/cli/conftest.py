@@ -9,4 +9,4 @@ from analysed import analysed_once
 
 @pytest.fixture(autouse=True)
 def recordings_are_analysed_once(monkeypatch):
-    monkeypatch.setattr("relay_autotune.cli.replay_bag.analyse", analysed_once)
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", analysed_once)

@@ -25,7 +25,7 @@ from relay_autotune.analysis import Task
 from relay_autotune.bag.signals import Selection
 from relay_autotune.cli import fleet, replay
 from relay_autotune.cli.fleet import COLUMNS, ResultsFile, in_processes, on_cluster, rows
-from relay_autotune.cli.replay_bag import Job
+from relay_autotune.cli.jobs import Job
 from relay_autotune.errors import BagError
 
 STEP = REPOSITORY / "bags" / "step_test"
@@ -230,7 +230,7 @@ def test_a_defect_in_one_bag_does_not_stop_the_others(tmp_path, capsys, monkeypa
     def fail(path, *rest):
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr("relay_autotune.cli.replay_bag.read_experiments", fail)
+    monkeypatch.setattr("relay_autotune.cli.jobs.read_experiments", fail)
     status, out, err = run(capsys, "--json", "a", "b", *QUICK)
     assert status == 1
     errors = [json.loads(line)["error"] for line in out.splitlines()]

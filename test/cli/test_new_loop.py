@@ -19,10 +19,10 @@ import pytest
 import yaml
 from made_experiments import record_of
 
-from relay_autotune.cli import proof, report, tune_loop
-from relay_autotune.cli.after_tune import hand_over, left, left_its_limits, prefix, repeated
+from relay_autotune.cli import report, tune_loop
+from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.export import EXPORTS
-from relay_autotune.cli.new_loop import (
+from relay_autotune.cli.own_nodes import (
     add_new_loop,
     is_new_loop,
     is_of_joint,
@@ -242,16 +242,20 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
         f"{prefix()}tune_loop --measurement /tank/level --command /tank/valve "
         f"--at 2 --within 30 50 --command-within 0 5"
     )
+    inside = SimpleNamespace(measurement=np.array([40.0]))
+
+    def repeated(result: Any, proven: bool | None) -> list[tuple[str, str]]:
+        client: Any = SimpleNamespace(result=result, record=lambda patience: inside)
+        return AfterTune(client, given, parser).repeated(proven)
+
     silent = ended("no measurement on /tank/level for 1.01 s")
-    (what, command), (then, told) = repeated(silent, given, parser, None, False)
+    (what, command), (then, told) = repeated(silent, None)
     assert (what, command, then) == ("run it again", again, "if it happens again")
     assert "ros2 topic hz /tank/level" in told and "the load of the machine" in told
-    assert repeated(ended("cancelled"), given, parser, None, False) == [("run it again", again)]
+    assert repeated(ended("cancelled"), None) == [("run it again", again)]
     found = ended("", gains=PidGains(experiment_id="x"))
-    assert repeated(found, given, parser, None, False) == [
-        ("prove the gains", f"{again} --verify")
-    ]
-    assert repeated(found, given, parser, True, False) == []
+    assert repeated(found, None) == [("prove the gains", f"{again} --verify")]
+    assert repeated(found, True) == []
 
 
 @pytest.fixture
@@ -292,12 +296,12 @@ def shown(
     def show(passed: bool | None, against: str, *answers: str, command_type: str = FLOAT64) -> str:
         typed.extend(answers)
         kinds["command_type"] = command_type
-        monkeypatch.setattr(proof, "_offered", lambda *_: proof.Outcome(passed, against))
-        done = hand_over(client, given, parser, nodes, None)
-        assert done.proven is passed
+        monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
+        proven, steps = AfterTune(client, given, parser, nodes).hand_over()
+        assert proven is passed
         assert not typed
         told = " ".join(capsys.readouterr().out.split())
-        return " ".join([told, "NEXT", *(word for step in done.steps for word in step)])
+        return " ".join([told, "NEXT", *(word for step in steps for word in step)])
 
     return show
 
@@ -382,9 +386,10 @@ def test_after_the_process_was_driven_away_the_same_command_is_not_offered_again
     client: Any = SimpleNamespace(
         result=result, record=lambda patience: SimpleNamespace(measurement=last)
     )
-    assert left_its_limits(client, given) is outside
-    assert left_at in left(result, 1040.0, outside)
-    ((name, told),) = repeated(result, given, parser, None, outside)
+    tune = AfterTune(client, given, parser)
+    assert tune.left_its_limits is outside
+    assert left_at in tune.left()
+    ((name, told),) = tune.repeated(None)
     assert name == next_step
     assert ("1040" in told) == (next_step == "run it again")
 

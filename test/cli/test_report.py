@@ -50,7 +50,7 @@ def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path, monkeypatch) -
         asked.append((wanted.controller, wanted.ms, wanted.loop_delay))
         return completed()
 
-    monkeypatch.setattr("relay_autotune.cli.replay_bag.analyse", analyse)
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", analyse)
     write_csv(tmp_path / "log.csv")
     page, folder = tmp_path / "page.html", tmp_path / "figures"
     facts = ("--structure", "fopdt", "--loss", "huber", "--rule", "imc", "--title", "Tank 7")
@@ -75,7 +75,7 @@ def test_several_recordings_of_one_process_have_one_model(capsys, tmp_path, monk
         asked.append((len(records), how["method"]))
         return completed()
 
-    monkeypatch.setattr("relay_autotune.cli.replay_bag.analyse_jointly", analyse_jointly)
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse_jointly", analyse_jointly)
     names = (tmp_path / "a.csv", tmp_path / "b.csv")
     for name in names:
         write_csv(name)
@@ -141,7 +141,7 @@ def test_what_does_not_fit_is_said_in_a_line(
 
 def test_replay_writes_the_report_beside_its_table(capsys, tmp_path, monkeypatch) -> None:
     only(monkeypatch, "uncertainty")
-    monkeypatch.setattr("relay_autotune.cli.replay_bag.analyse", lambda record, **_: completed())
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", lambda record, **_: completed())
     write_csv(tmp_path / "log.csv")
     page = tmp_path / "page.html"
     assert replay.main([str(tmp_path / "log.csv"), "--report", str(page)]) == 0

@@ -18,7 +18,7 @@ from report_cases import only
 
 from relay_autotune.analysis import Task
 from relay_autotune.cli import tune_loop
-from relay_autotune.cli.analysis_arguments import add_analysis, jobs_of
+from relay_autotune.cli.jobs import add_analysis, jobs_of
 from relay_autotune.cli.report import defaults, flags_of, report_of_tune
 from relay_autotune.cli.tune_view import (
     OUTCOMES,

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from analysed import completed, doubted
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, worst
-from relay_autotune.cli.replay_bag import status_of
+from relay_autotune.cli.jobs import status_of
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.document import document
 from relay_autotune.exchange.messages import fill_gains

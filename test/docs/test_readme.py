@@ -18,6 +18,7 @@ from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, se
 
 from relay_autotune import start
 from relay_autotune.cli import demo
+from relay_autotune.report.case import case_of
 from tools.report_images import tune_as_the_demo
 
 
@@ -77,7 +78,7 @@ def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
 
 
 def test_the_demo_shown_is_the_one_computed(capsys: pytest.CaptureFixture[str]) -> None:
-    demo._compare(tune_as_the_demo())
+    demo._compare(case_of(tune_as_the_demo(), "demo", truth=demo.TRUTH))
     assert capsys.readouterr().out == block_noted("README.md", "made by the demo").text
 
 

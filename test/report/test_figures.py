@@ -17,8 +17,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.report import draw
 from relay_autotune.report.case import case_of, in_loop
-from relay_autotune.report.experiment import rate_of, switches_of
-from relay_autotune.report.figures import PLATES
+from relay_autotune.report.figures import PLATES, rate_of, switches_of
 from relay_autotune.report.frequency import distinct_gains, simulated, swept_area
 from relay_autotune.report.style import in_steps, inline, save, thinned
 from relay_autotune.tuning import DesignOptions, tune

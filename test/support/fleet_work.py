@@ -10,7 +10,7 @@ import signal
 import time
 from pathlib import Path
 
-from relay_autotune.cli.replay_bag import Done, Job
+from relay_autotune.cli.jobs import Done, Job
 
 
 def mark(job: Job) -> Done:

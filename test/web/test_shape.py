@@ -17,7 +17,7 @@ from served import REPOSITORY, analysed, subject_of
 
 from relay_autotune import tuning
 from relay_autotune.analysis import analyse
-from relay_autotune.cli import page, replay
+from relay_autotune.cli import arguments, replay
 from relay_autotune.cli.arguments import as_typed
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.laws import OWN_LAW
@@ -221,7 +221,7 @@ def test_a_command_without_the_page_loads_nothing_of_it():
 
 
 def test_a_missing_package_is_named_before_any_work(monkeypatch, capsys):
-    monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(arguments.importlib.util, "find_spec", lambda name: None)
     assert replay.main(["--web", "no_such_bag"]) == 1
     assert "pip install tornado" in capsys.readouterr().err
 

@@ -1,0 +1,478 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""From options to what is made of recordings: which part of them, how to identify, what to design.
+
+It is the same in this process, in another one and on another host.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relay_autotune.analysis import Task, analyse, analyse_jointly
+from relay_autotune.bag.limits import LARGEST_CHUNK
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
+from relay_autotune.cli.arguments import (
+    DEBUG,
+    NOTHING_FOUND,
+    USAGE,
+    add_quantities,
+    as_typed,
+    deserved,
+    finite,
+    given_quantities,
+    say,
+)
+from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of
+from relay_autotune.cli.table import table
+from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import ONLY_JOINT
+from relay_autotune.loop.laws import LAWS
+from relay_autotune.quantities import declared
+from relay_autotune.record.record import Record
+from relay_autotune.result import Analysis
+from relay_autotune.text import visible
+from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
+from relay_autotune.verdict import Verdict
+
+if TYPE_CHECKING:
+    from relay_autotune.loop.gains import Gains
+    from relay_autotune.report.case import Case
+    from relay_autotune.result import Shaping
+    from relay_autotune.web.shape import Asked
+
+Progress = Callable[[int, int], None]
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One bag to replay, or several that are one.
+
+    :param name: how results call it.
+    :param paths: the recordings; several are one timeline, or tests of one process.
+    :param selection: what of them is wanted.
+    :param task: how to identify, and what is asked of the controller.
+    :param jointly: whether the experiments of all recordings give one model.
+    :param table_width: columns of the table for people; None: the document is wanted instead.
+    :param export: the kind of file that is wanted instead, and where its gains go; None: none.
+    :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
+    """
+
+    name: str
+    paths: tuple[str, ...]
+    selection: Selection
+    task: Task
+    jointly: bool = False
+    table_width: int | None = None
+    export: tuple[str, Target] | None = None
+    accept_doubtful: bool = False
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a job.
+
+    :param name: that of the job.
+    :param status: the exit status that it deserves.
+    :param said: sentences for standard error.
+    :param text: the table, or the document on one line; empty: there is none.
+    """
+
+    name: str
+    status: int
+    said: tuple[str, ...]
+    text: str
+
+
+def work(job: Job) -> Done:
+    """Read, identify and tune; an error becomes part of the result.
+
+    :param job: what to do.
+    """
+    return replay(job)[0]
+
+
+def replay(
+    job: Job, progress: Progress | None = None, tell: Tell = lambda _: None
+) -> tuple[Done, tuple[Analysis, ...]]:
+    """Read, identify and tune; return also the analyses themselves.
+
+    :param job: what to do.
+    :param progress: told of how far a bag has been read.
+    :param tell: told of what the computation is at.
+    """
+    said: list[str] = []
+    try:
+        analyses = analysed(job, said, progress, tell)
+        if job.export is not None:
+            text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
+            return Done(job.name, status_of(analyses), tuple(said), text), analyses
+    except SelectionError as error:
+        return _failed(job, said, str(error), USAGE), ()
+    except RelayAutotuneError as error:
+        return _failed(job, said, str(error), NOTHING_FOUND), ()
+    except Exception as error:
+        if os.environ.get(DEBUG):
+            raise
+        why = f"{job.name} could not be analysed: {defect(error)}"
+        return _failed(job, said, why, NOTHING_FOUND), ()
+    status = status_of(analyses)
+    if status == NOTHING_FOUND:
+        # A model that a check contradicts is shown, with the reason why there are no gains.
+        said += [
+            f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}" for a in analyses
+        ]
+    return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
+
+
+def status_of(analyses: Sequence[Analysis]) -> int:
+    """Return the exit status that a bag deserves.
+
+    :param analyses: of its experiments.
+    """
+    return deserved(
+        found=any(a.models and not a.judgement.contradicted for a in analyses),
+        doubtful=any(a.verdict is Verdict.DOUBTFUL for a in analyses),
+    )
+
+
+def analysed(
+    job: Job, said: list[str], progress: Progress | None = None, tell: Tell = lambda _: None
+) -> tuple[Analysis, ...]:
+    """Read, identify and tune.
+
+    :param job: what to do.
+    :param said: gets sentences for standard error.
+    :param progress: told of how far a bag has been read.
+    :param tell: told of what the computation is at.
+    :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
+    """
+    if job.jointly:
+        records: list[Record] = []
+        for path in job.paths:
+            recording = read_experiments(path, job.selection, progress)
+            said += [f"{path}: {note}" for note in recording.notes]
+            records += recording.experiments
+        return (analyse_jointly(records, **vars(job.task)),)
+    recording = read_experiments(job.paths, job.selection, progress)
+    said += [f"{job.name}: {note}" for note in recording.notes]
+    return tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
+
+
+def _exported(
+    analyses: Sequence[Analysis], how: str, target: Target, *, accept_doubtful: bool
+) -> str:
+    """Return the gains as a file; there must be those of one experiment alone."""
+    found = [a for a in analyses if a.best_gains is not None]
+    if not found:
+        why = analyses[0].reason if analyses else "there is no experiment"
+        raise RelayAutotuneError(f"no gains to export: {why}")
+    if len(found) > 1:
+        raise SelectionError(
+            f"{len(found)} experiments have gains and a file holds those of one: choose it by "
+            "--start and --end, or take all for tests of one process by --jointly"
+        )
+    only = found[0]
+    if only.verdict is not Verdict.TRUSTED and not accept_doubtful:
+        raise RelayAutotuneError(
+            f"gains are {only.verdict.name.lower()}: {only.judgement.reason}; give "
+            "--accept-doubtful to export them anyway"
+        )
+    assert only.best_gains is not None
+    if only.record.settings is not None:
+        target = replace(target, present=only.record.settings.baseline)
+    return exported(only.best_gains, how, target, doubt=only.judgement.reason).rstrip("\n")
+
+
+def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:
+    if job.table_width is not None:
+        if error is not None:
+            return ""
+        return table(job.name, analyses, job.table_width)
+    # Imported here, since a table for people does not need it.
+    from relay_autotune.exchange.document import document, to_json
+
+    return to_json(document(job.name, analyses, error=error))
+
+
+def _failed(job: Job, said: Sequence[str], why: str, status: int) -> Done:
+    why = visible(why, keep="\n")
+    sentence = (
+        why
+        if any(p in why for p in (job.name, *map(visible, job.paths)))
+        else f"{job.name}: {why}"
+    )
+    return Done(job.name, status, (*said, sentence), _text(job, (), sentence))
+
+
+def died(job: Job, how: str) -> Done:
+    """Return the result of a job that took its process down.
+
+    :param job: the job.
+    :param how: what happened, for people.
+    """
+    return _failed(job, (), f"{job.name}: {how}", NOTHING_FOUND)
+
+
+def add_design(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what is asked of a controller.
+
+    :param parser: of the command.
+    """
+    group = parser.add_argument_group("what is asked of the controller")
+    kind = group.add_mutually_exclusive_group()
+    kind.add_argument(
+        "--controller", choices=CONTROLLERS, help="auto is PI unless the rule finds PID worth it"
+    )
+    for each in ("pi", "pid"):
+        kind.add_argument(
+            f"--{each}",
+            dest="controller",
+            action="store_const",
+            const=each,
+            help=f"the same as --controller {each}",
+        )
+    add_quantities(group, (each for each in declared(DesignOptions) if each.name != "controller"))
+
+
+def design_options(options: argparse.Namespace) -> DesignOptions:
+    """Return what is asked of a controller.
+
+    :param options: with those of :func:`add_design`.
+    :raises SelectionError: if a value is out of its range.
+    """
+    given = given_quantities(options, declared(DesignOptions))
+    export = getattr(options, "export", None)
+    if "law" not in given and export in LAWS and export != WITHOUT_LAW:
+        given["law"] = export
+    return DesignOptions(**given)
+
+
+def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Add the options that say where gains go.
+
+    :param parser: of the command.
+    :return: the group that they are in.
+    """
+    group = parser.add_argument_group("gains as a file")
+    group.add_argument(
+        "--export",
+        choices=EXPORTS,
+        metavar="LAW",
+        help="print a file that other programs load instead: yaml, or of a law of --law, which "
+        "needs not be named again",
+    )
+    group.add_argument(
+        "--node", default="/pid_controller", metavar="NAME", help="whose file it is (%(default)s)"
+    )
+    group.add_argument(
+        "--dof", metavar="NAME", help="its degree of freedom (that of --joint, else joint)"
+    )
+    group.add_argument("--command-min", type=finite, metavar="U", help="lower clamp in it [u]")
+    group.add_argument("--command-max", type=finite, metavar="U", help="upper clamp in it [u]")
+    return group
+
+
+def export_target(options: argparse.Namespace) -> Target:
+    """Return where gains go.
+
+    :param options: with those of :func:`add_export`.
+    :raises SelectionError: if a name or a clamp cannot be.
+    """
+    limits = {n: getattr(options, n) for n in ("command_min", "command_max")}
+    given = {n: v for n, v in limits.items() if v is not None}
+    dof = options.dof or next(iter(getattr(options, "joint", ())), "joint")
+    return Target(node=options.node, dof=dof, **given)
+
+
+def add_analysis(parser: argparse.ArgumentParser) -> None:
+    """Add options: what is taken from a recording, how it is identified and tuned.
+
+    :param parser: of the command.
+    """
+    taken = parser.add_argument_group("what is taken from a recording")
+    for signal in ("measurement", "command"):
+        taken.add_argument(
+            f"--{signal}",
+            metavar="TOPIC[:FIELD]",
+            help=f"topic, or column of a CSV, of the {signal}",
+        )
+    add_times(taken)
+    taken.add_argument(
+        "--start", type=finite, metavar="S", help="leave out what is before S [s from the start]"
+    )
+    taken.add_argument(
+        "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
+    )
+    taken.add_argument(
+        "--command-before", type=finite, metavar="U",
+        help="command that held before the recording, where that begins with its step",
+    )  # fmt: skip
+    taken.add_argument(
+        "--clock", choices=CLOCKS, default=CLOCKS[0],
+        help="time of a message: when it was published, when it was recorded, or its header's "
+        "stamp (%(default)s)",
+    )  # fmt: skip
+    taken.add_argument(
+        "--join", action="store_true", help="take all BAGs as one recording on one timeline"
+    )
+    taken.add_argument(
+        "--joint", action="append", default=[], metavar="NAME",
+        help="find measurement and command of this joint by its name; of several, one after the "
+        "other",
+    )  # fmt: skip
+    taken.add_argument(
+        "--joint-order", metavar="NAME,NAME,...",
+        help="joints of commands that do not name them, as in the controller's parameter joints",
+    )  # fmt: skip
+    taken.add_argument(
+        "--jointly", action="store_true",
+        help="take all experiments as tests of one process, with one model",
+    )  # fmt: skip
+    taken.add_argument(
+        "--max-chunk", dest="largest_chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
+        help="leave out chunks that declare more than SIZE, such as 64M or 2G "
+        f"({LARGEST_CHUNK >> 20}M)",
+    )  # fmt: skip
+    how = parser.add_argument_group("identification and design")
+    how.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
+    add_quantities(how, declared(Known))
+    how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
+    add_design(parser)
+
+
+def add_times(parser: argparse._ActionsContainer) -> None:
+    """Add options: what a CSV file does not say of its times.
+
+    :param parser: of the command, or a group of its options.
+    """
+    parser.add_argument("--time", metavar="NAME", help="column of the time of a CSV")
+    parser.add_argument(
+        "--time-unit", choices=TIME_UNITS, help="its unit, where the CSV does not say it (s)"
+    )
+    parser.add_argument(
+        "--period", type=finite, metavar="S", help="time from row to row of a CSV without times"
+    )
+
+
+def _size(text: str) -> int:
+    match = re.fullmatch(r"(\d{1,12})([kMG]?)", text)
+    if match is None or int(match[1]) == 0:
+        raise argparse.ArgumentTypeError(f"expected a size such as 64M or 2G, found {text!r}")
+    return int(match[1]) << {"": 0, "k": 10, "M": 20, "G": 30}[match[2]]
+
+
+def jobs_of(
+    options: argparse.Namespace, recordings: Sequence[str], *, table_width: int | None = None
+) -> list[Job]:
+    """Return what is to be done with recordings, each once.
+
+    :param options: with those of :func:`add_analysis`.
+    :param recordings: their names.
+    :param table_width: columns of a table for people; None: documents are wanted instead.
+    :raises SelectionError: if options contradict each other, or a name is unknown.
+    """
+    try:
+        known = Known(**given_quantities(options, declared(Known)))
+        task = Task(options.method, options.rule, known, design_options(options))
+    except RelayAutotuneError as error:
+        raise SelectionError(str(error)) from error
+    start, end = options.start, options.end
+    if start is not None and end is not None and start >= end:
+        raise SelectionError(f"--start {start:g} is not before --end {end:g}")
+    joints = list(dict.fromkeys(options.joint)) or [""]
+    order = (
+        tuple(name.strip() for name in options.joint_order.split(","))
+        if options.joint_order
+        else ()
+    )
+    _check_joints(joints, order)
+    jointly = options.jointly or options.method in ONLY_JOINT
+    taken = {each.name: getattr(options, each.name) for each in fields(Selection)}
+    names = list(dict.fromkeys(recordings))
+    groups = [tuple(names)] if jointly or options.join else [(name,) for name in names]
+    return [
+        Job(
+            name=visible(", ".join(group) + (f" {joint}" if joint else "")),
+            paths=group,
+            selection=Selection(**taken | {"joint": joint, "joint_order": order}),
+            task=task,
+            jointly=jointly,
+            table_width=table_width,
+        )
+        for group in groups
+        for joint in joints
+        if group
+    ]
+
+
+def _check_joints(joints: Sequence[str], order: Sequence[str]) -> None:
+    """Refuse joints that cannot be.
+
+    :raises SelectionError: with what to write instead.
+    """
+    for joint in joints:
+        if joint and Path(joint).exists():
+            raise SelectionError(
+                f"--joint names a joint, but {joint} is a recording; to take all experiments as "
+                f"tests of one process, write --jointly"
+            )
+        if joint and order and joint not in order:
+            raise SelectionError(
+                f"--joint-order {','.join(order)} does not have the joint {joint}"
+            )
+    if order and not joints[0]:
+        raise SelectionError("--joint-order is for a joint: name it with --joint")
+    if len(set(order)) < len(order):
+        raise SelectionError(f"--joint-order {','.join(order)} names a joint twice")
+
+
+def show(
+    program: str,
+    parser: argparse.ArgumentParser,
+    options: argparse.Namespace,
+    models: Sequence[tuple[Case, Shaping | None]],
+) -> None:
+    """Serve a page with models to shape until Ctrl-C.
+
+    :param program: name of the command.
+    :param parser: that of the command.
+    :param options: as it parsed them.
+    :param models: the experiments, each with what the design of its gains takes.
+    :raises SelectionError: if the address cannot be used.
+    """
+    # Imported here: tornado is for --web alone.
+    from relay_autotune.web.address import address_of
+    from relay_autotune.web.server import Page, run
+    from relay_autotune.web.shape import Asked, Subject
+
+    rule, target = options.rule or Asked.rule, export_target(options)
+
+    def subject(case: Case, shaping: Shaping | None) -> Subject:
+        first = Asked.of(rule, shaping.task.options if shaping else DesignOptions())
+
+        def command(asked: Asked) -> str:
+            changed = asked.changed_from(first) | ({"law": None} if asked.law == "" else {})
+            return as_typed(
+                program, parser, options, web=None, web_address=None, export=None, **changed
+            )
+
+        return Subject(case, shaping, first, command)
+
+    subjects = [subject(case, shaping) for case, shaping in models]
+
+    def written(gains: Gains, how: str, doubt: str) -> str:
+        return exported(gains, how, target, doubt=doubt)
+
+    page = Page(subjects, exports_of, written, address_of(options.web_address))
+    run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))
