@@ -58,13 +58,8 @@ class Character:
     text: str
 
 
-@dataclass(frozen=True)
-class Pair:
-    """A measurement and a command that may belong to one loop, and why."""
-
-    measurement: Signal
-    command: Signal
-    reason: str
+# Names of a measurement and of a command that may belong to one loop, and why.
+Pair = tuple[str, str, str]
 
 
 def characterise(signal: Signal) -> Character:
@@ -126,8 +121,9 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
     role, named = ("command", command) if measurement is None else ("measurement", measurement)
     given = None if named is None else _checked(topics, role, named)
     signals = [timed.signal for timed in topics.signals().values()]
-    pairs = plausible_pairs(signals, given)
-    return _only(topics, [p for p in pairs if given in (None, getattr(p, role).name)])
+    place = 1 if role == "command" else 0
+    pairs = [p for p in plausible_pairs(signals, given) if given in (None, p[place])]
+    return _only(topics, pairs)
 
 
 def _checked(topics: Topics, role: str, wanted: str) -> str:
@@ -144,14 +140,11 @@ def _checked(topics: Topics, role: str, wanted: str) -> str:
 
 def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[str]]:
     if len(pairs) == 1:
-        pair = pairs[0]
-        names = f"--measurement {pair.measurement.name} --command {pair.command.name}"
-        return (pair.measurement.name, pair.command.name), [f"using {names}: {pair.reason}"]
+        ((y, u, reason),) = pairs
+        return (y, u), [f"using --measurement {y} --command {u}: {reason}"]
     if pairs:
         listed = "".join(
-            f"\n  --measurement {pair.measurement.name} --command {pair.command.name}"
-            f"  ({pair.reason})"
-            for pair in pairs
+            f"\n  --measurement {y} --command {u}  ({reason})" for y, u, reason in pairs
         )
         raise SelectionError(
             f"{topics.path} holds {len(pairs)} pairs of topics that may be measurement and "
@@ -191,7 +184,7 @@ def plausible_pairs(signals: Sequence[Signal], given: str | None = None) -> list
             )
             together = _namespace(names[0]) == _namespace(names[1])
             reason = "; ".join(f"{name} {looks[name].text}" for name in names)
-            found.append(((named, together), Pair(measurement, command, reason)))
+            found.append(((named, together), (*names, reason)))
     best = max((rank for rank, _ in found), default=None)
     return [pair for rank, pair in found if rank == best]
 

@@ -76,11 +76,7 @@ class Topics:
 
     def types(self) -> dict[str, str]:
         """Return the type of each topic."""
-        return {
-            channel.topic: channel.type or "unknown type"
-            for file in self.files
-            for channel in file.channels.values()
-        }
+        return {channel.topic: channel.type or "unknown type" for _, channel in self._channels()}
 
     def listing(self, looks: Mapping[str, str] | None = None) -> str:
         """Return the topics with their types for a message.
@@ -141,13 +137,12 @@ class Topics:
     def single_numbers(self) -> list[str]:
         """Return the topics whose messages are about one number."""
         found: dict[str, bool] = {}
-        for file in self.files:
-            for channel in file.channels.values():
-                try:
-                    alone = may_be_single(channel) and only_field(self._type(channel)) is not None
-                except BagError:
-                    alone = False
-                found[channel.topic] = alone and found.get(channel.topic, True)
+        for _, channel in self._channels():
+            try:
+                alone = may_be_single(channel) and only_field(self._type(channel)) is not None
+            except BagError:
+                alone = False
+            found[channel.topic] = alone and found.get(channel.topic, True)
         return [topic for topic, alone in found.items() if alone]
 
     def columns(self, names: Iterable[str], type_name: str) -> dict[str, Columns]:
@@ -178,8 +173,7 @@ class Topics:
         """Return all messages of one of our types, in the order in which they were recorded."""
         wanted = {
             (number, channel.id): channel
-            for number, file in enumerate(self.files)
-            for channel in file.channels.values()
+            for number, channel in self._channels()
             if channel.type == type_name
         }
         found: list[tuple[int, Any]] = []
@@ -264,12 +258,13 @@ class Topics:
         ]
         return min(sum(counts), MOST_EXPECTED)
 
-    def _channels(self, topic: str) -> list[tuple[int, Channel]]:
+    def _channels(self, topic: str | None = None) -> list[tuple[int, Channel]]:
+        """Return the channels of a topic, or of all, each after the number of its file."""
         return [
             (number, channel)
             for number, file in enumerate(self.files)
             for channel in file.channels.values()
-            if channel.topic == topic
+            if topic in (None, channel.topic)
         ]
 
     def _type(self, channel: Channel) -> Struct:

@@ -20,7 +20,8 @@ from relay_autotune.experiment.faults import (
     SilenceWatch,
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.procedure import Procedure, State
+from relay_autotune.experiment.procedure import Procedure
+from relay_autotune.experiment.samples import State
 from relay_autotune.record.record import Outcome, Record
 
 __all__ = ["ExperimentParameters", "RelayExperiment", "SafePolicy", "State"]
@@ -113,8 +114,10 @@ class RelayExperiment(Procedure):
     @property
     def reason(self) -> str:
         """Why it ended, a sentence for people; empty before."""
-        reason, repeated = self._end_reason, self._silence.repeated
-        if not (reason and repeated):
+        if not self.why_ended:
+            return ""
+        reason, repeated = "; ".join((self.why_ended, *self.notes)), self._silence.repeated
+        if not repeated:
             return reason
         told = f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
         silent = self._silence.silence
@@ -232,7 +235,7 @@ class RelayExperiment(Procedure):
         last = trace.time[-1] if trace else -math.inf
         problem = self._check.problem(time, measurement, last, self._origin)
         if problem is not None:
-            self._end(State.FAILED, problem)
+            self.end(State.FAILED, problem)
             return self._ended(math.nan)
         if not trace:
             self._origin = float(time)
@@ -270,7 +273,7 @@ class RelayExperiment(Procedure):
                 raise ParameterError(
                     "an experiment cannot be completed before its first half cycle; abort it"
                 )
-            self._end(State.COMPLETED, reason)
+            self.end(State.COMPLETED, reason)
             self._ended(math.nan)
         return self.after_end(self._last_measurement())
 
@@ -283,7 +286,7 @@ class RelayExperiment(Procedure):
         """
         if not self.finished:
             at = self.elapsed if time is None or not self.trace else time - self._origin
-            self._end(State.ABORTED, f"{reason} (at {at:.6g} s, {self._where()})")
+            self.end(State.ABORTED, f"{reason} (at {at:.6g} s, {self._where()})")
             self._ended(math.nan)
         return self.after_end(self._last_measurement())
 
@@ -307,25 +310,25 @@ class RelayExperiment(Procedure):
         """End the experiment if the last sample passes a limit; return True if it does."""
         p, resting = self.parameters, self.state is State.SETTLING
         if not p.measurement_min <= y <= p.measurement_max:
-            self._end(
+            self.end(
                 State.ABORTED,
                 f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
                 f"to {p.measurement_max:g}",
             )
         elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:
-            self._end(
+            self.end(
                 State.ABORTED,
                 f"the measurement {y:g} at {t:g} s is {self._deviation(y):g} away from the "
                 f"set-point, more than max_deviation, {p.max_deviation:g}",
             )
         elif 0.0 < p.max_duration < t:
-            self._end(
+            self.end(
                 State.FAILED,
                 f"max_duration {p.max_duration:g} s was over {self._where()}: allow more time "
                 f"or fewer cycles",
             )
         elif (seen := self.trace.seen[-1]) > self.latest:
-            self._end(
+            self.end(
                 State.FAILED,
                 f"the experiment was not over after {seen:.4g} s, longer than its parts may take, "
                 f"{self._where()}: let the process rest and look at the recording first",
@@ -337,7 +340,7 @@ class RelayExperiment(Procedure):
         if repeated:
             longest = max((cycle.period for cycle in self.cycles), default=math.inf)
             if self._silence.repeat(t, longest_cycle=longest):
-                self._end(
+                self.end(
                     State.FAILED,
                     f"the measurement does not respond any more: silent for "
                     f"{self._silence.silence:.3g} s, much longer than before, "
@@ -347,7 +350,7 @@ class RelayExperiment(Procedure):
         self._silence.hear(t, relaying=self.state is State.RELAY)
         resting = self.state is State.SETTLING
         if self._frozen.add(y, at_rest=resting, in_cycles=bool(self.cycles)):
-            self._end(
+            self.end(
                 State.FAILED,
                 f"the sensor is frozen: its last {self._frozen.run} samples are all {y:g}, "
                 f"{self._where()}; check the sensor",

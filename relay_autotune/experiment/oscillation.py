@@ -22,9 +22,9 @@ from relay_autotune.experiment.faults import (
     why_noise_alone,
 )
 from relay_autotune.experiment.relay_law import Patience, Relay, Turns, clear_swing
-from relay_autotune.experiment.samples import Run
+from relay_autotune.experiment.samples import Run, State
 from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
-from relay_autotune.record.record import Cycle, Outcome
+from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
 
 # Two instants that differ by less than this part of the sample interval are equal.
@@ -105,8 +105,6 @@ class Oscillation:
     def __init__(
         self, run: Run, *, doubtful: bool, first_limit: float, until_converged: bool
     ) -> None:
-        self.verdict: tuple[Outcome, str] | None = None
-        """How it ended and why; None while it goes on."""
         self._run = run
         self._parameters = run.parameters
         self._samples = run.trace
@@ -136,7 +134,7 @@ class Oscillation:
         return self._levels.high if self._is_high else self._levels.low
 
     def answer(self, t: float, y: float) -> float:
-        """Take the last sample and return the command; :attr:`verdict` is set at the end.
+        """Take the last sample and return the command; end the run where it cannot go on.
 
         :param t: its time [s].
         :param y: the measurement [y].
@@ -167,7 +165,7 @@ class Oscillation:
             if self._doubtful and not self._run.cycles:
                 self._no_return(t, y)
             else:
-                self._end(Outcome.FAILED, self._why_lost(t, y))
+                self._end(State.FAILED, self._why_lost(t, y))
         waiting = self._on_the_way
         while waiting and waiting[0][0] <= t + _ROUNDING * self._samples.interval:
             _, self._is_high, begins = waiting.popleft()
@@ -267,7 +265,7 @@ class Oscillation:
             return
         if len(self._run.cycles) + turns.lost >= most:
             self._end(
-                Outcome.FAILED,
+                State.FAILED,
                 f"no clear cycle for {turns.lost_for:.3g} s, though the relay went on switching, "
                 f"after {self._run.counted}, and max_cycles, {most}, are over: its half "
                 f"cycles differ too much; check sensor and actuator, and that the process rests "
@@ -315,7 +313,7 @@ class Oscillation:
 
     def _end_fast(self, how: str) -> None:
         self._end(
-            Outcome.FAILED, f"the relay switches fast, {how}: check the sensor and the actuator"
+            State.FAILED, f"the relay switches fast, {how}: check the sensor and the actuator"
         )
 
     # Cycles.
@@ -337,14 +335,14 @@ class Oscillation:
         p = self._parameters
         if is_growing([c.peak_max - c.peak_min for c in self._run.cycles]):
             self._end(
-                Outcome.FAILED,
+                State.FAILED,
                 f"the oscillation grows faster and faster, after {self._run.counted}: an "
                 f"unstable process that the relay cannot hold; give a larger amplitude",
             )
         elif noise := self._only_noise(TELL):
-            self._end(Outcome.FAILED, noise)
+            self._end(State.FAILED, noise)
         elif clipped := self._clipped():
-            self._end(Outcome.FAILED, clipped)
+            self._end(State.FAILED, clipped)
         elif self._until_converged and cycle.converged:
             n = len(self._run.cycles)
             which = f"{n}" if n == p.min_cycles else f"the last {p.min_cycles} of {n}"
@@ -376,7 +374,7 @@ class Oscillation:
             self._levels.grow()
             self._begin()
         elif noise:
-            self._end(Outcome.FAILED, noise)
+            self._end(State.FAILED, noise)
 
     def _has_grown(self) -> bool:
         """Make an amplitude that is not given larger if the last cycle was too small."""
@@ -393,7 +391,7 @@ class Oscillation:
             "" if self._levels.from_small else self._levels.why_clipped(half_swing, settled=False)
         )
         if clipped:
-            self._end(Outcome.FAILED, clipped)
+            self._end(State.FAILED, clipped)
             return True
         self._levels.note_small(half_swing, clear)
         factor = self._levels.growth_for(half_swing, least)
@@ -472,7 +470,7 @@ class Oscillation:
     def _complete(self, reason: str) -> None:
         """Complete, unless the last cycles may be noise alone."""
         if noise := self._only_noise(1):
-            self._end(Outcome.FAILED, noise)
+            self._end(State.FAILED, noise)
             return
         if self._levels.from_small and not self._levels.grew_enough:
             untold = (
@@ -481,10 +479,10 @@ class Oscillation:
                 "command_min and command_max"
             )
             if not self._run.cycles[-1].converged or self._should_have_told():
-                self._end(Outcome.FAILED, f"{untold}; {reason}")
+                self._end(State.FAILED, f"{untold}; {reason}")
                 return
             self._run.notes.append(untold)
-        self._end(Outcome.COMPLETED, reason)
+        self._end(State.COMPLETED, reason)
 
     def _only_noise(self, least: int) -> str:
         """Return why the last cycles are no oscillation, "" if they may be one.
@@ -507,14 +505,14 @@ class Oscillation:
             )
         return noise
 
-    def _end(self, outcome: Outcome, reason: str) -> None:
+    def _end(self, state: State, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self._run.cycles)
-        if outcome is Outcome.COMPLETED and disturbed:
+        if state is State.COMPLETED and disturbed:
             self._run.notes.append(
                 f"{disturbed} of {self._run.cycle_count} cycles disturbed: a long gap in the "
                 "samples, a load step, or switches that formed no clear cycle"
             )
-        self.verdict = outcome, reason
+        self._run.end(state, reason)
 
     def _no_return(self, t: float, y: float) -> None:
         """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
@@ -549,7 +547,7 @@ class Oscillation:
                 # Each shift gets half of the patience again.
                 self._patient_from = t - 0.5 * self._limit
                 return
-        self._end(Outcome.FAILED, self._why_lost(t, y))
+        self._end(State.FAILED, self._why_lost(t, y))
 
     @property
     def _told_at(self) -> float:

@@ -19,7 +19,6 @@ command stays at the baseline.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -27,7 +26,7 @@ from functools import partial
 from relay_autotune.experiment.oscillation import Oscillation
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Relay
-from relay_autotune.experiment.samples import Run
+from relay_autotune.experiment.samples import Run, State
 from relay_autotune.experiment.settling import (
     LAST_LOOK,
     LAST_LOOK_SAMPLES,
@@ -39,7 +38,6 @@ from relay_autotune.experiment.settling import (
     Settling,
     rest_state,
 )
-from relay_autotune.record.record import Outcome
 from relay_autotune.text import duration
 
 SETTLING_LIMIT = 600.0
@@ -70,21 +68,6 @@ _PATIENT = 10.0
 _USUAL_EXTRA = 2
 
 
-class State(enum.IntEnum):
-    """The state of an experiment."""
-
-    SETTLING = 1
-    KICK = 2
-    PROBE = 3
-    RELAY = 4
-    COMPLETED = 5
-    ABORTED = 6
-    FAILED = 7
-
-
-_ENDS = {Outcome.COMPLETED: State.COMPLETED, Outcome.FAILED: State.FAILED}
-
-
 class Procedure(Run):
     """Answer samples, one state after the other, until the procedure is over.
 
@@ -108,8 +91,6 @@ class Procedure(Run):
         before: Sequence[float] | None = None,
     ) -> None:
         super().__init__(parameters, baseline, from_small=from_small)
-        self.state = State.SETTLING
-        """The present state."""
         settling = Settling()
         self._answer: Callable[[float, float], float] = partial(self._settle, settling)
         """Take the last sample, its time without gaps [s] and the measurement [y]; return the
@@ -117,7 +98,6 @@ class Procedure(Run):
         self._tell: Callable[[float, float], str] = partial(self._tell_settling, settling)
         """Say what the present state waits for and sees, after the same sample."""
 
-        self._end_reason = ""
         self._until_converged = until_converged
         self._watch = None if before is None else RestWatch(before)
         self._oscillation: Oscillation | None = None
@@ -145,16 +125,6 @@ class Procedure(Run):
     def _settling_limit(self) -> float:
         return max(SETTLING_LIMIT, SETTLING_SAMPLES * self.trace.interval)
 
-    def _end(self, state: State, reason: str) -> float:
-        """End the experiment and return the safe command.
-
-        :param state: COMPLETED, ABORTED or FAILED.
-        :param reason: why, a sentence for people.
-        """
-        self.state = state
-        self._end_reason = "; ".join((reason, *self.notes))
-        return self.baseline
-
     def _where(self) -> str:
         """Return the present state as the end of a sentence."""
         return {
@@ -168,7 +138,7 @@ class Procedure(Run):
     def _settle(self, settling: Settling, t: float, y: float) -> float:
         n = len(self.trace)
         if self._watch is not None and (told := self._watch.leaves(y)):
-            return self._end(
+            return self.end(
                 State.FAILED,
                 f"{told}, {t:.3g} s after {self.baseline:g} u was commanded: {self.baseline:g} "
                 f"u is not the present command, or a load came; set the command at which the "
@@ -186,7 +156,7 @@ class Procedure(Run):
         if settled and (self._watch is None or n >= NOISE_SAMPLES):
             return self._settled(rest)
         if t > SETTLING_LIMIT and n >= SETTLING_SAMPLES and not self.parameters.max_duration:
-            return self._end(
+            return self.end(
                 State.FAILED,
                 f"the measurement was not steady within {t:g} s, {rest}: wait until the process "
                 f"is at rest, or give settle_time to start anyway",
@@ -286,7 +256,7 @@ class Procedure(Run):
             if detector.band
             else f"stayed at {self.rest.mean:g}"
         )
-        return self._end(
+        return self.end(
             State.FAILED,
             f"no response to the kick: the command was {level:g} instead of "
             f"{self.baseline:g} for {t - start:g} s, and the measurement {still}: check that "
@@ -341,17 +311,8 @@ class Procedure(Run):
             first_limit=self._kick_limit(),
             until_converged=self._until_converged,
         )
-        self._answer, self._tell = self._follow, self._oscillation.tell
+        self._answer, self._tell = self._oscillation.answer, self._oscillation.tell
         return self._oscillation.command
-
-    def _follow(self, t: float, y: float) -> float:
-        oscillation = self._oscillation
-        assert oscillation is not None
-        command = oscillation.answer(t, y)
-        if oscillation.verdict is None:
-            return command
-        outcome, reason = oscillation.verdict
-        return self._end(_ENDS[outcome], reason)
 
 
 def how_long(parameters: ExperimentParameters, interval: float, limit: float) -> str:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from array import array
 from itertools import pairwise
@@ -89,6 +90,18 @@ class Samples:
 _TRIED = 2
 
 
+class State(enum.IntEnum):
+    """The state of an experiment."""
+
+    SETTLING = 1
+    KICK = 2
+    PROBE = 3
+    RELAY = 4
+    COMPLETED = 5
+    ABORTED = 6
+    FAILED = 7
+
+
 class Run:
     """What is known of a running experiment: each of its parts reads it and adds to it.
 
@@ -104,6 +117,10 @@ class Run:
         self.baseline = float(baseline)
         self.levels = Levels(parameters, self.baseline, from_small=from_small)
         """The levels of the relay."""
+        self.state = State.SETTLING
+        """The present state."""
+        self.why_ended = ""
+        """Why it ended, a sentence for people without the notes; empty before."""
         self.trace = Samples()
         """The samples so far; each is appended before it is answered."""
         self.rest = NOT_SETTLED
@@ -129,6 +146,15 @@ class Run:
         """Number of switches of the relay so far; two of them are a half cycle."""
         self.notes: list[str] = []
         """Sentences that follow the reason of the end."""
+
+    def end(self, state: State, reason: str) -> float:
+        """End the experiment and return the safe command.
+
+        :param state: COMPLETED, ABORTED or FAILED.
+        :param reason: why, a sentence for people.
+        """
+        self.state, self.why_ended = state, reason
+        return self.baseline
 
     @property
     def settings(self) -> RelaySettings | None:
