@@ -23,10 +23,19 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, first_line, message_type
-from relay_autotune.bag.field_path import Element, Step, reading, written
+from relay_autotune.bag.field_path import (
+    Element,
+    Number,
+    Repeated,
+    Step,
+    Struct,
+    Text,
+    Type,
+    reading,
+    written,
+)
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
 from relay_autotune.bag.mcap_records import Channel, Content, every_byte
-from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type
 from relay_autotune.errors import BagError, FieldError
 from relay_autotune.quantities import told_fields
 from relay_autotune.record.record import Cycle, RelaySettings

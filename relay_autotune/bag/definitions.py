@@ -23,9 +23,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from relay_autotune.bag.field_path import Fields, Repeated, Struct, Text, Type, number_named
 from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.schema import Fields, Repeated, Struct, Text, Type, number_named
 from relay_autotune.errors import BagError
 from relay_autotune.text import visible
 

@@ -22,11 +22,11 @@ from relay_autotune.bag.field_path import (
     Element,
     Step,
     names_in,
+    numeric_paths,
     reading,
     steps_of,
     written,
 )
-from relay_autotune.bag.schema import numeric_paths
 from relay_autotune.bag.signals import Selection, Signal
 from relay_autotune.bag.topics import Topics, split_name
 from relay_autotune.errors import FieldError, SelectionError

@@ -21,10 +21,9 @@ from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
 from relay_autotune.bag.definitions import message_type
-from relay_autotune.bag.field_path import first_numbers, some_numbers, steps_of
+from relay_autotune.bag.field_path import Struct, Type, first_numbers, some_numbers, steps_of
 from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
 from relay_autotune.bag.mcap_records import Channel, Messages
-from relay_autotune.bag.schema import Struct, Type
 from relay_autotune.bag.signals import SignalReader, TimedSignal
 from relay_autotune.errors import BagError, FieldError, SelectionError
 

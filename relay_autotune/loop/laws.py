@@ -234,11 +234,11 @@ class Law:
     :param name: by which it is chosen.
     :param program: the program and the version whose source was read.
     :param equation: the difference equation.
+    :param limits: what happens at the limits of the command.
+    :param settings: its parameters.
     :param integral: when the error is added to the integral.
     :param slope: the signal whose derivative is taken.
     :param smoothing: of the derivative, or of the measurement.
-    :param limits: what happens at the limits of the command.
-    :param settings: its parameters.
     :param weights: set-point weights that it can have; (): any from 0 to 1.
     :param delay: samples until a command takes effect.
     :param form: of its gains, parallel (p, i, d) or ideal (gain and times).
@@ -254,11 +254,11 @@ class Law:
     name: str
     program: str
     equation: str
-    integral: Integral
-    slope: Slope
-    smoothing: Smoothing
     limits: str
     settings: tuple[Setting, ...]
+    integral: Integral = Integral.BEFORE
+    slope: Slope = Slope.MEASUREMENT
+    smoothing: Smoothing = _PLAIN
     weights: tuple[float, ...] = (1.0,)
     delay: int = 0
     form: str = "parallel"
@@ -510,7 +510,7 @@ def _control_toolbox(
     """Return the law of control_toolbox with one of its anti-windup strategies."""
     settings = (*_gains("p i d"), _strategy(strategy), *others)
     name = f"control_toolbox_{strategy}"
-    return Law(name, _TOOLBOX, equation, integral, Slope.ERROR, _PLAIN, limits, settings)
+    return Law(name, _TOOLBOX, equation, limits, settings, integral, Slope.ERROR)
 
 
 _BACK_CALCULATION = _control_toolbox(
@@ -526,11 +526,9 @@ _ROWS = (
         "I_k = I_{k-1} + i h (r_k - v_k), then u_k = kc (b r_k - v_k - td s_k) + I_k; v and s are "
         "y and its derivative after 1/(1 + tf s + (tf s)^2/2), exact for a y that is linear "
         "between samples",
-        Integral.BEFORE,
-        Slope.MEASUREMENT,
-        _ON_MEASUREMENT,
         "back-calculation with sqrt(ti td), without derivative ti",
         _gains("kc ti td tf b", "kc ti td tf b"),
+        smoothing=_ON_MEASUREMENT,
         weights=(),
         form="ideal",
     ),
@@ -553,9 +551,6 @@ _ROWS = (
         "arduino_pid_v1",
         "PID_v1 of br3ttb/Arduino-PID-Library, 1.2.1",
         f"{_ON_Y}; b is 1, with P_ON_M 0",
-        Integral.BEFORE,
-        Slope.MEASUREMENT,
-        _PLAIN,
         "I stays within the output limits",
         (
             # Their sign is that of ControllerDirection.
@@ -576,9 +571,6 @@ _ROWS = (
         "simple_pid",
         "simple-pid of m-lundberg, 2.0.1",
         f"{_ON_Y}; b is 1, with proportional_on_measurement 0",
-        Integral.BEFORE,
-        Slope.MEASUREMENT,
-        _PLAIN,
         "I stays within output_limits",
         (
             *_gains("Kp Ki Kd"),
@@ -594,9 +586,6 @@ _ROWS = (
         "the PID climate of ESPHome, 2024.11.0-dev",
         "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k - d (y_k - y_{k-N})/(N h), "
         "N = derivative_averaging_samples; without deadband, output_averaging_samples 1",
-        Integral.BEFORE,
-        Slope.MEASUREMENT,
-        _MEAN,
         "I stays between min_integral and max_integral",
         (
             *_gains("kp ki kd"),
@@ -606,6 +595,7 @@ _ROWS = (
             ),
             Setting("output_averaging_samples", "1"),
         ),
+        smoothing=_MEAN,
         command="level of the output, -1 (cool) to 1 (heat)",
         start=Start("starting_integral_term is the present command.", "starting_integral_term"),
     ),
@@ -614,9 +604,6 @@ _ROWS = (
         "the pid heater of Klipper, v0.13.0-730-g84104bbb",
         "I_k = I_{k-1} + h e_k, then u_k = (Kp e_k + Ki I_k - Kd s_k)/255; s_k = (1 - a) s_{k-1} "
         "+ a (y_k - y_{k-1})/h, a = h/smooth_time, at most 1; u acts one report later",
-        Integral.BEFORE,
-        Slope.MEASUREMENT,
-        _FIRST_ORDER,
         "the integral keeps its value while u is limited; small changes of u may be left out",
         (
             *_gains("pid_Kp pid_Ki pid_Kd", of=_of_255),
@@ -624,6 +611,7 @@ _ROWS = (
                 "smooth_time", lambda law: max(law.gains.tf, law.period) if law.gains.td else None
             ),
         ),
+        smoothing=_FIRST_ORDER,
         delay=1,
         command="power of the heater, 0 to 1; the gains are in parts of 255",
         only_positive=True,
@@ -633,9 +621,6 @@ _ROWS = (
         "PID_t of Marlin's temperature.h, commit 000b34772776",
         "I_k = I_{k-1} + e_k, then u_k = (Kp e_k + Ki h I_k - Kd s_k)/255; s_k = K1 s_{k-1} + "
         "(1 - K1) (y_k - y_{k-1})/h, K1 = PID_K1; within PID_FUNCTIONAL_RANGE",
-        Integral.BEFORE,
-        Slope.MEASUREMENT,
-        _FIRST_ORDER,
         "Ki h I stays between 0 and the largest output",
         (
             *_gains("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", of=_of_255),
@@ -646,6 +631,7 @@ _ROWS = (
                 ),
             ),
         ),
+        smoothing=_FIRST_ORDER,
         command="power of the heater, 0 to 1; the output is 0 to 255",
         only_positive=True,
         line="#define {name} {value}",
@@ -656,11 +642,10 @@ _ROWS = (
         "RateControl of PX4, rate_control.cpp of commit 0155b3a86295, for small errors; its D "
         "acts on an acceleration that another module filters, and is left at 0",
         "u_k = p e_k + I_k, then I_{k+1} = I_k + i h e_k",
-        Integral.AFTER,
-        Slope.NONE,
-        _PLAIN,
         "no integration further into the limit of the allocator; I within its own limit",
         _gains("MC_ROLLRATE_P MC_ROLLRATE_I MC_ROLLRATE_D"),
+        integral=Integral.AFTER,
+        slope=Slope.NONE,
         command="normalised torque",
         line="param set {name} {value}",
     ),
@@ -669,9 +654,6 @@ _ROWS = (
         "AC_PID::update_all of ArduPilot, commit 00e79c1a8aca, with FLTT, FLTE, SMAX and FF at 0",
         "s_k = s_{k-1} + a ((e_k - e_{k-1})/h - s_{k-1}), a = h/(h + 1/(2 pi FLTD)); "
         "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d s_k",
-        Integral.BEFORE,
-        Slope.ERROR,
-        _FIRST_ORDER,
         "I may only shrink while the limit flag is set; I within IMAX",
         (
             *_gains("ATC_RAT_RLL_P ATC_RAT_RLL_I ATC_RAT_RLL_D"),
@@ -687,6 +669,8 @@ _ROWS = (
             Setting("ATC_RAT_RLL_FLTE", 0.0),
             Setting("ATC_RAT_RLL_FF", 0.0),
         ),
+        slope=Slope.ERROR,
+        smoothing=_FIRST_ORDER,
         command="normalised torque",
         line="{name},{value}",
     ),
@@ -695,15 +679,14 @@ _ROWS = (
         "the example PID of IEC 61131-3, final draft of the 2nd edition (2001)",
         "its error is y - r: X_k = X_{k-1} + h (y_k - r_k), then u_k = KP (E_k + X_k/TR + TD "
         "(3 (E_k - E_{k-3}) + E_{k-1} - E_{k-2})/(10 h)), E = y - r",
-        Integral.BEFORE,
-        Slope.ERROR,
-        _FOUR_SAMPLES,
         "none: the integral winds up",
         (
             Setting("KP", lambda law: -law.gains.kc),
             *_gains("TR TD", "ti td"),
             Setting("CYCLE", lambda law: f"T#{1000.0 * law.period:.10g}ms"),
         ),
+        slope=Slope.ERROR,
+        smoothing=_FOUR_SAMPLES,
         form="ideal",
         needs_integral=True,
         line="{name} := {value};",
@@ -720,11 +703,10 @@ _ROWS = (
         "oscat_ft_pid",
         "FT_PID 2.1 of OSCAT BASIC 3.33, with the error as IN",
         "u_k = KP (e_k + I_k + TV (e_k - e_{k-1})/h), I_k = I_{k-1} + h (e_k + e_{k-1})/(2 TN)",
-        Integral.TRAPEZOID,
-        Slope.ERROR,
-        _PLAIN,
         "I stays between ILIM_L and ILIM_H",
         _gains("KP TN TV", "kc ti td"),
+        integral=Integral.TRAPEZOID,
+        slope=Slope.ERROR,
         form="ideal",
         line="{name} := {value};",
         remark="//",

@@ -16,8 +16,18 @@ from typing import Any
 import yaml
 from rosidl_parser import definition
 
-from relay_autotune.bag.field_path import Step, reading, setting, steps_of
-from relay_autotune.bag.schema import Number, Repeated, Struct, Text, Type, number_named
+from relay_autotune.bag.field_path import (
+    Number,
+    Repeated,
+    Step,
+    Struct,
+    Text,
+    Type,
+    number_named,
+    reading,
+    setting,
+    steps_of,
+)
 from relay_autotune.errors import FieldError, ParameterError
 
 FLOAT64 = "std_msgs/msg/Float64"

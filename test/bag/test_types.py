@@ -21,8 +21,8 @@ from relay_autotune.bag.definitions import (
     message_type,
     types_from_ros2msg,
 )
+from relay_autotune.bag.field_path import Number, Repeated, Text, numeric_paths
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.schema import Number, Repeated, Text, numeric_paths
 from relay_autotune.bag.topics import Topics, named_field, only_field
 from relay_autotune.errors import BagError, SelectionError
 
