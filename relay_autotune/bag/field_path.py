@@ -31,7 +31,8 @@ from relay_autotune.text import visible
 _FORMS = {
     **dict.fromkeys(("bool", "byte", "octet", "char"), "u1"),
     **{f"{'u' * (k == 'u')}int{8 * n}": f"{k}{n}" for k in "iu" for n in (1, 2, 4, 8)},
-    **{"float32": "f4", "float64": "f8"},
+    "float32": "f4",
+    "float64": "f8",
 }
 
 
