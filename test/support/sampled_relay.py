@@ -5,7 +5,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -81,6 +84,7 @@ def simulate_sampled_relay(
     )
 
 
+@cache
 def exact_limit_cycle(
     model: TransferFunction,
     settings: RelaySettings,
@@ -99,14 +103,23 @@ def exact_limit_cycle(
     """
     count = 8
     while True:
-        run = simulate_relay(model, settings, cycles=count, told=2)
-        a, b = run.cycles[-2], run.cycles[-1]
-        change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
-        if change <= tolerance * b.period:
-            return replace(b, converged=True)
+        run = simulate_relay(model, settings, cycles=count, told=3)
+        first, second = (_change(*pair) for pair in pairwise(run.cycles[-3:]))
+        last = run.cycles[-1]
+        if second <= tolerance * last.period:
+            return replace(last, converged=True)
         if count >= most_cycles:
             raise ModelError(
-                f"the limit cycle still changes by {change / b.period:g} of its period after "
+                f"the limit cycle still changes by {second / last.period:g} of its period after "
                 f"{count} cycles"
             )
-        count = min(4 * count, most_cycles)
+        # Deviations decay geometrically.
+        more = 3 * count
+        if second < first:
+            left = math.log(tolerance * last.period / second) / math.log(second / first)
+            more = min(math.ceil(left) + 2, more)
+        count = min(count + more, most_cycles)
+
+
+def _change(a: Cycle, b: Cycle) -> float:
+    return abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
