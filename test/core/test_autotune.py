@@ -69,7 +69,8 @@ def test_the_chosen_method_and_rule_come_first():
 @pytest.mark.long
 @pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
 def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
-    found = analyse(replace(_record(), outcome=outcome, reason="the operator said stop"))
+    ended = replace(_record(), outcome=outcome, reason="the operator said stop")
+    found = analyse(ended, known=Known(structure="fopdt"))
     assert found.model is not None
     assert found.gains == ()
     assert found.best_gains is None

@@ -166,7 +166,7 @@ def test_every_field_of_a_result_is_declared(kind):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", [k for k in RESULTS if k not in (LimitCycle, Cycle, FitProgress)])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(data=st.data())
 def test_a_result_comes_back_from_its_document(kind, data):
     value = data.draw(results(kind))

@@ -225,4 +225,9 @@ class Controllers(RuleBasedStateMachine):
 
 
 TestControllers = Controllers.TestCase
-TestControllers.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestControllers.settings = settings(max_examples=50, stateful_step_count=40, deadline=None)
+
+
+@pytest.mark.nightly
+class TestManyControllers(Controllers.TestCase):
+    settings = settings(max_examples=500, stateful_step_count=40, deadline=None)

@@ -522,7 +522,7 @@ def test_any_fopdt_process_completes(
 
 
 @pytest.mark.long
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     values=st.lists(
         st.one_of(

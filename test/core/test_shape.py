@@ -107,7 +107,7 @@ PROCESSES = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("category", PROCESSES)
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.1])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.05, marks=pytest.mark.nightly), 0.1])
 def test_a_record_has_the_shape_of_its_process(category, noise):
     model, cycles = PROCESSES[category]
     relay = RelaySettings(5.0, 40.0, 1.0)

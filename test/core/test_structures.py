@@ -144,10 +144,12 @@ ONE_OF_EACH_KIND = [
 ]
 
 
-def _record(model: TransferFunction, noise: float = 0.0, seed: int = 0) -> Record:
+def _record(
+    model: TransferFunction, noise: float = 0.0, seed: int = 0, samples: int = 1000
+) -> Record:
     relay = RelaySettings(0.0, 0.0, 1.0)
     end = simulate_relay(model, relay, cycles=5).command.times[-1]
-    run = simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, 1000))
+    run = simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, samples))
     signal = float(np.mean(np.abs(run.measurement)))
     std = noise * signal * math.sqrt(math.pi / 2.0)
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
@@ -157,7 +159,7 @@ def _record(model: TransferFunction, noise: float = 0.0, seed: int = 0) -> Recor
 @pytest.mark.parametrize("name", PROCESSES)
 def test_without_noise_the_true_structure_is_found_exactly(name):
     model = PROCESSES[name]
-    found = identify_waveform(_record(model))
+    found = identify_waveform(_record(model, samples=500))
     assert found.structure == model.structure
     assert found.model.order == model.order
     assert found.model.gain == pytest.approx(model.gain, rel=1e-7)

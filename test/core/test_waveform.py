@@ -178,7 +178,8 @@ def test_a_start_away_from_rest_is_estimated():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("start", [600, 900])
+# Two phases of the oscillation, of which one shows what the other does.
+@pytest.mark.parametrize("start", [pytest.param(600, marks=pytest.mark.nightly), 900])
 def test_a_record_cut_out_of_an_oscillation(start):
     record = _run(1.65, 20.0, 10.0, 0.3, 2000).record()
     part = slice(start, 2000)
