@@ -23,7 +23,7 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.relay_law import Patience, Relay, Turns, clear_swing
 from relay_autotune.experiment.samples import Run, State
-from relay_autotune.record.cycles import MIN_CYCLES, next_cycle
+from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
 
@@ -423,19 +423,17 @@ class Oscillation:
         return 0.5 * float(y.max() - y.min()) > _CLEARLY * clear
 
     def _cycle_that_ended(self) -> Cycle:
-        first, last = self._run.cycle_start[-2:]
-        time, measurement, command = self._samples.columns(first, last + 1)
-        p = self._parameters
+        run, p = self._run, self._parameters
+        first, last = run.cycle_start[-2:]
+        cycle = cycle_from_samples(
+            run.cycle_count,
+            *self._samples.columns(first, last + 1),
+            middle=run.baseline + self._levels.bias,
+            reverse_acting=run.process_gain_sign < 0,
+        )
+        interval = cycle.period / (last - first)
         return next_cycle(
-            self._run.cycles,
-            time,
-            measurement,
-            command,
-            middle=self._run.baseline + self._levels.bias,
-            reverse_acting=self._run.process_gain_sign < 0,
-            noise_std=self._run.noise_std,
-            min_cycles=p.min_cycles,
-            tolerance=p.cycle_tolerance,
+            run.cycles, cycle, interval, run.noise_std, p.min_cycles, p.cycle_tolerance
         )
 
     def _is_alone(self, period: float) -> bool:

@@ -225,40 +225,6 @@ class Gains(Performance, Controller):
         Controller.__post_init__(self)
         Performance.__post_init__(self)
 
-    @classmethod
-    def of(
-        cls,
-        rule: str,
-        controller: Controller,
-        performance: Performance,
-        *,
-        ms_95: float,
-        reason: str,
-        warnings: tuple[str, ...] = (),
-        law: tuple[str, float] | None = None,
-    ) -> Gains:
-        """Join a controller and its performance.
-
-        :param rule: name in the registry.
-        :param controller: the gains.
-        :param performance: their performance on the model.
-        :param ms_95: value of Ms not exceeded by 95 % of the models within the uncertainty.
-        :param reason: why this rule and these gains.
-        :param warnings: what the user must know.
-        :param law: name and sampling period of the law that they are for; None: not named.
-        """
-        name, period = law or ("", 0.0)
-        return cls(
-            **vars(controller),
-            **vars(performance),
-            rule=rule,
-            ms_95=ms_95,
-            law=name,
-            law_period=period,
-            reason=reason,
-            warnings=warnings,
-        )
-
 
 class ControlLaw(Protocol):
     """A linear controller, as :class:`~relay_autotune.loop.gains.Controller` is."""

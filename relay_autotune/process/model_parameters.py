@@ -65,16 +65,6 @@ def positive(time_constant: float) -> float:
     return float(time_constant)
 
 
-def at_least_one(order: int) -> int:
-    """Return the order of equal lags.
-
-    :raises ModelError: if it is less than 1.
-    """
-    if order < 1:
-        raise ModelError(f"the order of equal lags must be at least 1, found {order}")
-    return order
-
-
 def exactly(
     count: int, constants: Sequence[complex], name: str = "time_constants"
 ) -> tuple[complex, ...]:

@@ -32,7 +32,6 @@ from relay_autotune.process.model_parameters import (
     Lag,
     Parameter,
     Quadratic,
-    at_least_one,
     exactly,
 )
 from relay_autotune.process.transfer_function import TransferFunction
@@ -131,8 +130,10 @@ class Structure:
 
         :raises ModelError: if the order is less than one.
         """
+        if order < 1:
+            raise ModelError(f"the order of equal lags must be at least 1, found {order}")
         (parameters,) = [f.parameters for f in self.factors if isinstance(f, Lag)]
-        return replace(self, factors=(Lag(at_least_one(order), parameters),))
+        return replace(self, factors=(Lag(order, parameters),))
 
     def form(self, pair: bool) -> Structure:
         """Return the structure with its quadratic factor as a pair or as two lags.

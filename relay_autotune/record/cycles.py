@@ -380,37 +380,28 @@ def agree(cycles: Sequence[Cycle], noise_std: float, interval: float, tolerance:
 
 def next_cycle(
     before: Sequence[Cycle],
-    time: FloatArray,
-    measurement: FloatArray,
-    command: FloatArray,
-    *,
-    middle: float,
-    reverse_acting: bool,
-    noise_std: float = math.nan,
-    min_cycles: int = MIN_CYCLES,
-    tolerance: float = TOLERANCE,
+    cycle: Cycle,
+    interval: float,
+    noise_std: float,
+    min_cycles: int,
+    tolerance: float,
 ) -> Cycle:
-    """Compute the features of a cycle, and whether it agrees with those before it.
+    """Return a cycle with the answer to whether it agrees with those before it.
 
     It uses only data up to this cycle, so that a live experiment and a replay of its record give
     identical cycles.
 
     :param before: the cycles so far, in order.
-    :param time: as for :func:`cycle_from_samples`, as are the next four.
+    :param cycle: the next one.
+    :param interval: mean interval of its samples [s].
     :param noise_std: standard deviation of the measurement noise [y]; NaN: not known.
     :param min_cycles: number of cycles, this one included, that must agree.
     :param tolerance: relative difference allowed, see :func:`agree`.
     """
-    cycle = cycle_from_samples(
-        len(before), time, measurement, command, middle=middle, reverse_acting=reverse_acting
-    )
     if len(before) + 1 < min_cycles:
         return cycle
     window = (*before[len(before) + 1 - min_cycles :], cycle)
-    interval = cycle.period / (len(time) - 1)
-    if not agree(window, noise_std, interval, tolerance):
-        return cycle
-    return replace(cycle, converged=True)
+    return replace(cycle, converged=agree(window, noise_std, interval, tolerance))
 
 
 @asked_once
@@ -434,26 +425,19 @@ def cycles_of(
         return ()
     cycles: list[Cycle] = []
     for first, last in pairwise(bounds):
-        part = slice(first, last + 1)
-        sent = record.command[first:last]
+        samples = slice(first, last + 1)
+        time, sent = record.time[samples], record.command[first:last]
         low, high = float(sent.min()), float(sent.max())
         middle = settings.baseline + settings.bias
         if not low < middle < high:
             # The levels were shifted later, to compensate a load.
             middle = 0.5 * (low + high)
-        cycles.append(
-            next_cycle(
-                cycles,
-                record.time[part],
-                record.measurement[part],
-                sent,
-                middle=middle,
-                reverse_acting=settings.reverse_acting,
-                noise_std=record.noise_std,
-                min_cycles=min_cycles,
-                tolerance=tolerance,
-            )
+        y, reverse = record.measurement[samples], settings.reverse_acting
+        cycle = cycle_from_samples(
+            len(cycles), time, y, sent, middle=middle, reverse_acting=reverse
         )
+        interval, noise = cycle.period / (last - first), record.noise_std
+        cycles.append(next_cycle(cycles, cycle, interval, noise, min_cycles, tolerance))
     return tuple(cycles)
 
 

@@ -209,14 +209,15 @@ def judged(task: DesignTask, found: Designed) -> Gains:
         ms_95 = performance.ms
     else:
         ms_95 = max(ensemble_ms(controller, task.exact), performance.ms)
-    return Gains.of(
-        rule,
-        controller,
-        performance,
+    return Gains(
+        **vars(controller),
+        **vars(performance),
+        rule=rule,
         ms_95=ms_95,
+        law="" if law is None else law.law.name,
+        law_period=0.0 if law is None else law.period,
         reason=reason,
         warnings=warnings,
-        law=None if law is None else (law.law.name, law.period),
     )
 
 

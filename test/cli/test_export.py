@@ -21,7 +21,7 @@ from relay_autotune.cli.export import Target, exported, number, pid_controller, 
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import Controller, DesignOptions, Gains, Performance
+from relay_autotune.tuning import DesignOptions, Gains, Performance
 from relay_autotune.tuning import tune as tune_model
 
 PERFORMANCE = Performance(
@@ -36,7 +36,7 @@ PERFORMANCE = Performance(
 
 def gains(*values: float, **more: float) -> Gains:
     reason = 'so "fast": it is'
-    return Gains.of("imc", Controller(*values, **more), PERFORMANCE, ms_95=1.41, reason=reason)
+    return Gains(*values, **vars(PERFORMANCE), **more, rule="imc", ms_95=1.41, reason=reason)
 
 
 def as_loaded(text: str, prefix: str = "") -> dict[str, object]:
