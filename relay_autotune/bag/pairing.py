@@ -233,6 +233,8 @@ _INTERFACES = ("position", "velocity", "effort")
 
 # Joint states come from several nodes: the first messages need not have all joints.
 _LOOKED_AT = 50
+_ROLES = ("measurement", "command")
+
 # Largest number of joints that an error lists.
 _LISTED = 20
 
@@ -275,16 +277,13 @@ def named_pair(topics: Topics, wanted: Selection) -> tuple[str, str, str]:
     found, joints = _candidates(topics, wanted)
     if not any(c.steps or not c.path for c in found):
         raise _nowhere(topics, wanted.joint, joints)
-    measured = _of_role(found, "measurement", wanted.measurement)
-    commanded = _of_role(found, "command", wanted.command)
-    read = {c.name for c in (*measured, *commanded) if c.role != "named"}
-    signals = topics.signals(read)
+    named = (wanted.measurement, wanted.command)
+    fits = [_of_role(found, *each) for each in zip(_ROLES, named, strict=True)]
+    signals = topics.signals({c.name for own in fits for c in own if c.role != "named"})
     still = {
         name for name, t in signals.items() if not len(t.signal) or not np.ptp(t.signal.values)
     }
-    measured = [c for c in measured if c.name not in still]
-    commanded = [c for c in commanded if c.name not in still]
-    measured, commanded = _together(measured, commanded)
+    measured, commanded = _together(*([c for c in own if c.name not in still] for own in fits))
     if any(c.steps for c in commanded):
         commanded = [c for c in commanded if c.steps]
     if len(measured) > 1 and len(commanded) == 1:
@@ -475,17 +474,14 @@ def _unclear(
     topics: Topics, wanted: Selection, measured: list[_Candidate], commanded: list[_Candidate]
 ) -> SelectionError:
     said = f"{topics.path}: of {wanted.joint}"
-    for role, found in (("measurement", measured), ("command", commanded)):
+    chosen = dict(zip(_ROLES, (measured, commanded), strict=True))
+    for role, found in chosen.items():
         if not found:
             return SelectionError(
                 f"{said} no {role} is there that changes; name one with --{role} TOPIC[:FIELD]; "
                 f"it has {topics.listing()}"
             )
-    several = [
-        (role, found)
-        for role, found in (("measurement", measured), ("command", commanded))
-        if len(found) > 1
-    ]
+    several = [(role, found) for role, found in chosen.items() if len(found) > 1]
     listed = "".join(
         f"\n  --{role} {shlex.quote(name)}"
         for role, found in several

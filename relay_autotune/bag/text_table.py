@@ -48,6 +48,11 @@ _DATE = re.compile(
 )
 
 
+# The times of the rows in one of three forms, the others empty; all empty: the rows have none.
+# Numbers are as they stand, dates in nanoseconds since 1970, times of day in nanoseconds.
+Times = dict[str, list[float]]
+
+
 class TextTable:
     """The rows of a text: their separator, their header, their numbers.
 
@@ -184,7 +189,7 @@ class TextTable:
         :param places: of the other columns.
         :raises BagError: if a cell holds anything but a number.
         """
-        times = Times()
+        times: Times = {"numbers": [], "dates": [], "times of day": []}
         values: list[list[float]] = [[] for _ in places]
         suffixes: list[str | None] = [None] * len(places)
         lines: list[int] = []
@@ -223,7 +228,12 @@ class TextTable:
             raise damaged[0]
         if len(lines) < 2:
             raise BagError(f"{self._path} has {len(lines)} rows of numbers; expected at least two")
-        times.check(self._path, len(lines), "" if time is None else self.names[time])
+        for what in ("dates", "times of day"):
+            if time is not None and 0 < len(times[what]) < len(lines):
+                raise BagError(
+                    f"{self._path}: of {len(lines)} cells of {self.names[time]!r} "
+                    f"{len(times[what])} are {what}, the others not; expected one of them"
+                )
         if self._commas and self._points:
             raise BagError(
                 f"{self._path} has numbers with a decimal comma and others with a point; "
@@ -244,9 +254,9 @@ class TextTable:
     def _stamp(self, line: int, at: int, cell: str, times: Times) -> None:
         date = None if _is_number(cell) else _date(cell)
         if date is None:
-            times.numbers.append(self._number(line, at, cell)[0])
+            times["numbers"].append(self._number(line, at, cell)[0])
         else:
-            (times.dates if date[1] else times.clock).append(date[0])
+            times["dates" if date[1] else "times of day"].append(date[0])
 
     def _number(self, line: int, at: int, cell: str) -> tuple[float, str]:
         """Return a number, NaN of an empty cell, and the unit behind it."""
@@ -277,30 +287,6 @@ class TextTable:
             f"{self._path}, line {line}: {self.names[at]!r} is {shown}; expected a "
             f"{'finite ' if finite else ''}number"
         )
-
-
-class Times:
-    """The times of the rows, in one of three forms; all empty: the rows have none.
-
-    numbers: as they stand. dates: nanoseconds since 1970. clock: time of day in nanoseconds.
-    """
-
-    def __init__(self) -> None:
-        self.numbers: list[float] = []
-        self.dates: list[int] = []
-        self.clock: list[int] = []
-
-    def check(self, path: Path, rows: int, name: str) -> None:
-        """Refuse times of which some are dates and others numbers.
-
-        :raises BagError: if so.
-        """
-        for count, what in ((len(self.dates), "dates"), (len(self.clock), "times of day")):
-            if 0 < count < rows:
-                raise BagError(
-                    f"{path}: of {rows} cells of {name!r} {count} are {what}, the others not; "
-                    "expected one of them"
-                )
 
 
 def _lines(path: Path, text: TextIO, separator: str) -> Iterator[str]:

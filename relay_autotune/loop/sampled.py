@@ -164,22 +164,14 @@ class SampledPid:
 
     :param controller: the gains.
     :param period: period of the samples [s].
-    :param low: least command [u].
-    :param high: largest command [u].
-    :raises TuningError: if the period is not positive or the limits leave no range.
+    :param limits: range of the command.
+    :raises TuningError: if the period is not positive.
     """
 
-    def __init__(
-        self,
-        controller: Controller,
-        period: float,
-        *,
-        low: float = -math.inf,
-        high: float = math.inf,
-    ) -> None:
+    def __init__(self, controller: Controller, period: float, limits: Limits = UNLIMITED) -> None:
         require_period(period)
         self.period = period
-        self._limits = Limits(low, high)
+        self._limits = limits
         self._motion = filter_matrices(controller.tf, period)
         self._law = PidLaw(0.0, 0.0)
         self._gains = controller
@@ -245,7 +237,7 @@ def simulate_closed_loop(
     """
     law: SampledController
     if isinstance(controller, Controller):
-        law = SampledPid(controller, period, low=low, high=high)
+        law = SampledPid(controller, period, Limits(low, high))
     else:
         law = controller
     plant = Plant(model)

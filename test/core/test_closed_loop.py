@@ -13,7 +13,12 @@ from scipy.linalg import expm
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import noise_gain, open_noise_gain, step_responses
-from relay_autotune.loop.sampled import SampledPid, filter_matrices, simulate_closed_loop
+from relay_autotune.loop.sampled import (
+    Limits,
+    SampledPid,
+    filter_matrices,
+    simulate_closed_loop,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, analyse_loop
 
@@ -118,7 +123,7 @@ def test_a_period_or_limits_without_sense_are_refused():
         with pytest.raises(TuningError, match="sampling period"):
             SampledPid(PI, bad)
     with pytest.raises(TuningError, match="no range"):
-        SampledPid(PI, 1.0, low=1.0, high=1.0)
+        SampledPid(PI, 1.0, Limits(1.0, 1.0))
 
 
 def test_the_integrated_error_is_that_of_the_samples():
