@@ -238,8 +238,8 @@ class Rig:
             self.executor.spin_once(timeout_sec=0.05)
         return future.result() if future.done() else None
 
-    def ask_for_tune(self, **request: Any) -> Any:
-        name = "relay_node/start_tune"
+    def ask_for_tune(self, node: str = "relay_node", **request: Any) -> Any:
+        name = f"{node}/start_tune"
         return self.call(StartTune, name, StartTune.Request(**request), again=15.0)
 
     def tune(self, **request: Any) -> Any:

@@ -48,7 +48,15 @@ class RunningTune:
         return self.rig.until(lambda: self.experiments, "the record")[-1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+# The safe command after each of them is one of the faults of test_faults.py.
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGINT, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.nightly),
+    ],
+)
 def test_a_signal_leaves_the_safe_command_and_a_whole_bag(rig: Rig, number: int) -> None:
     tune = RunningTune(rig)
     rig.run_for(0.7)
@@ -171,7 +179,15 @@ sys.exit(relay.main())
     assert len(record) == 100
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1])
+# All nodes have the handler with which test_faults.py ends relay_node by each signal.
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGHUP,
+        pytest.param(signal.SIGQUIT, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGUSR1, marks=pytest.mark.nightly),
+    ],
+)
 def test_nodes_that_command_nothing_end_in_order_too(rig: Rig, number: int) -> None:
     plant = rig.plant(sample_period=0.02, structure="fopdt", time_constants=[1.0])
     nodes = [rig.identifier(), plant]

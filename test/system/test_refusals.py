@@ -252,7 +252,8 @@ def test_a_misspelt_name_in_a_file_is_told(rig: Rig) -> None:
     process.end()
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
+# The safe command after either is one of the faults of test_faults.py.
+@pytest.mark.parametrize("bad", [math.nan, pytest.param(math.inf, marks=pytest.mark.nightly)])
 def test_a_measurement_that_is_no_number_ends_the_tune(rig: Rig, bad: float) -> None:
     experiments = rig.listen("relay_experiment", RelayExperiment)
     relay = rig.relay(amplitude=1.0, baseline=0.5)

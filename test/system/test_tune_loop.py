@@ -13,7 +13,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from loop_rig import RELIABLE, Rig
@@ -59,9 +58,8 @@ def error(said: str) -> str:
 
 def ready(rig: Rig) -> None:
     """Wait until a tune could start, by repeated requests."""
-    deadline = time.monotonic() + 90.0
-    while run(rig, "--namespace", "/tank", "--dry-run")[0]:
-        assert time.monotonic() < deadline, rig.logs()
+    asked = {"node": "tank/relay_node", "dry_run": True}
+    rig.until(lambda: rig.ask_for_tune(**asked).accepted, "a loop that is ready")
 
 
 def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
