@@ -13,7 +13,9 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -259,78 +261,159 @@ _NUMBERS = {"isa": _ISA, "series": _ISA, "parallel": {"p": "u/y", "i": "u/(y s)"
 _UNITS_JUDGED = ("", "", "", "deg", "y s/u")
 
 
-def process_lines(task: DesignTask, width: int) -> list[str]:
-    """Return the process that is tuned for, and the law, if one was named.
+@dataclass
+class _Designs:
+    """The gains that some rules give for a process.
 
     :param task: what is designed.
-    :param width: columns that a line may have.
-    """
-    model, options = task.model, task.options
-    lines = labelled("process", f"{process_text(model)}   ({model.structure})", width)
-    if options.law:
-        lines += labelled("law", f"{options.law} every {options.sample_period:g} s", width)
-    return [*lines, ""]
-
-
-def further_forms(gains: Gains, form: str) -> list[tuple[str, str]]:
-    """Return gains in the form asked for, in addition to the forms that are always shown.
-
-    :param gains: the gains.
-    :param form: "isa", "parallel" or "series".
-    :return: name and numbers.
-    :raises TuningError: if they have no series form.
-    """
-    if form != "series":
-        return []
-    series = series_form(gains)
-    numbers = "   ".join(f"{n} {digits(getattr(series, n))} {unit}" for n, unit in _ISA.items())
-    return [("series form", f"{numbers}   alpha {digits(series.alpha, 3)}")]
-
-
-def side_by_side(
-    gains: Sequence[Gains],
-    recommended: int | None,
-    form: str,
-    inside: Sequence[tuple[Compensator, Performance]],
-    width: int,
-) -> list[str]:
-    """Return a line for every rule that applies, and one for each controller with a model inside.
-
-    :param gains: of the rules that apply.
-    :param recommended: index of the recommended gains; None: there are none.
-    :param form: in which they are shown.
-    :param inside: each compensator with what it does on the model.
-    :param width: columns that a line may have.
-    """
-    rows: list[tuple[str, ...]] = []
-    if gains:
-        rows.append(("", *_NUMBERS[form], *_HEADINGS[3:]))
-        for k, each in enumerate(gains):
-            mark = "* " if k == recommended else "  "
-            rows.append((mark + each.rule, *_in_form(each, form), *_judged(each)))
-        rows.append(("", *_NUMBERS[form].values(), *_UNITS_JUDGED))
-    if inside:
-        rows.append(("",) * 9)
-        rows.append(("with a model inside", *("",) * 8))
-        rows.append(("", "lambda", "DM", "", *_HEADINGS[3:]))
-        for compensator, found in inside:
-            numbers = digits(compensator.closed_loop_time), digits(found.delay_margin, 3), ""
-            rows.append((f"  {compensator.name}", *numbers, *_judged(found)))
-        rows.append(("", "s", "s", "", *_UNITS_JUDGED))
-    return in_columns(rows, width)
-
-
-def refusal_lines(refused: Mapping[str, str], width: int) -> list[str]:
-    """Return why rules give no gains.
-
+    :param rule: the rule that was asked for.
+    :param form: in which gains are shown: "isa", "parallel" or "series".
+    :param gains: those of the rules that apply, the chosen one's first.
     :param refused: by name, why a rule gives none.
-    :param width: columns that a line may have.
     """
-    if not refused:
-        return []
-    indent = max(map(len, refused)) + 6
-    told = [labelled(f"  {name}", why, width, indent=indent) for name, why in refused.items()]
-    return ["", "  no gains by", *(line for lines in told for line in lines)]
+
+    task: DesignTask
+    rule: str
+    form: str
+    gains: list[Gains] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def by_all_rules(cls, task: DesignTask, rule: str, form: str) -> _Designs:
+        """Return the gains of every rule."""
+        found = cls(task, rule, form)
+        for name in sorted(RULES, key=lambda n: n != rule):
+            try:
+                found.gains.append(design(task, name))
+            except TuningError as error:
+                found.refused[name] = str(error)
+        return found
+
+    @property
+    def recommended(self) -> int | None:
+        """Index of the gains of the rule that was asked for; None: it gives none."""
+        return 0 if self.gains and self.gains[0].rule == self.rule else None
+
+    @cached_property
+    def inside(self) -> list[tuple[Compensator, Performance]]:
+        """Controllers with a model inside, each with what it does; others are noted as refused."""
+        found, task = [], self.task
+        for name, make in COMPENSATORS.items():
+            try:
+                made = make(task)
+                found.append((made, analyse_loop(made.law, task.in_loop(task.model))))
+            except TuningError as error:
+                self.refused[name] = str(error)
+        return found
+
+    def one(self) -> list[str]:
+        """Return the only gains in full, as lines.
+
+        :raises TuningError: if they do not have the form.
+        """
+        (gains,), forms = self.gains, []
+        if self.form == "series":
+            series = series_form(gains)
+            told = "   ".join(
+                f"{n} {digits(getattr(series, n))} {unit}" for n, unit in _ISA.items()
+            )
+            forms = [("series form", f"{told}   alpha {digits(series.alpha, 3)}")]
+        return [*self._process(), *gains_lines(gains, width=width(), forms=forms)]
+
+    def side_by_side(self) -> list[str]:
+        """Return a line for each rule and each controller with a model inside, and why not."""
+        rows: list[tuple[str, ...]] = []
+        if self.gains:
+            rows.append(("", *_NUMBERS[self.form], *_HEADINGS[3:]))
+            for k, each in enumerate(self.gains):
+                mark = "* " if k == self.recommended else "  "
+                rows.append((mark + each.rule, *self._in_form(each), *_judged(each)))
+            rows.append(("", *_NUMBERS[self.form].values(), *_UNITS_JUDGED))
+        if self.inside:
+            rows.append(("",) * 9)
+            rows.append(("with a model inside", *("",) * 8))
+            rows.append(("", "lambda", "DM", "", *_HEADINGS[3:]))
+            for compensator, found in self.inside:
+                numbers = digits(compensator.closed_loop_time), digits(found.delay_margin, 3), ""
+                rows.append((f"  {compensator.name}", *numbers, *_judged(found)))
+            rows.append(("", "s", "s", "", *_UNITS_JUDGED))
+        lines = [*self._process(), *in_columns(rows, width())]
+        if self.refused:
+            lines += ["", "  no gains by"]
+        indent = max(map(len, self.refused), default=0) + 6
+        for name, why in self.refused.items():
+            lines += labelled(f"  {name}", why, width(), indent=indent)
+        return lines
+
+    def document(self, *, every: bool) -> dict[str, Any]:
+        """Return the gains as a document.
+
+        :param every: whether all rules were asked.
+        :raises TuningError: if the only gains do not have the form.
+        """
+        model = self.task.model
+        inside = self.inside if every else []
+        found: dict[str, Any] = {
+            "model": {"structure": model.structure, **model_fields(model)},
+            "gains": list(map(self._fields, self.gains)),
+            "recommended": self.recommended if every else 0,
+            "refused": self.refused,
+        }
+        if inside:
+            found["compensators"] = [
+                {
+                    "name": each.name,
+                    "closed_loop_time": each.closed_loop_time,
+                    **to_document(performance),
+                    "reason": each.reason,
+                }
+                for each, performance in inside
+            ]
+        return found
+
+    def case(self) -> Case:
+        """Return the model as a page shows it."""
+        from relay_autotune.report.case import Case, given_model
+
+        return Case(
+            source=process_text(self.task.model),
+            experiment_id="",
+            start=0.0,
+            duration=0.0,
+            outcome=Outcome.UNKNOWN,
+            reason="",
+            models=(given_model(self.task.model),),
+            selected=0,
+            gains=tuple(self.gains),
+            recommended=self.recommended,
+            added_delay=self.task.options.added_delay,
+        )
+
+    def _process(self) -> list[str]:
+        """Return the process that is tuned for, and the law, if one was named."""
+        model, options = self.task.model, self.task.options
+        lines = labelled("process", f"{process_text(model)}   ({model.structure})", width())
+        if options.law:
+            lines += labelled("law", f"{options.law} every {options.sample_period:g} s", width())
+        return [*lines, ""]
+
+    def _in_form(self, gains: Gains) -> tuple[str, ...]:
+        try:
+            found = series_form(gains) if self.form == "series" else gains
+        except TuningError:
+            return "no", "series", "form"
+        return tuple(digits(getattr(found, name)) for name in _NUMBERS[self.form])
+
+    def _fields(self, gains: Gains) -> dict[str, Any]:
+        fields = to_document(gains)
+        if self.form == "series":
+            try:
+                fields["series"] = dict(vars(series_form(gains)))
+            except TuningError as error:
+                if len(self.gains) == 1:
+                    raise
+                fields["series"] = {"reason": str(error)}
+        return fields
 
 
 def _judged(found: Gains | Performance) -> tuple[str, ...]:
@@ -339,14 +422,6 @@ def _judged(found: Gains | Performance) -> tuple[str, ...]:
         digits(math.degrees(found.phase_margin), 3),
         digits(found.iae_load, 3),
     )
-
-
-def _in_form(gains: Gains, form: str) -> tuple[str, ...]:
-    try:
-        found = series_form(gains) if form == "series" else gains
-    except TuningError:
-        return "no", "series", "form"
-    return tuple(digits(getattr(found, name)) for name in _NUMBERS[form])
 
 
 PROGRAM = "tune"
@@ -450,131 +525,35 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.web:
         check_web(options)
     task = task_of_model(model_of(options), design_options(options))
-    found = _by_all_rules(task, rule) if options.table or options.web else ([], {})
-    if options.table:
-        status = _side_by_side(task, rule, options, *found)
-    else:
-        status = _one(task, rule, options)
+    if options.table or options.web:
+        every = _Designs.by_all_rules(task, rule, options.form)
+    status = _told(every, options) if options.table else _one(task, rule, options)
     if options.web:
-        show(PROGRAM, parser, options, [_to_shape(task, rule, found[0])])
+        show(PROGRAM, parser, options, [(every.case(), Shaping(task))])
     return status
-
-
-def _to_shape(task: DesignTask, rule: str, gains: Sequence[Gains]) -> tuple[Case, Shaping]:
-    """Return a model that was given as a page shows it, and what the design of gains takes."""
-    from relay_autotune.report.case import Case, given_model
-
-    case = Case(
-        source=process_text(task.model),
-        experiment_id="",
-        start=0.0,
-        duration=0.0,
-        outcome=Outcome.UNKNOWN,
-        reason="",
-        models=(given_model(task.model),),
-        selected=0,
-        gains=tuple(gains),
-        recommended=0 if gains and gains[0].rule == rule else None,
-        added_delay=task.options.added_delay,
-    )
-    return case, Shaping(task)
 
 
 def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     gains = design(task, rule)
+    found = _Designs(task, rule, options.form, [gains])
     if options.export is not None:
         write(exported(gains, options.export, export_target(options)), options.output)
     elif options.json:
-        _print_document(task, [gains], {}, 0, options.form)
+        print(to_json(found.document(every=False)), flush=True)
     else:
-        columns = width()
-        lines = gains_lines(gains, width=columns, forms=further_forms(gains, options.form))
-        print("\n".join([*process_lines(task, columns), *lines]))
+        print("\n".join(found.one()))
     return DONE
 
 
-def _side_by_side(
-    task: DesignTask,
-    rule: str,
-    options: argparse.Namespace,
-    gains: Sequence[Gains],
-    refused: dict[str, str],
-) -> int:
-    recommended = 0 if gains and gains[0].rule == rule else None
-    inside = _compensators(task, refused)
+def _told(found: _Designs, options: argparse.Namespace) -> int:
     if options.json:
-        _print_document(task, gains, refused, recommended, options.form, inside)
+        print(to_json(found.document(every=True)), flush=True)
     else:
-        columns = width()
-        lines = side_by_side(gains, recommended, options.form, inside, columns)
-        lines += refusal_lines(refused, columns)
-        print("\n".join([*process_lines(task, columns), *lines]))
-    if not gains:
+        print("\n".join(found.side_by_side()))
+    if not found.gains:
         say(PROGRAM, "no rule gives gains for this model")
         return NOTHING_FOUND
     return DONE
-
-
-def _by_all_rules(task: DesignTask, rule: str) -> tuple[list[Gains], dict[str, str]]:
-    """Return the gains of every rule, the chosen one's first, and why others give none."""
-    gains: list[Gains] = []
-    refused: dict[str, str] = {}
-    for name in sorted(RULES, key=lambda n: n != rule):
-        try:
-            gains.append(design(task, name))
-        except TuningError as error:
-            refused[name] = str(error)
-    return gains, refused
-
-
-def _compensators(
-    task: DesignTask, refused: dict[str, str]
-) -> list[tuple[Compensator, Performance]]:
-    """Return the controllers with a model inside, and note why others do not apply."""
-    found = []
-    for name, make in COMPENSATORS.items():
-        try:
-            made = make(task)
-            found.append((made, analyse_loop(made.law, task.in_loop(task.model))))
-        except TuningError as error:
-            refused[name] = str(error)
-    return found
-
-
-def _print_document(
-    task: DesignTask,
-    gains: Sequence[Gains],
-    refused: dict[str, str],
-    recommended: int | None,
-    form: str,
-    inside: Sequence[tuple[Compensator, Performance]] = (),
-) -> None:
-    found = []
-    for each in gains:
-        fields = to_document(each)
-        if form == "series":
-            try:
-                series = series_form(each)
-                fields["series"] = dict(vars(series))
-            except TuningError as error:
-                if len(gains) == 1:
-                    raise
-                fields["series"] = {"reason": str(error)}
-        found.append(fields)
-    compensators = [
-        {
-            "name": each.name,
-            "closed_loop_time": each.closed_loop_time,
-            **to_document(performance),
-            "reason": each.reason,
-        }
-        for each, performance in inside
-    ]
-    model = {"structure": task.model.structure, **model_fields(task.model)}
-    document = {"model": model, "gains": found, "recommended": recommended, "refused": refused}
-    if compensators:
-        document["compensators"] = compensators
-    print(to_json(document), flush=True)
 
 
 if __name__ == "__main__":

@@ -254,20 +254,12 @@ def _ultimate(
         return ()
     true = ultimate_point(truth) if truth is not None else None
     gain, frequency = (math.nan, math.nan) if true is None else (true.gain, true.frequency)
-    rows = (
-        ("ultimate_gain", found.ultimate_gain, found.ultimate_gain_std, "u/y", gain),
-        (
-            "ultimate_frequency",
-            found.ultimate_frequency,
-            found.ultimate_frequency_std,
-            "rad/s",
-            frequency,
-        ),
-    )
-    return tuple(
-        EstimatedQuantity(n, v, v - NORMAL_95 * std, v + NORMAL_95 * std, unit, truth=t)
-        for n, v, std, unit, t in rows
-    )
+    rows = []
+    for name, unit, t in (("gain", "u/y", gain), ("frequency", "rad/s", frequency)):
+        value, std = (getattr(found, f"ultimate_{name}{end}") for end in ("", "_std"))
+        low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
+        rows.append(EstimatedQuantity(f"ultimate_{name}", value, low, high, unit, truth=t))
+    return tuple(rows)
 
 
 # Bytes of a file of results, and cycles of an experiment in it.

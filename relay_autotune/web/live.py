@@ -14,7 +14,6 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -199,15 +198,15 @@ class Live:
         with self._lock:
             told = _document(self._told)
             shown = dict(self._shown)
-            kept = {name: list(signal.kept) for name, signal in self._signals.items()}
-        time_, measurement = (np.array(part) for part in _columns(kept["measurement"]))
-        held, command = (np.array(part) for part in _columns(kept["command"]))
+            kept = {
+                name: np.array(signal.kept).reshape(-1, 2).T
+                for name, signal in self._signals.items()
+            }
+        at, measurement = kept["measurement"]
+        held, command = kept["command"]
         if command.size > 1:
             held, command = in_steps(held, command)
-        found = {
-            "measurement": curve(time_, measurement),
-            "command": curve(held, command),
-        }
+        found = {"measurement": curve(at, measurement), "command": curve(held, command)}
         return {"live": told, "samples": found, "shown": shown, "all": True}
 
     def news(self) -> dict[str, Any] | None:
@@ -228,10 +227,6 @@ class Live:
         if samples:
             news["samples"] = samples
         return news or None
-
-
-def _columns(samples: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [t for t, _ in samples], [value for _, value in samples]
 
 
 def _document(told: Told) -> dict[str, Any]:
