@@ -246,7 +246,7 @@ def check_web(options: argparse.Namespace) -> None:
 
     :param options: with those of :func:`add_web`.
     :raises MissingPackageError: if the package that serves it is not installed.
-    :raises SelectionError: if its address is none.
+    :raises SelectionError: if its address is not valid.
     """
     if importlib.util.find_spec("tornado") is None:
         raise MissingPackageError(

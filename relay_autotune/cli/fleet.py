@@ -172,7 +172,7 @@ class ResultsFile:
 
 
 def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each experiment of a bag; one with the error alone where there is none.
+    """Yield a row for each experiment of a bag; for none, a row with the error alone.
 
     :param document: as `replay --json` prints it.
     """

@@ -108,8 +108,8 @@ def replay(
     """Read, identify and tune; return also the analyses themselves.
 
     :param job: what to do.
-    :param progress: told of how far a bag has been read.
-    :param tell: told of what the computation is at.
+    :param progress: called with how much of a bag is read, and of how much.
+    :param tell: called with the stage of the computation, in words.
     """
     said: list[str] = []
     try:
@@ -153,8 +153,8 @@ def analysed(
 
     :param job: what to do.
     :param said: gets sentences for standard error.
-    :param progress: told of how far a bag has been read.
-    :param tell: told of what the computation is at.
+    :param progress: called with how much of a bag is read, and of how much.
+    :param tell: called with the stage of the computation, in words.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
     if job.jointly:

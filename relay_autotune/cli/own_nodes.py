@@ -308,7 +308,7 @@ _OF_NEW_LOOP: dict[str, dict[str, Any]] = {
     "export": {"metavar": "FILE", "help": "write the gains for ros2_controllers' pid_controller"},
 }  # fmt: skip
 
-# Flags of a loop without nodes that have a meaning only where the loop is opened, and never.
+# Flags of a loop without nodes that a joint takes with --open alone, and those it never takes.
 _OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
 _OF_TOPICS = (
     "command", "command_field", "command_period", "verify", "step", "law", "sample_period",

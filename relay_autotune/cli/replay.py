@@ -179,7 +179,7 @@ def _recordings(given: Sequence[str]) -> list[str]:
     """Return what of the command line can be a recording; a pattern such as bags/* names more."""
     found = [name for name in given if len(given) == 1 or may_be_recording(Path(name))]
     if not found:
-        # Each then says by itself what it is.
+        # The error of each then says what it is.
         return list(given)
     for name in dict.fromkeys(given):
         if name not in found:

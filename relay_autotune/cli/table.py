@@ -101,7 +101,7 @@ def _experiment(analysis: Analysis, which: str) -> list[_Entry]:
 def _verdict(judgement: Judgement) -> list[_Entry]:
     worse = [f for f in judgement.findings if f.result is not Result.PASSED]
     if judgement.contradicted and not judgement.refused:
-        # The worst of them stands in the place of the gains.
+        # The worst finding is shown where the gains would be.
         worse = [f for f in worse if f is not judgement.worst]
     return [
         ("verdict", judgement.verdict.name.lower()),

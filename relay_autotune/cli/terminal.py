@@ -258,7 +258,7 @@ class Working:
         line.clear()
 
 
-# A number as people type it: with a unit, which counts for nothing. A thousand is no unit.
+# A number as people type it, with a unit that is not read; a k for thousand is no unit.
 _UNIT = r"\s*(?!to\b|and\b|k\b|e\b)[^\W\d_][\w/^*]*|\s*[%°][a-z]*"
 _NUMBER = rf"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(?:{_UNIT})?"
 # What stands between two; a single point belongs to a number, and so does a dash before which

@@ -132,7 +132,7 @@ class _LoopOnPage:
         self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
         self._interrupted: list[int] = []
         self._gains = GainsPage(client, self._live, page, number, self._is_to_end)
-        # Of the running tune: messages of the cycles, K_u after each, signals and wishes to end
+        # About the running tune: messages of the cycles, K_u after each, signals and wishes to end
         # it, how many of the signals are among these, and what is done at its first feedback.
         self._cycles: list[Any] = []
         self._ultimate: list[tuple[int, EstimatedQuantity]] = []
@@ -311,7 +311,7 @@ class _LoopOnPage:
         self._live.tell(status=text, tone="warn")
         self._terminal.say(text)
 
-    # What comes of it.
+    # The result of a tune.
 
     def _add_subject(self, result: Any) -> None:
         """Show the model of the tune, and let its gains be shaped."""

@@ -167,7 +167,7 @@ def beside_present(case: Case) -> tuple[Row, ...]:
 
 
 def performance_of(present: Controller, case: Case) -> Performance | None:
-    """Return what the present gains do on the model; None: the loop is unstable, or there is none.
+    """Return what the present gains do on the model; None: no model, or an unstable loop.
 
     :param present: the gains.
     :param case: the experiment.

@@ -70,7 +70,7 @@ def address_of(text: str) -> Address:
     """Return an address from the command line, with a new token unless it is the loopback's.
 
     :param text: such as 127.0.0.1:8080, 0.0.0.0 or [::]:8080.
-    :raises SelectionError: if it is none.
+    :raises SelectionError: if the text is no address.
     """
     try:
         parts = urlsplit(f"//{text}")

@@ -129,7 +129,7 @@ _POLICY = (
 _LARGEST_QUESTION = 1 << 16
 # How long open pages may take to hear of the end [s].
 _ENDS_WITHIN = 5.0
-# Interval of what is told without being asked [s].
+# Interval of the news that pages get without asking [s].
 _EVERY = 0.5
 # Interval of samples [s]; the eye sees no more, and relay_node needs the processor.
 _LIVE_EVERY = 0.04
@@ -146,7 +146,7 @@ class Page:
     :param exports: returns the kinds of files that gains for a law can be written into.
     :param export: returns gains as such a file, with its kind and what makes them doubtful.
     :param address: where it is served.
-    :param lives: the loops that are watched; empty: the page is of what there is.
+    :param lives: the loops that are watched; empty: it shows models alone.
     """
 
     def __init__(
@@ -407,7 +407,7 @@ class _Socket(_Guarded, WebSocketHandler):
         self._waits: asyncio.Task[None] | None = None
         self._present: dict[int, Controller | None] = {}
         self._shown = 0
-        # What is new until now is part of everything.
+        # Everything includes what is new until now.
         self.page.tell_news()
         for number, live in enumerate(self.page.lives):
             self.tell(wire.to_text({"loop": number} | live.everything()))

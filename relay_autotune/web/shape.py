@@ -35,9 +35,9 @@ from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
 # What the slider asks for: from calm to fast.
 CALM, FAST, STEP = 1.2, 2.0, 0.02
-# Every so many of its positions are computed first, between which gains are sketched.
+# Each eighth position is computed first; between them gains are sketched.
 _ROUGH = 8
-# Ms that are farther than this from one that is asked for tell too little of its gains.
+# Gains known for an Ms farther away than this say too little of those that are asked for.
 _NEAR = 0.2
 # Instants of a response that is drawn, and frequencies of the band about a Nyquist curve.
 _POINTS = 512
@@ -256,7 +256,7 @@ class Subject:
         part = (asked.ms - low) / (high - low)
         names = [each.name for each in fields(Controller)]
         between = {n: (1.0 - part) * getattr(one, n) + part * getattr(other, n) for n in names}
-        # Beyond both a straight line may leave what can be.
+        # Outside of the two known ones a straight line may give a time below 0.
         between |= {n: max(between[n], 0.0) for n in ("ti", "td", "tf")}
         between["b"] = min(max(between["b"], 0.0), 1.0)
         shaping = self.shaping.asking(asked.options(self.shaping.task.options))

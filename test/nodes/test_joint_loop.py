@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from types import SimpleNamespace
 
@@ -267,6 +268,24 @@ def test_the_trajectory_to_type_holds_numbers_also_where_a_joint_is_almost_at_ze
     assert words[-1] == "trajectory_msgs/msg/JointTrajectory"
     (point,) = yaml.safe_load(text)["points"]
     assert point["positions"] == [5e-5, 0.15005]
+
+
+def test_an_opened_joint_without_limits_of_the_command_is_tuned_without_them() -> None:
+    arm = Arm()
+    loop = joint_loop(arm, arm, "arm", "arm_2")
+    options = SimpleNamespace(
+        open=True, amplitude=0.5, record_only=True, measurement=None, field="data", wait=0.0
+    )
+    tune = SimpleNamespace(
+        _loop=loop, _options=options, _manager=arm, _held=[math.nan], _baseline=0.0,
+        _client=SimpleNamespace(kind_of=lambda *_, **__: ""), _within=(-1.0, 2.0),
+        _command_within=None, _space="tune",
+        _forward=SimpleNamespace(name="forward", needs=(loop.interface,)),
+    )  # fmt: skip
+    tune._opened_ends = lambda: JointTune._opened_ends(tune)
+    words = JointTune.nodes(tune).arguments("relay_node")
+    assert "measurement_min:=-1.0" in words
+    assert not any(word.startswith("command_m") and "inf" in word for word in words)
 
 
 def test_a_joint_that_is_commanded_by_another_name_or_tells_no_output() -> None:
