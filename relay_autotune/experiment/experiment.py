@@ -26,13 +26,6 @@ from relay_autotune.record.record import Outcome, Record
 
 __all__ = ["ExperimentParameters", "RelayExperiment", "SafePolicy", "State"]
 
-_OUTCOMES = {
-    State.COMPLETED: Outcome.COMPLETED,
-    State.ABORTED: Outcome.ABORTED,
-    State.FAILED: Outcome.FAILED,
-}
-
-
 _BASELINE = SafePolicy()
 
 
@@ -104,12 +97,12 @@ class RelayExperiment(Procedure):
     @property
     def finished(self) -> bool:
         """True once the experiment has ended, however it ended."""
-        return self.state in _OUTCOMES
+        return self.state >= State.COMPLETED
 
     @property
     def outcome(self) -> Outcome:
         """How it ended: completed, aborted (on request or at a limit), failed; UNKNOWN before."""
-        return _OUTCOMES.get(self.state, Outcome.UNKNOWN)
+        return Outcome[self.state.name] if self.finished else Outcome.UNKNOWN
 
     @property
     def reason(self) -> str:
@@ -243,7 +236,7 @@ class RelayExperiment(Procedure):
         trace.add(t, y)
         over = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
         command = self.baseline if over else self._answer(trace.seen[-1], y)
-        if self.state in _OUTCOMES:
+        if self.state >= State.COMPLETED:
             command = self._ended(y)
         elif self.parameters.command_rate > 0.0:
             command = self._rate_limited(command)

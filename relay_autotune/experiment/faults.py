@@ -513,13 +513,7 @@ class ProportionalHold:
                 gain = -gain if settings.reverse_acting else gain
         if gain == 0.0:
             return None
-        return cls(
-            centre=centre,
-            gain=gain,
-            setpoint=settings.setpoint,
-            low=settings.low,
-            high=settings.high,
-        )
+        return cls(centre, gain, settings.setpoint, settings.low, settings.high)
 
     def command(self, measurement: float) -> float:
         """Return the command [u] for a measurement [y]; the centre if it is not finite."""

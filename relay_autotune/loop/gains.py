@@ -76,8 +76,7 @@ class Controller:
 
         :raises ModelError: if it has a derivative without a filter.
         """
-        gain, zeros, lags, integrators = self._factors()
-        return TransferFunction(gain, zeros, lags, integrators)
+        return TransferFunction(*self._factors())
 
     def loop(self, model: TransferFunction) -> TransferFunction:
         """Return controller times process.
@@ -85,14 +84,7 @@ class Controller:
         :param model: the process.
         :raises ModelError: if it has a derivative without a filter, and the process no lag.
         """
-        gain, zeros, lags, integrators = self._factors()
-        return TransferFunction(
-            gain * model.gain,
-            zeros + model.zeros,
-            lags + model.time_constants,
-            integrators + model.integrators,
-            model.dead_time,
-        )
+        return model.after(*self._factors())
 
     def characteristic(self, model: TransferFunction) -> tuple[TransferFunction, ...]:
         """Return the terms L_k of the characteristic equation ``1 + sum L_k(s) = 0``.
@@ -273,4 +265,8 @@ class InternalModelLaw:
 
         :param model: the process.
         """
-        return replace(self.inside, gain=-self.inside.gain), self.forward * model
+        first = self.forward
+        through = model.after(
+            first.gain, first.zeros, first.time_constants, first.integrators, first.dead_time
+        )
+        return replace(self.inside, gain=-self.inside.gain), through

@@ -245,15 +245,14 @@ class Denominator:
             first = last
         return parts
 
-    def constants(self, theta: FloatArray) -> tuple[complex, ...]:
-        """Return the time constants of all poles but the integrators [s]."""
-        parts = zip(self.factors, self.split(theta), strict=True)
-        return tuple(c for f, own in parts for c in f.constants(own) * f.multiplicity)
+    def constants(self, theta: FloatArray, more: int = 0) -> tuple[complex, ...]:
+        """Return the time constants of all poles but the integrators [s].
 
-    def extended_constants(self, theta: FloatArray) -> tuple[complex, ...]:
-        """Return the time constants with each factor one power higher [s]."""
+        :param theta: shape (parameters,).
+        :param more: powers by which each factor is higher.
+        """
         parts = zip(self.factors, self.split(theta), strict=True)
-        return tuple(c for f, own in parts for c in f.constants(own) * (f.multiplicity + 1))
+        return tuple(c for f, own in parts for c in f.constants(own) * (f.multiplicity + more))
 
     def numerators(
         self, theta: FloatArray, powers: Sequence[int], *, by_dead_time: bool = True

@@ -121,14 +121,21 @@ class TransferFunction:
             value = np.asarray(value / (1.0 + t * s))
         return value
 
-    def __mul__(self, other: TransferFunction) -> TransferFunction:
-        """Return both in series."""
+    def after(
+        self,
+        gain: float,
+        zeros: tuple[complex, ...],
+        time_constants: tuple[complex, ...],
+        integrators: int,
+        dead_time: float = 0.0,
+    ) -> TransferFunction:
+        """Return this one behind another, whose factors are given as for the class."""
         return TransferFunction(
-            self.gain * other.gain,
-            self.zeros + other.zeros,
-            self.time_constants + other.time_constants,
-            self.integrators + other.integrators,
-            self.dead_time + other.dead_time,
+            gain * self.gain,
+            zeros + self.zeros,
+            time_constants + self.time_constants,
+            integrators + self.integrators,
+            dead_time + self.dead_time,
         )
 
     def phase(self, frequency: ArrayLike) -> NDArray[np.float64]:

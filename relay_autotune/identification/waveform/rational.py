@@ -466,7 +466,7 @@ def _follow(
 ) -> FloatArray:
     """Return the outputs at the samples, shape (outputs, n); zero before the first change."""
     horizon = max(float(max(time[-1], changes[-1]) - changes[0]), np.finfo(float).tiny)
-    constants = denominator.extended_constants(own)
+    constants = denominator.constants(own, 1)
     segment = changes.searchsorted(time, side="right") - 1
     first = int(segment.searchsorted(0))
     integrators = denominator.integrators + ramps
