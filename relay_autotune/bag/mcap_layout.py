@@ -20,21 +20,12 @@ from numpy.typing import NDArray
 from relay_autotune.arrays import IntArray
 from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW
 from relay_autotune.bag.mcap_records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
     FOOTER_SIZE,
-    MESSAGE,
-    MESSAGE_INDEX,
-    METADATA,
     RECORD,
-    SCHEMA,
-    STATISTICS,
     Content,
     DamageError,
     Declarations,
+    Opcode,
     every_byte,
     indexed_offsets,
     nanoseconds,
@@ -183,7 +174,7 @@ def segment_content(source: Source, segment: Segment) -> Content:
 def is_chunk_there(source: Source, segment: Segment) -> bool:
     """Return whether a chunk begins where the index says."""
     head = source.read(segment.start, segment.start + RECORD.size)
-    return head == RECORD.pack(CHUNK, segment.end - segment.start - RECORD.size)
+    return head == RECORD.pack(Opcode.CHUNK, segment.end - segment.start - RECORD.size)
 
 
 def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
@@ -226,7 +217,7 @@ def _expand(data: memoryview, compression: str, size: int, *, whole: bool) -> by
 _PIECE = 4 << 20
 
 # Records that declare or hold messages; others are of no use inside of a chunk.
-_INSIDE = (SCHEMA, CHANNEL, MESSAGE)
+_INSIDE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 class _Scan:
@@ -258,19 +249,19 @@ class _Scan:
             begin = position + RECORD.size
             end = begin + length
             if opcode == 0 or end > source.size:
-                torn = position if opcode == CHUNK else -1
+                torn = position if opcode == Opcode.CHUNK else -1
                 break
-            if opcode == MESSAGE_INDEX:
+            if opcode == Opcode.MESSAGE_INDEX:
                 if self._chunk is not None:
                     self._chunk = replace(self._chunk, index_end=end)
             else:
                 self._settle()
-                if opcode == CHUNK:
+                if opcode == Opcode.CHUNK:
                     self._chunk = Segment(position, end, whole=True, is_chunk=True)
-                elif opcode == METADATA:
+                elif opcode == Opcode.METADATA:
                     with contextlib.suppress(DamageError):
                         self.layout.declared.take(opcode, record_body(source, begin, end))
-                elif opcode in (DATA_END, FOOTER):
+                elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     unfinished = source.read(source.size - len(MAGIC), source.size) != MAGIC
                     self._declared_again(end)
                     break
@@ -286,7 +277,7 @@ class _Scan:
         """Take channels and statistics from the end of the file, beside those of the data."""
         with contextlib.suppress(DamageError):
             for opcode, begin, end in file_records(self.source, position, self.source.size):
-                if opcode in (SCHEMA, CHANNEL, STATISTICS):
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
                     self.layout.declared.take(opcode, record_body(self.source, begin, end))
 
     def _tell_tear(self) -> None:
@@ -382,7 +373,7 @@ def layout_by_summary(source: Source) -> Layout | None:
     tail = source.read(foot, source.size)
     if len(tail) != source.size - foot or tail[-len(MAGIC) :] != MAGIC:
         return None
-    if RECORD.unpack_from(tail) != (FOOTER, FOOTER_SIZE):
+    if RECORD.unpack_from(tail) != (Opcode.FOOTER, FOOTER_SIZE):
         return None
     start, _, crc = struct.unpack_from("<QQI", tail, RECORD.size)
     if not len(MAGIC) <= start < foot or foot - start > LARGEST_SUMMARY:
@@ -412,7 +403,7 @@ def _take(summary: bytes, data_end: int, layout: Layout) -> ChunkIndex:
     offsets, end = record_offsets(summary)
     if end != len(summary):
         raise DamageError(f"a record of impossible length at {end}")
-    is_chunk = every_byte(summary, "u1")[offsets] == CHUNK_INDEX
+    is_chunk = every_byte(summary, "u1")[offsets] == Opcode.CHUNK_INDEX
     for at in offsets[~is_chunk].tolist():
         opcode, length = RECORD.unpack_from(summary, at)
         begin = at + RECORD.size
@@ -508,7 +499,7 @@ def _check_between(source: Source, chunks: ChunkIndex, data_end: int, layout: La
     ends = np.append(chunks.start, data_end)
     for gap in np.flatnonzero(begins < ends).tolist():
         for opcode, begin, end in file_records(source, int(begins[gap]), int(ends[gap])):
-            if opcode in (CHUNK, MESSAGE):
+            if opcode in (Opcode.CHUNK, Opcode.MESSAGE):
                 raise DamageError("data that the index does not know")
-            if opcode == METADATA:
+            if opcode == Opcode.METADATA:
                 layout.declared.take(opcode, record_body(source, begin, end))

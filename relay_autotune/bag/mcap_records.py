@@ -21,9 +21,14 @@ from relay_autotune.arrays import IntArray
 from relay_autotune.bag.limits import MOST_DECLARATIONS
 from relay_autotune.text import visible
 
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
-MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 0x07, 0x08, 0x0B
-METADATA, DATA_END = 0x0C, 0x0F
+
+class Opcode:
+    """The kinds of records that are read."""
+
+    FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
+    MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 0x07, 0x08, 0x0B
+    METADATA, DATA_END = 0x0C, 0x0F
+
 
 RECORD = struct.Struct("<BQ")
 # Channel, sequence, log time and publish time, before the message itself.
@@ -92,7 +97,7 @@ class Channel:
     metadata: dict[str, str]
 
 
-_DECLARING = (SCHEMA, CHANNEL, METADATA, STATISTICS)
+_DECLARING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.STATISTICS)
 
 
 class Declarations:
@@ -136,7 +141,7 @@ class Declarations:
         """
         opcodes = np.ndarray((len(content),), "u1", content)[offsets]
         damage: DamageError | None = None
-        for at in offsets[(opcodes == SCHEMA) | (opcodes == CHANNEL)].tolist():
+        for at in offsets[(opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)].tolist():
             opcode, length = RECORD.unpack_from(content, at)
             begin = at + RECORD.size
             try:
@@ -158,7 +163,7 @@ class Declarations:
         if len(self._taken) >= MOST_DECLARATIONS:
             raise DamageError(f"more than {MOST_DECLARATIONS} schemas, channels and metadata")
         self._taken.add((opcode, body))
-        if opcode == SCHEMA:
+        if opcode == Opcode.SCHEMA:
             number = unsigned(body, 0, "<H")
             name, at = text(body, 2)
             encoding, at = text(body, at)
@@ -166,7 +171,7 @@ class Declarations:
             schema = (name, encoding, definition)
             if self._schemas.setdefault(number, schema) != schema:
                 self.contradictions.append(f"two different types have the number {number}")
-        elif opcode == CHANNEL:
+        elif opcode == Opcode.CHANNEL:
             number, schema_number = unsigned(body, 0, "<H"), unsigned(body, 2, "<H")
             topic, at = text(body, 4)
             encoding, at = text(body, at)
@@ -176,7 +181,7 @@ class Declarations:
                 self.contradictions.append(
                     f"channel {number} is declared as {first[0]} and, differently, as {topic}"
                 )
-        elif opcode == METADATA:
+        elif opcode == Opcode.METADATA:
             name, at = text(body, 0)
             self.metadata.append((name, map_of_text(body, at)[0]))
         elif self.message_counts is None:
@@ -361,7 +366,7 @@ def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
     found: dict[int, IntArray] = {}
     for at in offsets.tolist():
         opcode, length = RECORD.unpack_from(indexes, at)
-        if opcode != MESSAGE_INDEX or length < 6:
+        if opcode != Opcode.MESSAGE_INDEX or length < 6:
             continue
         channel, listed = _INDEX_HEAD.unpack_from(indexes, at + RECORD.size)
         count = min(listed, length - 6) // _INDEX_ENTRY.itemsize
@@ -398,7 +403,7 @@ def sorted_records(
     :param wanted: the channels whose messages are wanted; None: all of them.
     :param declared: the channels that there are.
     """
-    is_message = _opcodes(content, offsets) == MESSAGE
+    is_message = _opcodes(content, offsets) == Opcode.MESSAGE
     others, places = offsets[~is_message], offsets[is_message]
     if not places.size:
         return Sorted({}, others, places, 0)

@@ -256,14 +256,14 @@ class _Candidate:
         return set(re.split(r"[^a-z]+", self.name.lower()))
 
     def fits(self, wanted: str) -> bool:
-        """Tell whether it is what a user named, perhaps without the element."""
+        """Return whether a user named it, perhaps without the element."""
         wanted = wanted if wanted.startswith("/") else f"/{wanted}"
         own = {self.name, f"/{self.name}", _bare(self.name), self.topic}
         return wanted in own or _bare(wanted) in own
 
 
 def has_joints(topics: Topics) -> bool:
-    """Tell by its types whether a bag has the states of joints."""
+    """Return whether a bag has the states of joints, by its types."""
     return any(kind.rpartition("/")[2] in _STATES for kind in topics.types().values())
 
 

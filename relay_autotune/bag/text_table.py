@@ -145,7 +145,7 @@ class TextTable:
         return names
 
     def _day_before_its_time(self) -> int | None:
-        """Return the place of a column of dates just before one of times of day; None: no such."""
+        """Return the place of a column of dates just before one of times of day; None: none."""
         cells = self._waiting[0][1] if self._waiting else []
         for at, (day, time) in enumerate(pairwise(cells)):
             both = _date(f"{day} {time}")

@@ -28,7 +28,7 @@ _FURTHEST = 20.0
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
 # A measurement has left its rest when this many samples in a row are further away on one side than
-# so many standard deviations, and so many times its resolution.
+# this many standard deviations and this many times its resolution.
 _OUTSIDE_SAMPLES = 5
 _OUTSIDE_STD = 5.0
 _OUTSIDE_STEPS = 5.0
