@@ -20,6 +20,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
@@ -134,11 +135,11 @@ class BagFile:
             decompressor = zstandard.ZstdDecompressor()
         parts: list[bytes] = []
         kept: list[int] = []
-        size, refusal = 0, ""
-        for number in range(len(messages)):
+        size, refusal, largest = 0, "", self._source.largest
+        for number, frame in enumerate(messages.payloads()):
             try:
-                part = _expanded(decompressor, messages.payload(number), self._source.largest)
-            except DamageError as damage:
+                part = _expanded(zstandard, decompressor, frame, largest)
+            except (DamageError, zstandard.ZstdError, MemoryError) as damage:
                 refusal = refusal or str(damage)
                 continue
             self._source.count_expanded(len(part))
@@ -158,19 +159,18 @@ class BagFile:
             )
 
 
-def _expanded(decompressor: Any, frame: bytes, largest: int) -> bytes:
+def _expanded(zstandard: ModuleType, decompressor: Any, frame: bytes, largest: int) -> bytes:
     if not frame.startswith(ZSTD_MAGIC):
         return frame
-    with expanding("zstandard") as zstandard:
-        # zstd allocates at once the size that the frame declares.
-        size = zstandard.frame_content_size(frame)
-        if size < 0:
-            raise DamageError("it does not declare its size")
-        if size > largest:
-            raise DamageError(
-                f"it declares {size} bytes, more than the {largest} that --max-chunk allows"
-            )
-        return bytes(decompressor.decompress(frame, max_output_size=size) if size else b"")
+    # zstd allocates at once the size that the frame declares.
+    size = zstandard.frame_content_size(frame)
+    if size < 0:
+        raise DamageError("it does not declare its size")
+    if size > largest:
+        raise DamageError(
+            f"it declares {size} bytes, more than the {largest} that --max-chunk allows"
+        )
+    return bytes(decompressor.decompress(frame, max_output_size=size) if size else b"")
 
 
 def _together(messages: Messages, kept: list[int], parts: list[bytes]) -> Messages:

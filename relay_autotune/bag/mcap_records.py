@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -235,6 +235,11 @@ class Messages:
 
     def __len__(self) -> int:
         return int(self.begin.size)
+
+    def payloads(self) -> Iterator[bytes]:
+        """Yield a copy of each of them, serialized."""
+        for begin, end in zip(self.begin.tolist(), self.end.tolist(), strict=True):
+            yield bytes(self.content[begin:end])
 
     def payload(self, number: int, most: int = sys.maxsize) -> bytes:
         """Return a copy of one of them, serialized, or of its beginning.

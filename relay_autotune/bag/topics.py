@@ -126,9 +126,9 @@ class Topics:
         root, found = self.root_of(topic), []
         key, channel = self._channels(topic)[0]
         for _, _, messages in self._messages({(key, channel.id): None}):
-            for number in range(len(messages)):
+            for payload in messages.payloads():
                 with suppress(BagError):
-                    found.append(decoded_message(root, messages.payload(number)))
+                    found.append(decoded_message(root, payload))
                 if len(found) == count:
                     return found
         return found
@@ -177,7 +177,7 @@ class Topics:
         }
         found: list[tuple[int, Any]] = []
         for key, _, messages in self._messages(wanted):
-            decoded = decode_messages(wanted[key], map(messages.payload, range(len(messages))))
+            decoded = decode_messages(wanted[key], messages.payloads())
             found += zip(messages.log_time.tolist(), decoded, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
 
