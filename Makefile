@@ -10,6 +10,8 @@
 
 PYTHON ?= python3
 ENTER = . ./env.sh
+# targets that run beside each other remember apart what failed
+PYTEST = python3 -m pytest -q -o cache_dir=.pytest_cache/$@
 SOURCES = setup.py docs/conf.py launch relay_autotune test tools $(wildcard bags benchmarks)
 # neither the demo nor a test shall meet the nodes of another machine
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
@@ -25,30 +27,30 @@ demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
 
 # Both environments beside each other, with the tests in the oldest one, which needs no built
-# messages. Then the running nodes by themselves, since a busy machine makes them late. Then two
-# at a time.
+# messages. Then all others beside the running nodes, which leave a seventh of two processors, and
+# which `nice` lets go first: a busy machine makes them late.
 test:
 	@status=0; $(MAKE) --no-print-directory --jobs=2 setup test-oldest || status=$$?; \
 	[ -f install/relay_autotune/.prepared ] || exit $$status; \
-	$(MAKE) --no-print-directory test-system || status=$$?; \
-	$(MAKE) --no-print-directory --jobs=2 --keep-going --output-sync=target \
-		test-core test-rest lint || status=$$?; exit $$status
+	echo "the tests run beside each other now, each prints at its end"; \
+	$(MAKE) --no-print-directory --jobs=3 --keep-going --output-sync=target \
+		test-system test-core test-rest lint || status=$$?; exit $$status
 
 test-core: setup
-	@$(ENTER) && python3 -m pytest -q test/core
+	@$(ENTER) && nice $(PYTEST) test/core
 
 # A machine that is busy with something else can miss the deadline of a running node: what failed
 # runs once more, by itself.
 ONCE_MORE = || { echo "$@: what failed runs once more, by itself"; \
-	python3 -m pytest -q --last-failed --last-failed-no-failures=none
+	$(PYTEST) --last-failed --last-failed-no-failures=none
 
-# running nodes, over real DDS; half of the time they wait, so three files at a time
+# running nodes, over real DDS, which wait much: three files at a time
 test-system: setup
-	@$(ENTER) && { python3 -m pytest -q --numprocesses=3 --dist=loadfile test/system \
+	@$(ENTER) && { $(PYTEST) --numprocesses=3 --dist=loadfile test/system \
 		$(ONCE_MORE) test/system; }; }
 
 test-rest: setup
-	@$(ENTER) && { python3 -m pytest -q --ignore=test/core --ignore=test/system \
+	@$(ENTER) && { nice $(PYTEST) --ignore=test/core --ignore=test/system \
 		$(ONCE_MORE) --ignore=test/core --ignore=test/system; }; }
 
 # the numeric core with the oldest numeric libraries, without ROS
@@ -70,7 +72,7 @@ lint: setup
 	@$(ENTER) && ruff check $(SOURCES)
 	@$(ENTER) && ruff check --preview --select CPY001 $(SOURCES)
 	@$(ENTER) && ruff format --check $(SOURCES)
-	@$(ENTER) && mypy
+	@$(ENTER) && nice mypy
 
 docs:
 	@$(PYTHON) tools/prepare.py docs
