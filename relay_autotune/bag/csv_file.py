@@ -156,7 +156,13 @@ def _log(
     order = np.argsort(time_ns, kind="stable")
     time_ns = time_ns[order]
     same = int(np.count_nonzero(np.diff(time_ns) == 0))
-    if same:
+    if 2 * same > time_ns.size:
+        time_ns, rows = _spread(time_ns)
+        notes.append(
+            f"about {rows:g} rows share each time stamp, which is coarser than the sampling: they "
+            "are spread evenly up to the next stamp"
+        )
+    elif same:
         notes.append(
             f"{same} rows have the time of the row before; of such rows the last one's command "
             "counts from then on"
@@ -173,6 +179,25 @@ def _log(
             )
         signals.append(Signal(name, time_ns[there], ordered[there]))
     return Log(signals[0], signals[1], dated, tuple(notes))
+
+
+def _spread(time_ns: IntArray) -> tuple[IntArray, float]:
+    """Return the times of rows that share coarse stamps, and how many share one.
+
+    :param time_ns: stamps in order, shape (n,).
+    """
+    stamps, counts = np.unique(time_ns, return_counts=True)
+    usual = float(np.median(counts))
+    gaps = np.diff(stamps)
+    gaps = np.append(gaps, np.median(gaps) if gaps.size else 0)
+    place = np.arange(time_ns.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    # The first stamp and the last one may have been cut short.
+    rows = counts.astype(np.float64)
+    rows[[0, -1]] = np.maximum(rows[[0, -1]], usual)
+    begin = np.zeros(counts.size)
+    begin[0] = rows[0] - counts[0]
+    share = (np.repeat(begin, counts) + place) / np.repeat(rows, counts)
+    return time_ns + np.round(share * np.repeat(gaps, counts)).astype(np.int64), usual
 
 
 def _nanoseconds(

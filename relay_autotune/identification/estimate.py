@@ -161,7 +161,9 @@ class Estimate:
     @property
     def std(self) -> FloatArray:
         """Standard deviations of the values, shape (p,); NaN: not estimated."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        # Rounding may leave a variance below zero, of which no deviation is known.
+        variance = np.diag(self.covariance)
+        return np.sqrt(np.where(variance >= 0.0, variance, math.nan))
 
     def intervals(self, quantile: float = NORMAL_95) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the 95 % intervals of the values, each of shape (p,).

@@ -142,8 +142,13 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
         return []
     earlier = held.values[: int(np.argmax(inside))]
     before = float(earlier[-1]) if earlier.size else held.initial
-    if times.size >= max(_FEWEST_CHANGES, _CONTINUOUS * (last - first)):
+    # Rows that share a time stamp are one instant, at which the command changes once.
+    instants = np.count_nonzero(np.diff(record.time[first : last + 1]))
+    if times.size >= max(_FEWEST_CHANGES, _CONTINUOUS * instants):
         found = _moving_parts(record, first, last)
+    elif times[-1] == record.time[last]:
+        # A change at the last sample, as when all is switched off, has no response behind it.
+        return _in_part(record, first, last - 1)
     else:
         changes = _Changes(times, np.concatenate(([before], values)))
         found = _switching_parts(record, last, changes)
@@ -331,20 +336,22 @@ def _steps(
 # --- a command that a controller changes all the time
 
 
-def _span(y: FloatArray) -> float:
-    """Return the range of a measurement without single outliers [y]."""
+def _without_outliers(y: FloatArray) -> FloatArray:
+    """Return a measurement without single samples far out, by medians of three."""
     if y.size < 3:
-        return float(np.ptp(y))
-    return float(np.ptp(np.median(np.lib.stride_tricks.sliding_window_view(y, 3), axis=1)))
+        return y
+    inner = np.median(np.lib.stride_tricks.sliding_window_view(y, 3), axis=1)
+    return np.concatenate((inner[:1], inner, inner[-1:]))
 
 
 def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, float, str, str]]:
     """Return the parts in which the set-point or a load moved the measurement."""
     time, y = record.time[first : last + 1], record.measurement[first : last + 1]
     edges = np.unique(np.linspace(0, y.size, min(_BLOCKS, max(y.size // 5, 1)) + 1).astype(int))
-    means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
     noise = roughness(y)
-    span = _span(y)
+    y = _without_outliers(y)
+    means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
+    span = float(np.ptp(y))
     reach = max(_NOISE * noise, _SHARE * span)
     if span < 2.5 * reach:
         return []
@@ -357,6 +364,10 @@ def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, fl
         (float(time[edges[a]]), float(time[min(edges[b], y.size - 1)]))
         for a, b in zip(bounds[::2], bounds[1::2], strict=True)
     ]
+    if not runs:
+        # It moves evenly, as on a ramp, or so fast that no window is like the others.
+        why = "the command varies all the time, and so does the measurement"
+        return [(float(time[0]), float(time[-1]), "closed loop", why)]
     merged: list[list[float]] = []
     moves: list[int] = []
     for begin, end in runs:
@@ -396,7 +407,8 @@ def _with_rest(
         high = int(np.searchsorted(record.time, min(end + length, latest), side="right")) - 1
         low, high = max(low, first), min(high, last)
         part = record.measurement[low : high + 1]
-        if part.size < 10 or float(np.ptp(part)) < 3.0 * _NOISE * noise:
+        lasting = record.time[high] > record.time[low]
+        if part.size < 10 or not lasting or float(np.ptp(part)) < 3.0 * _NOISE * noise:
             continue
         stretches.append(Stretch(low, high, kind, reason))
     return stretches

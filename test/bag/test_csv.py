@@ -373,3 +373,12 @@ def test_a_step_before_the_first_row_needs_the_command_before_it(tmp_path):
     (record,) = read_experiments(path, Selection(command_before=0.0)).experiments
     held = record.input()
     assert (held.initial, held.times.tolist(), held.values.tolist()) == (0.0, [0.0], [10.0])
+
+
+def test_rows_that_share_a_coarse_stamp_are_spread_up_to_the_next_one(tmp_path):
+    times = 0.3 + 0.25 * np.arange(200)
+    text = "".join(f"{t // 1:g},{50.0 + t:.3f},{40.0 if t < 20.0 else 60.0:g}\n" for t in times)
+    found = read_experiments(write(tmp_path / "a.csv", f"time,y,u\n{text}"))
+    (record,) = found.experiments
+    assert np.diff(record.time) == pytest.approx(0.25)
+    assert "about 4 rows share each time stamp" in found.notes[-1]

@@ -213,3 +213,26 @@ def test_a_pseudo_random_sequence_is_one_experiment_and_no_relay():
         )
         assert found.kind == "pulses"
         assert "whatever the measurement does" in found.reason
+
+
+def test_a_change_at_the_last_sample_is_left_out():
+    record = commanded([2500.0, 2600.0, TIME[-1]], [0, 1, 0.5, 0])
+    (found,) = find_experiments(record)
+    assert found.reason == "step of the command from 0 to 1 to 0.5"
+    assert found.last == len(record) - 2
+
+
+def test_an_even_ramp_under_a_command_that_varies_all_the_time_is_an_experiment():
+    rng = np.random.default_rng(7)
+    u = 1.0 + rng.normal(0.0, 0.02, TIME.size)
+    integrator = TransferFunction(0.01, integrators=1, dead_time=1.0)
+    y = response(integrator, TIME, PiecewiseConstant(TIME, u, 0.0))
+    record = Record(time=TIME, measurement=y + rng.normal(0.0, 0.01, TIME.size), command=u)
+    ((kind, begin, end),) = spans(record)
+    assert (kind, begin, end) == ("closed loop", TIME[0], TIME[-1])
+
+
+def test_rows_that_share_a_time_are_one_instant_of_the_command():
+    fine = controlled(lambda t: 50.0 + 5.0 * (t > 300.0))
+    shared = replace(fine, time=np.floor(fine.time / 4.0) * 4.0)
+    assert {stretch.kind for stretch in find_experiments(shared)} == {"closed loop"}

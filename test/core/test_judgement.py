@@ -16,7 +16,11 @@ from analysed import completed
 from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.checks import followed_share, lost_effect
+from relay_autotune.identification.judgement.checks import (
+    followed_changes,
+    followed_share,
+    lost_effect,
+)
 from relay_autotune.identification.judgement.evidence import Evidence, Loop, visible_error
 from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.judgement.table import CHECKS
@@ -317,7 +321,6 @@ def test_a_half_that_explains_the_whole_far_worse_makes_its_direction_no_more_th
     assert (share >= check.failed) is (worse < 3.0)
 
 
-@pytest.mark.long
 def fed_back(process, gain, *, steps=2000):
     """Record a proportional controller beside noise at the process's input."""
     plant = VirtualProcess(process)
@@ -402,3 +405,33 @@ def test_a_model_of_less_than_half_of_the_record_is_doubtful(record, gains, shar
     of_part = of_checks(record, replace(found, fitted=fitted), gains)["left_out"]
     assert of_part.result is result
     assert of_part.value == pytest.approx(share, abs=0.01)
+
+
+def test_a_command_that_follows_the_changes_at_once_is_a_controller_with_derivative():
+    rng = np.random.default_rng(11)
+    y = np.cumsum(rng.normal(0.0, 1.0, 2000))
+    law = 0.5 * y + 0.02 * np.cumsum(y) + 6.0 * np.diff(y, prepend=0.0)
+    record = Record(time=np.arange(2000.0), measurement=y, command=law)
+    assert followed_changes(record, 1) > 0.5
+    assert followed_changes(record, -1) is None
+
+
+def test_a_process_that_is_moved_at_random_does_not_lead_its_command():
+    rng = np.random.default_rng(12)
+    time, u = np.arange(3000.0), rng.normal(0.0, 1.0, 3000)
+    y = response(TransferFunction.fopdt(2.0, 3.0, 0.5), time, PiecewiseConstant(time, u, 0.0))
+    record = Record(time=time, measurement=y, command=u)
+    share = followed_changes(record, 1)
+    assert share is None or share < 0.05
+
+
+def test_a_rival_of_the_other_direction_leaves_no_gains():
+    (check,) = (check for check in CHECKS if check.name == "rival_direction")
+    up, down = (TransferFunction.fopdt(gain, 20.0, 5.0) for gain in (1.0, -1.0))
+    found = SimpleNamespace(model=up)
+    finding = check(SimpleNamespace(found=found, rivals=(up,), plain=(down,)))
+    assert finding.result is Result.FAILED
+    assert "moves the measurement the other way" in finding.sentence
+    alike = check(SimpleNamespace(found=found, rivals=(up,), plain=()))
+    assert alike.result is Result.PASSED
+    assert check(SimpleNamespace(found=found, rivals=(), plain=())) is None

@@ -37,6 +37,9 @@ _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
 _BUT_FEW, _OWN = (1.0, 99.0), 0.2
 # Largest share left unexplained at the same instant, relative to that left one sample away.
 _AT_ONCE = 0.5
+# Earlier changes of the measurement that a controller's law may hold, and the last changes of a
+# record that are looked at.
+_PAST, _MOST_CHANGES = 3, 20_000
 
 
 def unequal_gains(
@@ -173,6 +176,34 @@ def followed_share(record: Record, sign: int) -> float | None:
     if at_once * sign <= 0.0 or left > _AT_ONCE * min(1.0 - r**2 for r in beside):
         return None
     return at_once**2
+
+
+def followed_changes(record: Record, sign: int) -> float | None:
+    """Return the share of the command's changes that the measurement's last change adds.
+
+    A controller with derivative action makes ``du[k] = b0 dy[k] + b1 dy[k - 1] + ...``, with b0
+    against the process's sign, whereas the changes of a process come after those of its command.
+    The share is what ``dy[k]`` adds to the coefficient of determination of three earlier changes.
+
+    :param record: any record.
+    :param sign: of the process; with a b0 of the same sign a loop would run away.
+    :return: None where b0 has the other sign, or the command does not vary all the time.
+    """
+    du, dy = np.diff(record.command[-_MOST_CHANGES:]), np.diff(record.measurement[-_MOST_CHANGES:])
+    if len(record) < _LEAST_SAMPLES or not np.ptp(du) > 0.0:
+        return None
+    if 2 * np.count_nonzero(du) < du.size:
+        return None
+    lags = np.stack([dy[_PAST - k : dy.size - k] for k in range(_PAST + 1)], axis=1)
+    lags, now = lags - lags.mean(axis=0), du[_PAST:] - du[_PAST:].mean()
+    left = []
+    for columns in (lags, lags[:, 1:]):
+        factors, *_ = np.linalg.lstsq(columns, now, rcond=_ALIKE)
+        left.append((float(np.sum((now - columns @ factors) ** 2)), float(factors[0])))
+    (both, at_once), (earlier, _) = left
+    if at_once * sign <= 0.0:
+        return None
+    return (earlier - both) / float(now @ now)
 
 
 def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:

@@ -16,7 +16,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from relay_autotune.identification.judgement.assessment import misfit, unexplained_share
-from relay_autotune.identification.judgement.checks import followed_share, lost_effect
+from relay_autotune.identification.judgement.checks import (
+    followed_changes,
+    followed_share,
+    lost_effect,
+)
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.identification.result import NOT_AT_REST
@@ -53,6 +57,19 @@ def _direction(evidence: Evidence) -> Measured | None:
 def _fed_back(evidence: Evidence) -> Measured | None:
     share = followed_share(evidence.record, evidence.found.model.process_sign)
     return None if share is None else Measured(share)
+
+
+def _fed_back_changes(evidence: Evidence) -> Measured | None:
+    share = followed_changes(evidence.record, evidence.found.model.process_sign)
+    return None if share is None else Measured(share)
+
+
+def _rival_direction(evidence: Evidence) -> Measured | None:
+    models = (*evidence.rivals, *evidence.plain)
+    if not models:
+        return None
+    other = [m for m in models if m.process_sign != evidence.found.model.process_sign]
+    return Measured(len(other), process_text(other[0]) if other else "")
 
 
 def _open_dead_time(evidence: Evidence) -> Measured | None:
@@ -230,6 +247,19 @@ MODEL_CHECKS = (
         measure=_direction,
     ),
     Check(
+        name="rival_direction",
+        title="Direction of rivals",
+        what="number of models of the other direction among the other models that explain the "
+        "record as well",
+        unit="",
+        failed=0.0,
+        sentence="{detail} explains the record as well, and in it a higher command moves the "
+        "measurement the other way",
+        remedy="run a test with larger moves of the command, or record from rest without other "
+        "inputs",
+        measure=_rival_direction,
+    ),
+    Check(
         name="fed_back",
         title="Feedback",
         what="share of the command's variance that follows the measurement at the same instant, "
@@ -242,6 +272,21 @@ MODEL_CHECKS = (
         remedy="move the set-point while recording, or let a relay work in place of the "
         "controller",
         measure=_fed_back,
+    ),
+    Check(
+        name="fed_back_changes",
+        title="Feedback of changes",
+        what="share of the variance of the command's changes that the measurement's change at the "
+        "same instant explains beyond its earlier ones, in the direction that the model says "
+        "would run away",
+        unit="",
+        failed=0.5,
+        sentence="the command's changes follow those of the measurement ({value} of their "
+        "variance), in a direction in which a loop with this process would have run away: the "
+        "model is the controller, read backward",
+        remedy="move the set-point while recording, or let a relay work in place of the "
+        "controller",
+        measure=_fed_back_changes,
     ),
     Check(
         name="dead_time_open",
