@@ -107,7 +107,7 @@ def page_in_browser(found: Analysis) -> None:
     assert found.shaping is not None
     first = Asked.of("robust", found.shaping.task.options)
     subject = Subject(case, found.shaping, first, lambda _: "replay demo_output/bag")
-    page = Page([subject], lambda _: (), lambda *_: "", Address())
+    page = Page([subject], Address())
     with (
         tempfile.TemporaryDirectory() as folder,
         in_background(page) as url,

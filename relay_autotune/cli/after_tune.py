@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.apply_gains import found_lines
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, deserved, say
-from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of, write
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
@@ -47,6 +46,7 @@ from relay_autotune.cli.terminal import (
     number_of,
     tell,
     width,
+    write,
 )
 from relay_autotune.cli.tune_view import (
     Paint,
@@ -65,6 +65,7 @@ from relay_autotune.control.verification import (
     proving_step,
 )
 from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.experiment.settling import NO_REST_AT
 from relay_autotune.loop.gains import Controller, Gains

@@ -32,6 +32,7 @@ from relay_autotune.cli.terminal import (
     in_columns,
     labelled,
     width,
+    write,
 )
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
 from relay_autotune.text import digits, duration
@@ -126,13 +127,7 @@ def _work(options: argparse.Namespace) -> int:
         return apply_and_verify(client, options)
 
 
-def apply_at(
-    name: str,
-    *,
-    doubtful: bool,
-    yes: bool,
-    patience: float,
-) -> int:
+def apply_at(name: str, *, doubtful: bool, yes: bool, patience: float) -> int:
     """Offer the newest gains to a controller_node that ends with this command.
 
     :param name: its full name.
@@ -153,7 +148,7 @@ def apply_at(
 
 
 def _write(client: GainsClient, options: argparse.Namespace) -> int:
-    from relay_autotune.cli.export import WITHOUT_LAW, Target, exported, exports_of, write
+    from relay_autotune.exchange.export import WITHOUT_LAW, Target, exported, exports_of
 
     gains, doubt = client.waiting()
     _require_trust(doubt, options)

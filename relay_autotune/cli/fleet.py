@@ -43,10 +43,7 @@ _METHOD, *_ACCURACY = columns(Identification)
 _OF_MODEL = (_METHOD, *OF_PROCESS, *_ACCURACY)
 _OF_FIT = columns(FitReport)
 _OF_GAINS = columns(Gains)
-COLUMNS = (
-    *("bag", "experiment", "error"),
-    *(*_OF_EXPERIMENT, *_OF_MODEL, *_OF_FIT, *_OF_GAINS),
-)
+COLUMNS = (*("bag", "experiment", "error"), *(*_OF_EXPERIMENT, *_OF_MODEL, *_OF_FIT, *_OF_GAINS))
 _TEXTS = {
     *("bag", "error", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
     *("structure", "zeros", "time_constants"),
@@ -176,10 +173,7 @@ def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
     :param document: as `replay --json` prints it.
     """
-    base = dict.fromkeys(COLUMNS) | {
-        "bag": document["bag"],
-        "error": document.get("error"),
-    }
+    base = dict.fromkeys(COLUMNS) | {"bag": document["bag"], "error": document.get("error")}
     experiments = document.get("experiments", [])
     if not experiments:
         yield base

@@ -313,13 +313,8 @@ def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> I
 
 def _require_range(name: str, value: float) -> None:
     wanted = NUMBERS[name].range
-    good = {
-        ANY: True,
-        POSITIVE: value > 0.0,
-        NOT_NEGATIVE: value >= 0.0,
-        NOT_ZERO: value != 0.0,
-    }[wanted]
-    if not good or not math.isfinite(value):
+    good = {ANY: True, POSITIVE: value > 0.0, NOT_NEGATIVE: value >= 0.0, NOT_ZERO: value != 0.0}
+    if not good[wanted] or not math.isfinite(value):
         raise SelectionError(f"{option(name)} must be finite and {wanted}, found {value:g}")
 
 

@@ -31,9 +31,9 @@ from relay_autotune.cli.arguments import (
     given_quantities,
     say,
 )
-from relay_autotune.cli.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of
 from relay_autotune.cli.table import table
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
@@ -45,7 +45,6 @@ from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
-    from relay_autotune.loop.gains import Gains
     from relay_autotune.report.case import Case
     from relay_autotune.result import Shaping
     from relay_autotune.web.shape import Asked
@@ -471,8 +470,5 @@ def show(
 
     subjects = [subject(case, shaping) for case, shaping in models]
 
-    def written(gains: Gains, how: str, doubt: str) -> str:
-        return exported(gains, how, target, doubt=doubt)
-
-    page = Page(subjects, exports_of, written, address_of(options.web_address))
+    page = Page(subjects, address_of(options.web_address), target=target)
     run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))

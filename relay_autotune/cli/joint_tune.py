@@ -18,7 +18,6 @@ import yaml
 
 from relay_autotune.cli.apply_gains import apply_at, beside
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
-from relay_autotune.cli.export import Target
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
@@ -31,6 +30,7 @@ from relay_autotune.cli.own_nodes import (
 from relay_autotune.cli.terminal import Working, agrees, asked, number_of, pair_of, tell, width
 from relay_autotune.cli.tune_view import check_lines
 from relay_autotune.errors import LoopError, SelectionError
+from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_place import controller_of

@@ -31,9 +31,9 @@ from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.arguments import finite
-from relay_autotune.cli.export import number
 from relay_autotune.cli.terminal import Working, asked, broken, number_of, pair_of, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
+from relay_autotune.exchange.export import number
 from relay_autotune.loop.laws import LAWS
 
 if TYPE_CHECKING:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from relay_autotune.bag.reader import may_be_recording
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, add_web, check_web, guarded, say, worst
-from relay_autotune.cli.export import write
 from relay_autotune.cli.jobs import (
     Done,
     Job,
@@ -31,7 +30,7 @@ from relay_autotune.cli.report import (
     command_line,
     write_report,
 )
-from relay_autotune.cli.terminal import ProgressLine, Stages, width
+from relay_autotune.cli.terminal import ProgressLine, Stages, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.result import Analysis
 
@@ -167,9 +166,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         target = export_target(options)
         jobs = [
             replace(
-                jobs[0],
-                export=(options.export, target),
-                accept_doubtful=options.accept_doubtful,
+                jobs[0], export=(options.export, target), accept_doubtful=options.accept_doubtful
             )
         ]
     return jobs

@@ -18,7 +18,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.errors import LoopError
+from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.text import TOLD_EVERY, duration
 
 if TYPE_CHECKING:
@@ -136,6 +136,25 @@ def in_columns(rows: Sequence[Sequence[str]], columns: int) -> list[str]:
         + "".join(f"{cell:>{gap + n}}" for cell, n in zip(row[1:], others, strict=True)).rstrip()
         for row in rows
     ]
+
+
+def write(text: str, path: str | None) -> None:
+    """Write a file, or to standard output.
+
+    :param text: what it holds.
+    :param path: the file; None: standard output.
+    :raises SelectionError: if it exists already, or cannot be written.
+    """
+    if path is None:
+        print(text, end="", flush=True)
+        return
+    try:
+        with Path(path).open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise SelectionError(f"{path} exists already, not overwriting it") from error
+    except OSError as error:
+        raise SelectionError(f"{path} cannot be written: {error.strerror}") from error
 
 
 # Time after which a terminal is first told what is being done [s]: several short works in a row

@@ -29,12 +29,12 @@ from relay_autotune.cli.arguments import (
     say,
     with_negative,
 )
-from relay_autotune.cli.export import exported, write
 from relay_autotune.cli.jobs import add_design, add_export, design_options, export_target, show
 from relay_autotune.cli.table import gains_lines
-from relay_autotune.cli.terminal import in_columns, labelled, width
+from relay_autotune.cli.terminal import in_columns, labelled, width, write
 from relay_autotune.errors import ModelError, SelectionError, TuningError
 from relay_autotune.exchange.document import to_json
+from relay_autotune.exchange.export import exported
 from relay_autotune.exchange.fields import to_document
 from relay_autotune.exchange.models import model_fields
 from relay_autotune.process.structures import (

@@ -32,7 +32,6 @@ from relay_autotune.cli.arguments import (
     guarded,
     say,
 )
-from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
@@ -47,6 +46,7 @@ from relay_autotune.cli.own_nodes import (
 from relay_autotune.cli.terminal import Help, Working, agrees, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
 from relay_autotune.errors import ParameterError
+from relay_autotune.exchange.export import EXPORTS
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient

@@ -23,7 +23,6 @@ from typing import Any
 
 from relay_autotune.cli.apply_gains import verdict_lines
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, worst
-from relay_autotune.cli.export import Target, exported, exports_of
 from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.terminal import WIDEST
@@ -46,7 +45,7 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.identifier_parameters import options_from
 from relay_autotune.nodes.tune_client import TuneClient
@@ -76,11 +75,8 @@ class TunePage:
     """
 
     def __init__(self, clients: Sequence[TuneClient], options: argparse.Namespace) -> None:
-        def written(gains: Gains, how: str, doubt: str) -> str:
-            return exported(gains, how, Target(), doubt=doubt)
-
         lives = [Live(client.name) for client in clients]
-        self._page = Page((), exports_of, written, address_of(options.web_address), lives)
+        self._page = Page((), address_of(options.web_address), lives)
         self._loops = [
             _LoopOnPage(client, options, self._page, number)
             for number, client in enumerate(clients)
@@ -179,8 +175,7 @@ class _LoopOnPage:
         try:
             self._client.watch_measurement(lambda value: live.sample("measurement", value))
             self._commands_shown = self._client.command_watch(
-                lambda value: live.sample("command", value),
-                self._take_cycle,
+                lambda value: live.sample("command", value), self._take_cycle
             )
         except RelayAutotuneError as error:
             live.tell(status=str(error), tone="warn")

@@ -246,11 +246,7 @@ def model_lines(message: Any, paint: Paint, columns: int = WIDEST) -> list[str]:
 
 
 def next_commands(
-    result: Any,
-    controllers: Sequence[str],
-    prefix: str = "",
-    flags: str = "",
-    report: str = "",
+    result: Any, controllers: Sequence[str], prefix: str = "", flags: str = "", report: str = ""
 ) -> list[tuple[str, str]]:
     """Return the next commands, each with its purpose.
 

@@ -97,11 +97,7 @@ def _limit_cycle(analysis: Analysis) -> dict[str, Any] | None:
     if not analysis.cycles:
         return None
     cycle = limit_cycle(analysis.cycles)
-    return {
-        **to_document(cycle),
-        "cycles": len(cycle.cycles),
-        **_shape(analysis.record),
-    }
+    return {**to_document(cycle), "cycles": len(cycle.cycles), **_shape(analysis.record)}
 
 
 def _shape(record: Record) -> dict[str, Any]:

@@ -33,7 +33,8 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
-from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.exchange.export import Target, exported, exports_of
+from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
@@ -118,8 +119,6 @@ class Worker:
                 work()
 
 
-Export = Callable[[Gains, str, str], str]
-
 _STATIC = ("page.html", "page.css", "page.js", "plot.js", "live.js")
 # No script, style or connection but those of this server, and no page around ours.
 _POLICY = (
@@ -143,23 +142,20 @@ class Page:
     """All that a page shows, with the answers that are known.
 
     :param subjects: the models, at least one.
-    :param exports: returns the kinds of files that gains for a law can be written into.
-    :param export: returns gains as such a file, with its kind and what makes them doubtful.
     :param address: where it is served.
     :param lives: the loops that are watched; empty: it shows models alone.
+    :param target: where gains for pid_controller go that are written to a file.
     """
 
     def __init__(
         self,
         subjects: Sequence[Subject],
-        exports: Callable[[str], Sequence[str]],
-        export: Export,
         address: Address,
         lives: Sequence[Live] = (),
+        target: Target | None = None,
     ) -> None:
         self.subjects: list[Subject] = []
-        self.exports = exports
-        self.export = export
+        self.target = target or Target()
         self.address = address
         self.lives = tuple(lives)
         self.computes_ahead = True
@@ -248,7 +244,7 @@ class Page:
         subject = self.subjects[number]
         try:
             shaped = subject.shaped(asked)
-            exports = {"exports": list(self.exports(shaped.gains.law))}
+            exports = {"exports": list(exports_of(shaped.gains.law))}
             told = wire.to_text({"shaped": wire.of_shaped(subject, shaped) | exports})
         except RelayAutotuneError as error:
             told = wire.to_text({"refused": visible(str(error))})
@@ -382,13 +378,13 @@ class _Export(_Guarded):
             shaped = await asyncio.wrap_future(
                 self.page.worker.ask(partial(subject.shaped, asked))
             )
-            if name not in self.page.exports(shaped.gains.law):
+            if name not in exports_of(shaped.gains.law):
                 raise HTTPError(HTTPStatus.NOT_FOUND)
             judgement = shaped.judgement
             doubt = judgement.reason if judgement.verdict is Verdict.DOUBTFUL else ""
             if doubt and self.get_query_argument("accept_doubtful", "") != "yes":
                 raise TuningError("these gains are doubtful, and were not accepted")
-            text = self.page.export(shaped.gains, name, doubt)
+            text = exported(shaped.gains, name, self.page.target, doubt=doubt)
         except RelayAutotuneError as error:
             raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
         self.set_header("Content-Type", "text/plain; charset=utf-8")

@@ -16,9 +16,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relay_autotune.cli import export, replay, tune
-from relay_autotune.cli.export import Target, exported, number, pid_controller, plain
+from relay_autotune.cli import replay, terminal, tune
 from relay_autotune.errors import SelectionError
+from relay_autotune.exchange.export import Target, exported, number, pid_controller, plain
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, Gains, Performance
@@ -141,12 +141,12 @@ def test_plain_lines():
 
 def test_a_file_is_never_overwritten(tmp_path):
     path = tmp_path / "gains.yaml"
-    export.write("a: 1.0\n", str(path))
+    terminal.write("a: 1.0\n", str(path))
     assert path.read_text() == "a: 1.0\n"
     with pytest.raises(SelectionError, match="not overwriting"):
-        export.write("a: 2.0\n", str(path))
+        terminal.write("a: 2.0\n", str(path))
     with pytest.raises(SelectionError, match="cannot be written"):
-        export.write("a: 2.0\n", str(tmp_path / "none" / "gains.yaml"))
+        terminal.write("a: 2.0\n", str(tmp_path / "none" / "gains.yaml"))
 
 
 def test_numbers_of_numpy_are_written_like_any_other():

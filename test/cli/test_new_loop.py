@@ -21,7 +21,6 @@ from made_experiments import record_of
 
 from relay_autotune.cli import report, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
-from relay_autotune.cli.export import EXPORTS
 from relay_autotune.cli.own_nodes import (
     add_new_loop,
     is_new_loop,
@@ -31,6 +30,7 @@ from relay_autotune.cli.own_nodes import (
 )
 from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.errors import LoopError, SelectionError
+from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS

@@ -70,8 +70,6 @@ def served(
     """
     page = Page(
         subjects,
-        lambda law: ("yaml",),
-        lambda gains, how, doubt: f"{how} {gains.kc:.6g} {doubt}\n",
         address or Address(),
         [live] if live is not None else lives,
     )

@@ -265,7 +265,7 @@ def test_a_model_that_is_added_is_told_to_open_pages():
     from relay_autotune.web.address import Address
     from relay_autotune.web.server import Page, in_background
 
-    page = Page((), lambda _: (), lambda *_: "", Address(), [Live("/relay_node")])
+    page = Page((), Address(), [Live("/relay_node")])
 
     async def listen(socket):
         assert (await heard(socket, lambda m: "subjects" in m))["subjects"] == []

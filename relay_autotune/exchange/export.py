@@ -15,7 +15,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import Gains
@@ -103,10 +102,7 @@ def pid_controller(gains: Gains, target: Target) -> str:
     :param gains: what is to be loaded.
     :param target: where they go.
     """
-    clamps = (
-        ("u_clamp_max", target.command_max),
-        ("u_clamp_min", target.command_min),
-    )
+    clamps = (("u_clamp_max", target.command_max), ("u_clamp_min", target.command_min))
     values = _values(gains, LAWS[WITHOUT_LAW])
     lines = [
         *_comments(gains, (*_lacking(gains), *_signed(gains)), "#"),
@@ -193,25 +189,6 @@ def number(value: float) -> str:
         rounded = math.nextafter(rounded, math.copysign(math.inf, rounded))
         text = repr(rounded)
     return text
-
-
-def write(text: str, path: str | None) -> None:
-    """Write a file, or to standard output.
-
-    :param text: what it holds.
-    :param path: the file; None: standard output.
-    :raises SelectionError: if it exists already, or cannot be written.
-    """
-    if path is None:
-        print(text, end="", flush=True)
-        return
-    try:
-        with Path(path).open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise SelectionError(f"{path} exists already, not overwriting it") from error
-    except OSError as error:
-        raise SelectionError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _key(name: str) -> str:
