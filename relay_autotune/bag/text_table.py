@@ -132,7 +132,13 @@ class TextTable:
                     "and command, separated by commas, semicolons, tabs or spaces"
                 )
             names = [str(number) for number in range(1, width + 1)]
-            self.notes.append(f"there is no header line; the columns are called {listed(names)}")
+            why = "there is no header line"
+            if above and not _is_data(above[-1][1]) and sum(map(bool, above[-1][1])) > width // 2:
+                why = (
+                    f"line {above[-1][0]} has {len(above[-1][1])} names and the rows have {width} "
+                    "cells, so that it does not tell which is which"
+                )
+            self.notes.append(f"{why}; the columns are called {listed(names)}")
             return names
         line, cells = above[-1]
         units: list[str] = []
@@ -140,6 +146,9 @@ class TextTable:
             self.notes.append(f"line {line} holds no number and is taken for units")
             units, (line, cells) = cells, above[-2]
         self._head = cells
+        # A separator at the end of each line makes no column.
+        while not cells[-1] and not any(row[len(cells) - 1 :] > [""] for _, row in self._waiting):
+            cells = cells[:-1]
         names = [visible(name) for name in cells]
         self.units = {name: unit for name, unit in zip(names, units, strict=False) if unit}
         return names

@@ -382,3 +382,16 @@ def test_rows_that_share_a_coarse_stamp_are_spread_up_to_the_next_one(tmp_path):
     (record,) = found.experiments
     assert np.diff(record.time) == pytest.approx(0.25)
     assert "about 4 rows share each time stamp" in found.notes[-1]
+
+
+def test_a_separator_at_the_end_of_each_line_makes_no_column(tmp_path):
+    body = "".join(f"{k * 0.1!r},{k % 7},{k // 5 % 2},\n" for k in range(20))
+    (record,) = read_experiments(write(tmp_path / "a.csv", f"t,y,u,\n{body}")).experiments
+    np.testing.assert_array_equal(record.measurement, np.arange(20) % 7)
+
+
+def test_fewer_names_than_cells_are_not_taken_and_said(tmp_path):
+    body = "".join(f"{k * 0.1!r},{k % 7},{k // 5 % 2},{k}\n" for k in range(20))
+    path = write(tmp_path / "a.csv", f"t,y,u\n{body}")
+    found = read_experiments(path, Selection(measurement="2", command="3"))
+    assert found.notes[0].startswith("line 1 has 3 names and the rows have 4 cells")
