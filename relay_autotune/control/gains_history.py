@@ -15,7 +15,7 @@ guarantees:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -304,15 +304,14 @@ class GainsHistory:
 
     def _back(self) -> GainsHistory:
         """Put the newest earlier set that differs from the present one in force."""
-        for k in range(len(self.before) - 1, -1, -1):
-            if self.before[k].gains != self.gains:
-                return replace(self, in_force=self.before[k], before=self.before[:k])
-        return replace(self, in_force=None, before=())
+        return self._newest(self.before, lambda entry: entry.gains != self.gains)
 
     def _trusted(self) -> GainsHistory:
-        """Put the newest trusted set in force, or none."""
+        """Put the newest trusted set in force."""
         chain = (*self.before, *((self.in_force,) if self.in_force else ()))
-        for k in range(len(chain) - 1, -1, -1):
-            if chain[k].is_trusted and chain[k].gains not in self.failed:
-                return replace(self, in_force=chain[k], before=chain[:k])
-        return replace(self, in_force=None, before=())
+        return self._newest(chain, lambda e: e.is_trusted and e.gains not in self.failed)
+
+    def _newest(self, chain: tuple[Entry, ...], fits: Callable[[Entry], bool]) -> GainsHistory:
+        """Put the newest fitting set of a chain in force, or none, and forget those after it."""
+        k = max((k for k, entry in enumerate(chain) if fits(entry)), default=-1)
+        return replace(self, in_force=chain[k] if k >= 0 else None, before=chain[: max(k, 0)])

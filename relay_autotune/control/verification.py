@@ -194,11 +194,7 @@ def noise_of(noise_std: float, residual_rms: float) -> float:
 
 
 def proving_step(
-    record: Record,
-    model: TransferFunction,
-    measurement: Limits,
-    command: Limits,
-    noise_std: float,
+    record: Record, model: TransferFunction, measurement: Limits, command: Limits, noise_std: float
 ) -> float:
     """Return the step of the set-point that proves gains best [y], in two digits; 0: not known.
 

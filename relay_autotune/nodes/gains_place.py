@@ -294,12 +294,7 @@ class RemoteGains(Place):
                     RemoteError(f"{self.name} did not answer within {TIMEOUT:g} s")
                 )
 
-        timer = self._node.create_timer(
-            TIMEOUT,
-            give_up,
-            callback_group=self._group,
-            clock=STEADY,
-        )
+        timer = self._node.create_timer(TIMEOUT, give_up, callback_group=self._group, clock=STEADY)
         try:
             return await answer
         finally:
@@ -310,9 +305,7 @@ class RemoteGains(Place):
 _SILENCE = 2.0
 
 
-def reported_by(
-    values: Mapping[str, Any],
-) -> tuple[Callable[[Any], float] | None, CommandMessage]:
+def reported_by(values: Mapping[str, Any]) -> tuple[Callable[[Any], float] | None, CommandMessage]:
     """Return what reads the other node's command from the measurement's messages, and set-points.
 
     :param values: the parameters of controller_node.

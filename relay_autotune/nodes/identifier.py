@@ -14,13 +14,7 @@ from typing import Any
 
 from rclpy.task import Future
 
-from relay_autotune.analysis import (
-    RunningFit,
-    Task,
-    analyse,
-    analyse_jointly,
-    model_so_far,
-)
+from relay_autotune.analysis import RunningFit, Task, analyse, analyse_jointly, model_so_far
 from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,

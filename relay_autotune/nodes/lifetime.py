@@ -29,6 +29,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -360,16 +361,12 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
     except Exception as error:
         status, reason = 1, f"the node failed: {_where(error)}"
     # The safe command goes out before the reason is logged.
-    try:
-        node.end(reason)
-    except Exception as error:
-        status = 1
-        node.get_logger().fatal(f"could not end in order: {_where(error)}")
-    try:
-        executor.finish(_FINISH_WITHIN)
-    except Exception as error:
-        status = 1
-        node.get_logger().fatal(f"could not end in order: {_where(error)}")
+    for end in (partial(node.end, reason), partial(executor.finish, _FINISH_WITHIN)):
+        try:
+            end()
+        except Exception as error:
+            status = 1
+            node.get_logger().fatal(f"could not end in order: {_where(error)}")
     if status:
         node.get_logger().fatal(reason)
     signals.end()

@@ -333,11 +333,7 @@ class LoopEnds:
         """Time without a command after which the last is sent again [s]; 0: never."""
         if self.repeat_period > 0.0:
             # A command is between one and two looks old when it is sent again.
-            node.create_timer(
-                0.5 * self.repeat_period,
-                self._send_again,
-                clock=STEADY,
-            )
+            node.create_timer(0.5 * self.repeat_period, self._send_again, clock=STEADY)
         quality.subscription(
             node, Float64, "command_feedback", self._on_feedback, quality.MEASUREMENT
         )

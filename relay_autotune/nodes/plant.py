@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 import numpy as np
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64
 
@@ -199,12 +199,7 @@ class PlantNode(ServedNode):
             "lockstep": self._on_command_in_lockstep,
         }[values["mode"]]
         self._command = quality.subscription(
-            self,
-            Float64,
-            "command",
-            received,
-            QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE),
-            overridable=True,
+            self, Float64, "command", received, QoSProfile(depth=1000), overridable=True
         )
         self._start = time.monotonic()
         if values["mode"] == "lockstep":
@@ -219,9 +214,7 @@ class PlantNode(ServedNode):
             # Whether an answer to the last sample is expected, and whether it has come.
             self._waiting = self._answered = False
             self._ticked = 0.0
-            self._clock = self.create_publisher(
-                ClockMessage, "/clock", QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-            )
+            self._clock = self.create_publisher(ClockMessage, "/clock", QoSProfile(depth=1))
             self.create_timer(self._period / values["speed"], self._tick, clock=STEADY)
         else:
             self.create_timer(self._period, self._sample, clock=STEADY)

@@ -27,13 +27,10 @@ from relay_autotune.bag.writer import Qos
 
 FLOAT64_TYPE = "std_msgs/msg/Float64"
 
-# A sensor may burst after a stall of some milliseconds; at 1 kHz a depth of 1 loses samples.
-MEASUREMENT = QoSProfile(
-    depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
-)
-COMMAND = QoSProfile(
-    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
-)
+# All of these are reliable, which is rclpy's default as volatile is. A sensor may burst after a
+# stall of some milliseconds; at 1 kHz a depth of 1 loses samples.
+MEASUREMENT = QoSProfile(depth=100)
+COMMAND = QoSProfile(depth=10)
 
 
 def latched(depth: int) -> QoSProfile:
@@ -41,11 +38,7 @@ def latched(depth: int) -> QoSProfile:
 
     :param depth: number of messages kept.
     """
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 RESULT = latched(1)
@@ -61,7 +54,6 @@ _MOST_NAMED = 4
 _ALIVE_WITHIN = 1.0
 STATUS = QoSProfile(
     depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
     liveliness=LivelinessPolicy.AUTOMATIC,
     liveliness_lease_duration=Duration(seconds=_ALIVE_WITHIN),
@@ -142,9 +134,8 @@ def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
         other = _other(node, topic, kind, "measurement", node.get_publishers_info_by_topic)
         return f"{topic} has no publisher{other}"
     own = _own(node, node.get_subscriptions_info_by_topic(topic))
-    problems = _problems(ends, kind, lambda offered: qos_check_compatible(offered, own))
-    why = "; ".join(problems) or "nothing arrives"
-    return f"{topic} has {_count(len(ends), 'publisher')}, but {why}"
+    why = _problems(ends, kind, lambda offered: qos_check_compatible(offered, own))
+    return f"{topic} has {_count(len(ends), 'publisher')}, but {why or 'nothing arrives'}"
 
 
 def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
@@ -159,9 +150,8 @@ def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
         other = _other(node, topic, kind, "command", node.get_subscriptions_info_by_topic)
         return f"{topic} has no subscriber{other}"
     own = _own(node, node.get_publishers_info_by_topic(topic))
-    problems = _problems(ends, kind, lambda wanted: qos_check_compatible(own, wanted))
-    if problems:
-        return f"{topic} has no subscriber that can be served: {'; '.join(problems)}"
+    if why := _problems(ends, kind, lambda wanted: qos_check_compatible(own, wanted)):
+        return f"{topic} has no subscriber that can be served: {why}"
     return f"{topic} has {_count(len(ends), 'subscriber')}, but none is connected yet"
 
 
@@ -170,9 +160,8 @@ def _other(
 ) -> str:
     """Return what to type for the topic that may be meant: that of this type with like names."""
     first, more = nearest(node, topic, ends_of, kind)
-    if not first:
-        return ""
-    return f"; {first} has one of this type: start the node with -r {name}:={first}{more}"
+    typed = f"; {first} has one of this type: start the node with -r {name}:={first}{more}"
+    return typed if first else ""
 
 
 def nearest(
@@ -227,7 +216,7 @@ def _own(node: Node, ends: Sequence[Any]) -> Any:
     return None
 
 
-def _problems(ends: Sequence[Any], kind: str, check: Any) -> list[str]:
+def _problems(ends: Sequence[Any], kind: str, check: Any) -> str:
     problems = []
     for end in ends:
         if end.topic_type != kind:
@@ -237,7 +226,7 @@ def _problems(ends: Sequence[Any], kind: str, check: Any) -> list[str]:
         if compatibility == QoSCompatibility.ERROR:
             told = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
             problems.append(f"{who(end)} has an incompatible QoS: {told}")
-    return problems
+    return "; ".join(problems)
 
 
 def _count(number: int, noun: str) -> str:

@@ -26,12 +26,7 @@ from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
 from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import merged, values_of
-from relay_autotune.nodes.quality import (
-    described,
-    who,
-    why_no_publisher,
-    why_no_subscriber,
-)
+from relay_autotune.nodes.quality import described, who, why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
 from relay_autotune.record.record import Cycle

@@ -27,18 +27,10 @@ from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
-from relay_autotune.nodes.readiness import (
-    Checklist,
-    Readiness,
-    Ready,
-    require_settable,
-)
+from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, require_settable
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
-from relay_autotune.nodes.tables import (
-    FIXED_PARAMETERS,
-    TUNE_PARAMETERS,
-)
+from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, losses
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration

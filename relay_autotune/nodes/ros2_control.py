@@ -167,9 +167,33 @@ class ControllerManager:
         """Let a time pass [s]."""
         self._client.rest(seconds)
 
-    def still_active(self, controller: str) -> StillActive:
-        """Return what tells during a tune whether a controller is active."""
-        return StillActive(self._client, f"{self.name}{_LIST}", controller, self._kinds)
+    def still_active(self, controller: str) -> Callable[[], str]:
+        """Return what tells during a tune why a controller is not active; empty: it is.
+
+        It asks each second, and does not wait for the answer; something else spins the client.
+
+        :param controller: the controller's name.
+        """
+        kind, service = self._kinds["ListControllers"], f"{self.name}{_LIST}"
+        asked: Any = None
+        next_at = 0.0
+
+        def look() -> str:
+            nonlocal asked, next_at
+            if asked is not None and asked.done():
+                found, asked = _listed(asked.result().controller), None
+                state = {each.name: each.state for each in found}.get(controller, "not loaded")
+                if state != _ACTIVE:
+                    return (
+                        f"{controller} is {state}: its manager has ended it, and its log says why"
+                    )
+            # An answer that does not come is not waited for.
+            if time.monotonic() >= next_at + (_LOST_AFTER if asked is not None else 0.0):
+                next_at = time.monotonic() + _LOOK_EVERY
+                asked = self._client.begin(kind, service, kind.Request())
+            return ""
+
+        return look
 
     def command_for(self, activate: Collection[str], deactivate: Collection[str]) -> str:
         """Return what to type to switch controllers by hand."""
@@ -181,38 +205,6 @@ class ControllerManager:
         service = "".join(f"_{c.lower()}" if c.isupper() else c for c in kind).lstrip("_")
         asked = request if request is not None else self._kinds[kind].Request()
         return self._client.call(self._kinds[kind], f"{self.name}/{service}", asked)
-
-
-class StillActive:
-    """Ask each second whether a controller is active, without waiting for the answer.
-
-    :param client: a node of the graph, which something else spins.
-    :param service: full name of the manager's list_controllers.
-    :param controller: the controller's name.
-    :param kinds: the classes of the services.
-    """
-
-    def __init__(
-        self, client: LoopClient, service: str, controller: str, kinds: dict[str, Any]
-    ) -> None:
-        self._client, self._service, self._name = client, service, controller
-        self._kind = kinds["ListControllers"]
-        self._answer: Any = None
-        self._next = 0.0
-
-    def __call__(self) -> str:
-        """Return why the controller is not active as far as known; empty: it is."""
-        if self._answer is not None and self._answer.done():
-            states = {each.name: each.state for each in _listed(self._answer.result().controller)}
-            self._answer = None
-            state = states.get(self._name, "not loaded")
-            if state != _ACTIVE:
-                return f"{self._name} is {state}: its manager has ended it, and its log says why"
-        # An answer that does not come is not waited for.
-        if time.monotonic() >= self._next + (_LOST_AFTER if self._answer is not None else 0.0):
-            self._next = time.monotonic() + _LOOK_EVERY
-            self._answer = self._client.begin(self._kind, self._service, self._kind.Request())
-        return ""
 
 
 def _listed(found: Iterable[Any]) -> tuple[ManagedController, ...]:
@@ -411,7 +403,35 @@ class DofState:
 
 
 @dataclass(frozen=True)
-class JointLoop:
+class _Parts:
+    """What the parameters of a controller tell of its joints.
+
+    :param joints: their names in the controller's state and references, in its own order.
+    :param dofs: those in the command interfaces.
+    :param keys: those in the parameter gains.
+    :param commanded: what is commanded, such as ``effort``.
+    :param measured: what is controlled, such as ``velocity``.
+    :param has_rate: True if the derivative comes from a second state interface.
+    :param feeds: name of the parameter of the feed-forward; empty: there is none.
+    :param unrolls: True if the errors of continuous joints are wrapped.
+    :param kind: name of the message of the controller's state.
+    :param state_of: the state of a joint by its name within one; None: it is not in there.
+    """
+
+    joints: tuple[str, ...]
+    dofs: tuple[str, ...]
+    keys: tuple[str, ...]
+    commanded: str
+    measured: str
+    has_rate: bool
+    feeds: str
+    unrolls: bool
+    kind: str
+    state_of: Callable[[Any, str], DofState | None]
+
+
+@dataclass(frozen=True)
+class JointLoop(_Parts):
     """A joint, its controller, and what the controller computes from its gains.
 
     :param controller: name of the controller.
@@ -419,11 +439,7 @@ class JointLoop:
     :param joint: name of the joint, as the controller's state and reference have it.
     :param dof: its name in the parameter gains.
     :param follows: True if its references are trajectories.
-    :param joints: all that the controller has, in its own order.
-    :param dofs: the names that these have in the command interfaces.
     :param interface: the command interface, such as ``left_wheel/effort``.
-    :param measured: what is controlled, such as ``velocity``.
-    :param has_rate: True if the derivative comes from a second state interface.
     :param period: of the controller's updates [s].
     :param is_simulated: True if the robot runs on /clock.
     :param gains: p, i and d in force.
@@ -444,11 +460,7 @@ class JointLoop:
     joint: str
     dof: str
     follows: bool
-    joints: tuple[str, ...]
-    dofs: tuple[str, ...]
     interface: str
-    measured: str
-    has_rate: bool
     period: float
     is_simulated: bool
     gains: tuple[float, float, float]
@@ -467,11 +479,6 @@ class JointLoop:
     def state(self) -> DofState:
         """That of the joint."""
         return self.states[self.joints.index(self.joint)]
-
-    @property
-    def commanded(self) -> str:
-        """What is commanded, such as ``effort``."""
-        return self.interface.rpartition("/")[2]
 
     @property
     def law(self) -> str:
@@ -571,58 +578,28 @@ def joint_loop(
     own = _of_dof(client, node, parts.keys[place])
     description = _description(client, manager.namespace)
     return JointLoop(
-        controller,
-        node,
-        joints[place],
-        parts.keys[place],
-        found.type_name == TRAJECTORY_CONTROLLER,
-        joints,
-        dofs,
-        interface,
-        parts.measured,
-        parts.has_rate,
-        1.0 / _rate(client, manager, found),
-        client.values(node, ["use_sim_time"])["use_sim_time"],
-        (own["p"], own["i"], own["d"]),
-        own["antiwindup_strategy"],
-        own["tracking_time_constant"],
-        own["save_i_term"],
-        own[parts.feedforward] if parts.feedforward else 0.0,
-        own["angle_wraparound"] or (parts.unrolls and is_continuous(description, joints[place])),
-        (own["u_clamp_min"], own["u_clamp_max"]),
-        above(loaded, [controller]),
-        _states(client, node, parts),
-        limits_in(description, joints[place], parts.measured),
-        limits_in(description, dofs[place], parts.commanded),
+        **vars(parts),
+        controller=controller,
+        node=node,
+        joint=joints[place],
+        dof=parts.keys[place],
+        follows=found.type_name == TRAJECTORY_CONTROLLER,
+        interface=interface,
+        period=1.0 / _rate(client, manager, found),
+        is_simulated=client.values(node, ["use_sim_time"])["use_sim_time"],
+        gains=(own["p"], own["i"], own["d"]),
+        strategy=own["antiwindup_strategy"],
+        tracking_time_constant=own["tracking_time_constant"],
+        save_i_term=own["save_i_term"],
+        feedforward=own[parts.feeds] if parts.feeds else 0.0,
+        wraps=own["angle_wraparound"]
+        or (parts.unrolls and is_continuous(description, joints[place])),
+        clamps=(own["u_clamp_min"], own["u_clamp_max"]),
+        above=above(loaded, [controller]),
+        states=_states(client, node, parts),
+        within=limits_in(description, joints[place], parts.measured),
+        command_within=limits_in(description, dofs[place], parts.commanded),
     )
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """What the parameters of a controller tell of its joints.
-
-    :param joints: their names in the controller's state and references.
-    :param dofs: those in the command interfaces.
-    :param keys: those in the parameter gains.
-    :param commanded: what is commanded, such as ``effort``.
-    :param measured: what is controlled.
-    :param has_rate: True if the derivative comes from a second state interface.
-    :param feedforward: name of the parameter of the feed-forward; empty: there is none.
-    :param unrolls: True if the errors of continuous joints are wrapped.
-    :param kind: name of the message of the controller's state.
-    :param state_of: the state of a joint by its name within one; None: it is not in there.
-    """
-
-    joints: tuple[str, ...]
-    dofs: tuple[str, ...]
-    keys: tuple[str, ...]
-    commanded: str
-    measured: str
-    has_rate: bool
-    feedforward: str
-    unrolls: bool
-    kind: str
-    state_of: Callable[[Any, str], DofState | None]
 
 
 def _of_pid(client: LoopClient, node: str) -> _Parts:

@@ -236,11 +236,7 @@ class Session:
         }
 
     def _answer_at(
-        self,
-        received: int,
-        source: int,
-        measurement: float,
-        step: Callable[[float, float], float],
+        self, received: int, source: int, measurement: float, step: Callable[[float, float], float]
     ) -> float:
         """Take a sample with its stamps [ns]; return the command."""
         if self._count == 0:

@@ -9,12 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from relay_autotune.control.controller import (
-    LARGEST_GAIN,
-    LARGEST_VALUE,
-    LONGEST_TIME,
-    GainBounds,
-)
+from relay_autotune.control.controller import LARGEST_GAIN, LARGEST_VALUE, LONGEST_TIME, GainBounds
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS

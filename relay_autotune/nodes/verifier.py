@@ -473,23 +473,16 @@ def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Re
     message = Verification(
         kind=Verification.SETPOINT if step.setpoint else Verification.LOAD,
         step=step.setpoint or step.load,
-        passed=found.passed,
-        reason=found.reason,
-        overshoot=found.measured.overshoot,
-        overshoot_predicted=found.expected.overshoot,
-        settling_time=found.measured.settling_time,
-        settling_time_predicted=found.expected.settling_time,
-        iae=found.measured.iae,
-        iae_predicted=found.expected.iae,
-        fit=found.fit,
-        gain_ratio=found.gain_ratio,
-        ms=found.ms,
-        ms_predicted=found.ms_predicted,
         time=float64_array(t - t[0]),
         measurement=float64_array(y),
         command=float64_array(u),
         predicted=float64_array(rest.measurement + found.predicted),
     )
+    for name in ("passed", "reason", "fit", "gain_ratio", "ms", "ms_predicted"):
+        setattr(message, name, getattr(found, name))
+    for name in ("overshoot", "settling_time", "iae"):
+        setattr(message, name, getattr(found.measured, name))
+        setattr(message, f"{name}_predicted", getattr(found.expected, name))
     set_stamp(message.header.stamp, round(float(t[0]) * 1e9))
     return message
 
