@@ -141,7 +141,6 @@ class Response:
 class Comparison:
     """Comparison of a measured step with the predicted one.
 
-    :param step: the step.
     :param passed: True if every comparison is within its tolerance.
     :param reason: the problems, and the compared numbers.
     :param measured: the measured response.
@@ -153,7 +152,6 @@ class Comparison:
     :param ms_predicted: Ms with the identified model.
     """
 
-    step: Step
     passed: bool
     reason: str
     measured: Response
@@ -169,7 +167,6 @@ class Comparison:
 class Plan:
     """Duration of a step, and the deviation that stops it.
 
-    :param step: the step.
     :param duration: how long to observe it [s].
     :param runaway: deviation from rest that ends the step at once [y].
     :param peak: largest deviation of the measurement that the model predicts [y].
@@ -177,7 +174,6 @@ class Plan:
         rest [u].
     """
 
-    step: Step
     duration: float
     runaway: float
     peak: float
@@ -317,7 +313,7 @@ def plan(
             runaway = RUNAWAY * response.largest + 10.0 * noise_std
             low, high, last = run.command.min(), run.command.max(), run.command[-1]
             command = float(min(low, last - high, 0.0)), float(max(high, last - low, 0.0))
-            return Plan(step, duration, runaway, response.largest, command)
+            return Plan(duration, runaway, response.largest, command)
         horizon *= 2.0
     raise TuningError("the predicted response does not settle in any reasonable time")
 
@@ -416,7 +412,6 @@ def compare(
         f"gain {ratio:.2f} times the model's"
     )
     return Comparison(
-        step=step,
         passed=not problems,
         reason="; ".join((*told, numbers)),
         measured=measured,

@@ -27,7 +27,7 @@ from relay_autotune.errors import (
     TuningError,
 )
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.nodes import quality
+from relay_autotune.nodes import quality, tables
 from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
 from relay_autotune.nodes.gains_place import (
     OwnGains,
@@ -43,18 +43,6 @@ from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
-from relay_autotune.nodes.tables import (
-    CONTROLLER_PARAMETERS,
-    FIXED,
-    GAINS,
-    NONE_WAIT,
-    OTHERS,
-    bounds_from,
-    gains_from,
-    limits_from,
-    range_from,
-    rate_from,
-)
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
 from relay_autotune.nodes.watch import Following, Repeater, require_own_time
 from relay_autotune_msgs.action import Verify
@@ -63,7 +51,7 @@ from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 # How long the end of the process waits for the acknowledgement of its last message.
 ACKNOWLEDGE = Duration(seconds=0.2)
-NAMES_OF_GAINS = frozenset(entry.name for entry in GAINS)
+NAMES_OF_GAINS = frozenset(entry.name for entry in tables.GAINS)
 # How long the end of the process may wait for another node to restore its gains [s].
 END_WITHIN = 5.0
 
@@ -77,13 +65,13 @@ class ControllerNode(ServedNode):
 
     def __init__(self) -> None:
         super().__init__("controller_node")
-        declare(self, (*GAINS, *OTHERS))
-        declare(self, FIXED, read_only=True)
-        values = values_of(self, (*GAINS, *OTHERS, *FIXED))
+        declare(self, (*tables.GAINS, *tables.OTHERS))
+        declare(self, tables.FIXED, read_only=True)
+        values = values_of(self, (*tables.GAINS, *tables.OTHERS, *tables.FIXED))
         require_own_time(values["sample_period"], values["repeat_period"])
-        gains, self._rate = gains_from(values), rate_from(values)
+        gains, self._rate = tables.gains_from(values), tables.rate_from(values)
         if gains is not None:
-            bounds_from(values, self._rate).require(gains)
+            tables.bounds_from(values, self._rate).require(gains)
         self._results = ResultCheck(self, lambda c, model: runs_stably(c, model, self._rate))
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
@@ -93,8 +81,8 @@ class ControllerNode(ServedNode):
         self._doubt = ""
         self._applying = False
         self._predictors = Predictors(self._results.models)
-        self._limits = limits_from(values)
-        self._range = range_from(values)
+        self._limits = tables.limits_from(values)
+        self._range = tables.range_from(values)
         self._pid = running(
             self._rate,
             gains,
@@ -335,7 +323,7 @@ class ControllerNode(ServedNode):
 
     @property
     def _bounds(self) -> GainBounds:
-        return bounds_from(values_of(self, OTHERS), self._rate)
+        return tables.bounds_from(values_of(self, tables.OTHERS), self._rate)
 
     def _on_model(self, message: Any) -> None:
         if message.final and self._results.model(message) is not None:
@@ -369,7 +357,9 @@ class ControllerNode(ServedNode):
 
     async def _apply(self) -> str:
         if self._pending is None:
-            raise TuningError(f"{NONE_WAIT}; {self._refused}" if self._refused else NONE_WAIT)
+            raise TuningError(
+                f"{tables.NONE_WAIT}; {self._refused}" if self._refused else tables.NONE_WAIT
+            )
         name, gains = pending = self._pending
         try:
             # The record may have come after the gains.
@@ -399,7 +389,7 @@ class ControllerNode(ServedNode):
         """Put gains in force, and into the parameters."""
         gains = None if kept is None else self._place.controller_of(kept)
         self._pid.use(gains)
-        values: dict[str, Any] = {entry.name: entry.default for entry in GAINS}
+        values: dict[str, Any] = {entry.name: entry.default for entry in tables.GAINS}
         if gains is not None:
             values = {name: getattr(gains, name) for name in values}
         self._following = True
@@ -527,10 +517,10 @@ class ControllerNode(ServedNode):
             return
         if self._verifier.is_running:
             raise ParameterError("parameters stay as they are while a verification runs")
-        values = merged(self, (*GAINS, *OTHERS), changes)
-        limits_from(values)
-        range_from(values)
-        gains, bounds = gains_from(values), bounds_from(values, self._rate)
+        values = merged(self, (*tables.GAINS, *tables.OTHERS), changes)
+        tables.limits_from(values)
+        tables.range_from(values)
+        gains, bounds = tables.gains_from(values), tables.bounds_from(values, self._rate)
         if gains is not None:
             bounds.require(gains)
         if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
@@ -540,17 +530,17 @@ class ControllerNode(ServedNode):
         if self._following:
             return
         names = {change.name for change in changes}
-        values = values_of(self, (*GAINS, *OTHERS))
+        values = values_of(self, (*tables.GAINS, *tables.OTHERS))
         if names & NAMES_OF_GAINS and self._remote is None:
-            gains = gains_from(values)
+            gains = tables.gains_from(values)
             self._pid.use(gains)
             self._keeper.edited(self._own(gains))
-        self._range = range_from(values)
+        self._range = tables.range_from(values)
         if names & {"command_min", "command_max"}:
-            self._limits = limits_from(values)
+            self._limits = tables.limits_from(values)
             self._pid.limit(self._limits)
 
 
 def main(args: list[str] | None = None) -> int:
     """Run controller_node."""
-    return run(ControllerNode, "controller_node", args, CONTROLLER_PARAMETERS)
+    return run(ControllerNode, "controller_node", args, tables.CONTROLLER_PARAMETERS)

@@ -45,8 +45,6 @@ from relay_autotune_msgs.msg import TransferFunction as ModelMessage
 
 # How long a latched result may take to come [s].
 _RESULT_WITHIN = 5.0
-# How long the node may take to hear gains that are offered [s].
-_TAKEN_WITHIN = 5.0
 _TURN = 0.1
 # Limits that relay_node and controller_node both have.
 LIMITS = ("measurement_min", "measurement_max", "command_min", "command_max")
@@ -168,10 +166,11 @@ class GainsClient(LoopClient):
         found = self.values(self.name, [entry.name for entry in GAINS])
         return Controller(**found) if found["kc"] else None
 
-    def ask(self, service: str) -> str:
+    def ask(self, service: str, done: Callable[[], str] = lambda: "") -> str:
         """Call ~/apply, ~/revert or ~/discard, and return its answer.
 
         :param service: which of them.
+        :param done: returns a sentence where the service need not be asked again; else "".
         :raises LoopError: with the reason, if it refuses.
         """
         deadline = time.monotonic() + ANSWER_WITHIN
@@ -181,6 +180,8 @@ class GainsClient(LoopClient):
                 return str(answer.message)
             if not _is_early(answer.message) or time.monotonic() > deadline:
                 raise LoopError(f"{self.name} refuses: {answer.message}")
+            if said := done():
+                return said
             self.rest(_TURN)
 
     def has(self, gains: Controller) -> bool:
@@ -210,17 +211,8 @@ class GainsClient(LoopClient):
         offer = self._node.create_publisher(PidGains, self._resolved("pi_gains"), quality.RESULT)
         try:
             offer.publish(message)
-            deadline = time.monotonic() + _TAKEN_WITHIN
-            while True:
-                answer = self.call(Trigger, f"{self.name}/apply", Trigger.Request())
-                if answer.success:
-                    return str(answer.message)
-                if answer.message != NONE_WAIT or time.monotonic() > deadline:
-                    raise LoopError(f"{self.name} refuses: {answer.message}")
-                if self.has(gains):
-                    # auto_apply was faster.
-                    return "the gains are in force"
-                self.rest(_TURN)
+            # auto_apply may be faster.
+            return self.ask("apply", lambda: "the gains are in force" * self.has(gains))
         finally:
             self._node.destroy_publisher(offer)
 

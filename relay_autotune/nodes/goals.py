@@ -135,17 +135,6 @@ def conclude(goal: Any, result: Any, *, succeeded: bool) -> None:
     goal.execute(finish)
 
 
-_STATES = {
-    State.SETTLING: Tune.Feedback.STATE_SETTLING,
-    State.KICK: Tune.Feedback.STATE_KICK,
-    State.PROBE: Tune.Feedback.STATE_KICK,
-    State.RELAY: Tune.Feedback.STATE_RELAY,
-    State.COMPLETED: Tune.Feedback.STATE_COMPLETED,
-    State.ABORTED: Tune.Feedback.STATE_ABORTED,
-    State.FAILED: Tune.Feedback.STATE_FAILED,
-}
-
-
 class TuneAction(OneGoal):
     """Serve the action.
 
@@ -192,8 +181,10 @@ class TuneAction(OneGoal):
         """
         if self.running is None:
             return
+        # The probe is a second kick.
+        state = State.KICK if experiment.state is State.PROBE else experiment.state
         feedback = Tune.Feedback(
-            state=_STATES[experiment.state],
+            state=getattr(Tune.Feedback, f"STATE_{state.name}"),
             cycle=experiment.cycle_count,
             progress=experiment.progress,
             elapsed=experiment.elapsed,

@@ -47,20 +47,13 @@ def descriptor_of(entry: Quantity, *, read_only: bool = False) -> ParameterDescr
         return descriptor
     if not math.isfinite(entry.lower) and not math.isfinite(entry.upper):
         return descriptor
-    if isinstance(entry.default, int):
-        descriptor.integer_range = [
-            IntegerRange(
-                from_value=int(max(entry.lower, -_LARGEST_INTEGER)),
-                to_value=int(min(entry.upper, _LARGEST_INTEGER)),
-            )
-        ]
+    whole = isinstance(entry.default, int)
+    most = _LARGEST_INTEGER if whole else sys.float_info.max
+    low, high = max(entry.lower, -most), min(entry.upper, most)
+    if whole:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     else:
-        descriptor.floating_point_range = [
-            FloatingPointRange(
-                from_value=max(entry.lower, -sys.float_info.max),
-                to_value=min(entry.upper, sys.float_info.max),
-            )
-        ]
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     return descriptor
 
 

@@ -31,7 +31,7 @@ from rclpy.timer import Timer
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.errors import BagError, ParameterError, RecordError
+from relay_autotune.errors import ParameterError, RecordError
 from relay_autotune.exchange.messages import (
     fill_cycle,
     fill_experiment,
@@ -428,7 +428,6 @@ class Recorder:
         self._opened = threading.Event()
         self._closing = threading.Event()
         self._finished: Callable[[], object] = bool
-        self._writer: BagWriter | None = None
         # Looked up once, because it is called for each sample.
         self.sample = self._samples.put
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -465,30 +464,23 @@ class Recorder:
 
     def _run(self) -> None:
         try:
-            self._writer = BagWriter(
+            writer = BagWriter(
                 self.path, self._topics, start_ns=self._start_ns, custom=self._facts
             )
-        except (BagError, ImportError, OSError) as error:
-            self.failure = f"not recorded: {error}"
-        finally:
             self._opened.set()
-        closing = False
-        while not closing:
             # Sleep for a period: a wake-up for each sample would compete with the relay.
-            closing = self._closing.wait(FLUSH_PERIOD)
-            self._guarded(self._drain)
-        self._guarded(self._finish)
-
-    def _guarded(self, action: Callable[[BagWriter], None]) -> None:
-        writer = self._writer
-        if self.failure is None and writer is not None:
-            try:
-                action(writer)
-            except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
-                self.failure = str(error) or type(error).__name__
-        if self.failure is not None:
-            # Nothing is written after a failure, so empty the queues.
-            self._discard()
+            while not self._closing.wait(FLUSH_PERIOD):
+                self._drain(writer)
+            self._drain(writer)
+            writer.close()
+            self._finished()
+        except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
+            told = str(error) or type(error).__name__
+            self.failure = told if self._opened.is_set() else f"not recorded: {told}"
+            self._opened.set()
+            # Nothing is written after a failure, so the queues are emptied.
+            while not self._closing.wait(FLUSH_PERIOD):
+                self._discard()
 
     def _drain(self, writer: BagWriter) -> None:
         with contextlib.suppress(Empty):
@@ -503,10 +495,6 @@ class Recorder:
                 topic, time_ns, message = self._messages.get_nowait()
                 writer.write(topic, time_ns, time_ns, serialize_message(message))
         writer.flush()
-
-    def _finish(self, writer: BagWriter) -> None:
-        writer.close()
-        self._finished()
 
     def _discard(self) -> None:
         for queue in (self._samples, self._messages):
