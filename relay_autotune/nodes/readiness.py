@@ -106,7 +106,7 @@ class Checklist:
         self._add(Mark.OK, name, found(value))
         return value
 
-    def tell(self, name: str, found: str, *, good: bool = True, typed: str = "") -> None:
+    def tell(self, name: str, found: str, good: bool = True, typed: str = "") -> None:
         """Add a line that is no reason not to start.
 
         :param name: what was looked at.
@@ -216,10 +216,10 @@ class Readiness:
         )
         if checks.stops:
             return ready
-        _look_at_limits(checks, parameters)
-        _look_at_rest(checks, self._samples)
-        _look_at_recording(checks, values["record_directory"])
-        _look_at_identifier(checks, self._node, self._ends.gains.topic_name)
+        checks.tell("limits", *_limits_of(parameters))
+        checks.tell("at rest", *_rest_of(self._samples))
+        checks.tell("recording", *_recording_in(values["record_directory"]))
+        checks.tell("model", *_identifier_of(self._node, self._ends.gains.topic_name))
         checks.tell("expected", _expected(parameters, last))
         checks.tell("time", how_long(parameters, self._samples.interval, SETTLING_LIMIT))
         return ready if checks.refusal is None else None
@@ -444,62 +444,47 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
         ExperimentParameters(**experiment).validate()
 
 
-def _look_at_rest(checks: Checklist, samples: LastSamples) -> None:
+# Each of these returns what was found, whether that is good, and what to set where it is not.
+_Told = tuple[str, bool, str]
+
+
+def _rest_of(samples: LastSamples) -> _Told:
     """Say whether the measurement is at rest.
 
-    :param checks: where it is told.
     :param samples: the last measurements.
     """
     rest = samples.rest()
     if rest is None:
-        checks.tell("at rest", "not known yet, since few samples have come", good=False)
-    elif rest.is_steady:
-        checks.tell(
-            "at rest",
-            f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {duration(rest.span)}",
-        )
-    else:
-        checks.tell(
-            "at rest",
-            f"no: {rest.motion} over {duration(rest.span)}; wait until the process rests, else "
-            f"the tune waits for that",
-            good=False,
-        )
+        return "not known yet, since few samples have come", False, ""
+    span = duration(rest.span)
+    if rest.is_steady:
+        return f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {span}", True, ""
+    waits = "wait until the process rests, else the tune waits for that"
+    return f"no: {rest.motion} over {span}; {waits}", False, ""
 
 
-def _look_at_limits(checks: Checklist, parameters: ExperimentParameters) -> None:
+def _limits_of(parameters: ExperimentParameters) -> _Told:
     """Say which limits of the measurement are missing.
 
-    :param checks: where it is told.
     :param parameters: the experiment's parameters.
     """
     low, high = parameters.measurement_min, parameters.measurement_max
-    missing = [
-        name
-        for name, value in (("measurement_min", low), ("measurement_max", high))
-        if math.isinf(value)
-    ]
+    ends = {"measurement_min": low, "measurement_max": high}
+    missing = [name for name, value in ends.items() if math.isinf(value)]
     if not missing:
-        checks.tell("limits", f"a tune ends where the measurement leaves {low:g} to {high:g} y")
-    elif parameters.max_deviation > 0.0:
-        checks.tell(
-            "limits",
-            f"a tune ends where the measurement is {parameters.max_deviation:g} y from its rest",
-        )
-    else:
-        checks.tell(
-            "limits",
-            f"{' and '.join(missing)} not given: nothing ends a tune whose measurement goes "
-            f"too far that way",
-            good=False,
-            typed=f"{missing[0]} LIMIT",
-        )
+        return f"a tune ends where the measurement leaves {low:g} to {high:g} y", True, ""
+    if (most := parameters.max_deviation) > 0.0:
+        return f"a tune ends where the measurement is {most:g} y from its rest", True, ""
+    found = (
+        f"{' and '.join(missing)} not given: nothing ends a tune whose measurement goes too far "
+        f"that way"
+    )
+    return found, False, f"{missing[0]} LIMIT"
 
 
-def _look_at_recording(checks: Checklist, directory: str) -> None:
+def _recording_in(directory: str) -> _Told:
     """Say whether a recording can be written.
 
-    :param checks: where it is told.
     :param directory: folder of the recordings.
     """
     folder = Path(directory).expanduser()
@@ -507,32 +492,26 @@ def _look_at_recording(checks: Checklist, directory: str) -> None:
     typed = "record_directory FOLDER"
     if not (there.is_dir() and os.access(there, os.W_OK)):
         found = f"{there} cannot be written to: the tune would go on without a recording"
-        checks.tell("recording", found, good=False, typed=typed)
-        return
+        return found, False, typed
     free = shutil.disk_usage(there).free
-    found = f"in {folder}, {free / 1e9:.3g} GB free"
-    checks.tell("recording", found, good=free > _LITTLE, typed=typed)
+    return f"in {folder}, {free / 1e9:.3g} GB free", free > _LITTLE, typed
 
 
-def _look_at_identifier(checks: Checklist, node: Node, topic: str) -> None:
+def _identifier_of(node: Node, topic: str) -> _Told:
     """Say whether model and gains will come.
 
-    :param checks: where it is told.
     :param node: the node that tunes.
     :param topic: resolved name of the gains' topic.
     """
-    found = ", ".join(who(end) for end in node.get_publishers_info_by_topic(topic))
-    if found:
-        checks.tell("model", f"from {found}")
-        return
+    if found := ", ".join(who(end) for end in node.get_publishers_info_by_topic(topic)):
+        return f"from {found}", True, ""
     there = node.get_namespace()
     named = "" if there == "/" else f" --ros-args -r __ns:={there}"
-    checks.tell(
-        "model",
+    found = (
         f"no identifier_node: a recording alone, without model and gains; type: ros2 run "
-        f"relay_autotune identifier_node{named}",
-        good=False,
+        f"relay_autotune identifier_node{named}"
     )
+    return found, False, ""
 
 
 def _expected(parameters: ExperimentParameters, last: tuple[float, Cycle] | None) -> str:

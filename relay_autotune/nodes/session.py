@@ -521,11 +521,12 @@ HEARD_WITHIN = 2.5
 ON_THE_WAY = 0.5
 
 
-class _Recording:
-    def __init__(self, recorder: Recorder) -> None:
-        self.recorder = recorder
+class _Recording(Recorder):
+    """A recorder, and the results that it waits for."""
+
+    def __init__(self, *args: Any, **facts: Any) -> None:
+        super().__init__(*args, **facts)
         self.missing = list(RESULTS)
-        self.waiting = False
         self.timer: Timer | None = None
         self.until = 0.0
         self.waits_since = self.heard_at = -math.inf
@@ -557,7 +558,7 @@ class Recordings:
         :param directory: where the folder is made.
         :return: the function that records a sample, and a sentence on the folder or the failure.
         """
-        recorder = Recorder(
+        recorder = _Recording(
             Path(directory).expanduser() / experiment_id,
             [
                 Topic(
@@ -572,7 +573,7 @@ class Recordings:
             | {"experiment_id": experiment_id},
         )
         recorder.wait_until_open(OPEN_WITHIN)
-        self._open[experiment_id] = _Recording(recorder)
+        self._open[experiment_id] = recorder
         self._last = recorder
         if len(self._paths) > 1:
             self._paths.pop(next(iter(self._paths)))
@@ -599,10 +600,10 @@ class Recordings:
         recording = self._open.get(experiment_id)
         if recording is None:
             return
-        recording.recorder.message(self._names[name], time_ns, message)
+        recording.message(self._names[name], time_ns, message)
         if name in recording.missing and message.final:
             recording.missing.remove(name)
-            if recording.waiting and not recording.missing:
+            if recording.closed is not None and not recording.missing:
                 self.close(experiment_id, "with model and gains")
 
     def path_of(self, experiment_id: str) -> str:
@@ -661,7 +662,6 @@ class Recordings:
         recording = self._open.get(experiment_id)
         if recording is None:
             return
-        recording.waiting = True
         recording.closed = closed
         if not recording.missing:
             self.close(experiment_id, "with model and gains")
@@ -669,9 +669,8 @@ class Recordings:
 
         def late() -> None:
             missing = " and ".join(recording.missing)
-            recording.reason = (
-                recording.reason or f"identifier_node did not send them within {timeout:g} s"
-            )
+            silent = f"identifier_node did not send them within {timeout:g} s"
+            recording.reason = recording.reason or silent
             self.close(experiment_id, f"without {missing}: {recording.reason}")
 
         recording.waits_since = time.monotonic()
@@ -693,17 +692,18 @@ class Recordings:
             missing = " and no ".join(recording.missing)
             cause = f": {recording.reason}" if recording.reason else ""
             recording.closed(f"no {missing}{cause}" if missing else "")
-        log, lacks = self._node.get_logger(), recording.waiting and recording.missing
+        log = self._node.get_logger()
+        lacks = recording.closed is not None and recording.missing
 
         def say() -> None:
-            told = f"the recording {recording.recorder.path} is closed {why}"
+            told = f"the recording {recording.path} is closed {why}"
             # A line of code has one severity; with another one the logger raises.
             if lacks:
                 log.warning(told)
             else:
                 log.info(told)
 
-        recording.recorder.close(say)
+        recording.close(say)
 
     def close_all(self, why: str, timeout: float) -> None:
         """Close all recordings and wait for the newest to be finished.
