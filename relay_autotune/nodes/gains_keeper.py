@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.task import Future
 
 from relay_autotune.control.gains_history import (
     AT_WORK,
@@ -426,11 +425,7 @@ class GainsKeeper:
 
         :raises JournalError: if it cannot be written.
         """
-        done: Future = Future()
-        self._node.compute(self._writing(history), done.set_result)
-        error = await done
-        if error is not None:
-            raise error
+        await self._node.computed(self._writing(history))
 
     async def _kept(self, history: GainsHistory) -> str:
         try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -46,16 +45,9 @@ CYCLE_DEPTH = 1000
 _MOST_WAITING = 10
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A computation in another thread, and the callback for its result.
-
-    :param work: the computation; it must not touch the node.
-    :param taken: called by the node's executor with what ``work`` returned or raised.
-    """
-
-    work: Callable[[], Analysis]
-    taken: Callable[[Any], None]
+# A computation in another thread, which must not touch the node, and the callback of the node's
+# executor for what it returned or raised.
+_Fit = tuple[Callable[[], Analysis], Callable[[Any], None]]
 
 
 class IdentifierNode(ServedNode):
@@ -133,7 +125,7 @@ class IdentifierNode(ServedNode):
             self._signs.done(name, f"the experiment cannot be used: {error}")
             return
         self._signs.work_on(name)
-        self._wait_for(_Fit(self._whole(record), partial(self._identified, name)))
+        self._wait_for(self._whole(record), partial(self._identified, name))
 
     async def _on_identify(self, request: Any, response: Any) -> Any:
         """Answer with every method's model and every rule's gains for a record."""
@@ -150,7 +142,7 @@ class IdentifierNode(ServedNode):
             response.reason = str(error)
             return response
         done: Future = Future(executor=self.executor)
-        self._wait_for(_Fit(work, done.set_result))
+        self._wait_for(work, done.set_result)
         found = await done
         if isinstance(found, Exception):
             response.reason = (
@@ -173,8 +165,8 @@ class IdentifierNode(ServedNode):
 
     # One fit at a time.
 
-    def _wait_for(self, fit: _Fit) -> None:
-        self._waiting.append(fit)
+    def _wait_for(self, work: Callable[[], Analysis], taken: Callable[[Any], None]) -> None:
+        self._waiting.append((work, taken))
         self._look()
 
     def _look(self) -> None:
@@ -189,16 +181,17 @@ class IdentifierNode(ServedNode):
         if fit is None:
             return
         self._is_fitting = True
+        work, take = fit
 
         def taken(found: Any) -> None:
             self._is_fitting = False
             try:
-                fit.taken(found)
+                take(found)
             finally:
                 self._look()
                 self.tidy_when_idle()
 
-        self.compute(fit.work, taken)
+        self.compute(work, taken)
 
     def _of_running(self) -> _Fit | None:
         """Return the fit of the running experiment, None if there is nothing new."""
@@ -209,12 +202,12 @@ class IdentifierNode(ServedNode):
                 # The quantity whose interval ends the experiment, and the wanted width.
                 sought = progress.sought or ULTIMATE_GAIN, progress.sought_width
                 work = partial(self._running_fit.fit, record, self._task(), *sought)
-                return _Fit(work, partial(self._fitted, record.experiment_id))
+                return work, partial(self._fitted, record.experiment_id)
             new, self._cycles_are_new = self._cycles_are_new, False
             if new and self._cycles:
                 record = record_from_cycles(self._cycles.values())
                 work = partial(model_so_far, record, self._task())
-                return _Fit(work, partial(self._fitted, record.experiment_id))
+                return work, partial(self._fitted, record.experiment_id)
         except RelayAutotuneError as error:
             what = "the cycles" if progress is None else "the progress"
             name = self._cycles_of if progress is None else progress.experiment_id

@@ -46,6 +46,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.task import Future
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.parameters import unknown_parameters
@@ -214,6 +215,18 @@ class ServedNode(Node):
 
         # A daemon thread, so that a running computation does not delay the end of the process.
         threading.Thread(target=run, name="computation", daemon=True).start()
+
+    async def computed(self, work: Callable[[], Any]) -> Any:
+        """Return what ``work`` returns in a thread, or raise what it raises; callbacks go on.
+
+        :param work: as of `compute`.
+        """
+        done: Future = Future()
+        self.compute(work, done.set_result)
+        found = await done
+        if isinstance(found, Exception):
+            raise found
+        return found
 
     def end(self, reason: str) -> None:
         """Bring the loop to a safe state first, then finish open work.

@@ -227,33 +227,18 @@ class Verifier:
     async def _prepare(self, goal: Any) -> None:
         try:
             tried = await self._verifiable(goal.request)
+            if not self._is_prepared(goal):
+                await self._ended(None, "the verification ended before its first step")
+                return
             rest, period = self._at_rest(tried.steps)
-        except RelayAutotuneError as error:
-            self._refuse(goal, error)
-            return
-        if not self._is_prepared(goal):
-            await self._ended(None, "the verification ended before its first step")
-            return
-        self._tried, self._rest, self._period = tried, rest, period
-
-        def plans() -> list[Plan]:
+            self._tried, self._rest, self._period = tried, rest, period
             loop = tried.gains, tried.model
-            return [plan(*loop, s, period, rest.noise_std, tried.rate) for s in tried.steps]
-
-        self._node.compute(plans, partial(self._planned, goal))
-
-    def _is_prepared(self, goal: Any) -> bool:
-        """Tell whether a goal has neither ended nor begun its steps."""
-        return goal is self._action.running and self._phase is _Phase.PREPARING
-
-    def _refuse(self, goal: Any, error: Exception) -> None:
-        """End a goal before its first step."""
-        if self._is_prepared(goal):
-            self._end(None, _said(error), succeeded=False)
-
-    def _planned(self, goal: Any, plans: list[Plan] | Exception) -> None:
-        if isinstance(plans, Exception):
-            self._refuse(goal, plans)
+            plans = await self._node.computed(
+                lambda: [plan(*loop, s, period, rest.noise_std, tried.rate) for s in tried.steps]
+            )
+        except Exception as error:  # noqa: BLE001  the loop goes on, and the client is told
+            if self._is_prepared(goal):
+                self._end(None, _said(error), succeeded=False)
             return
         if not self._is_prepared(goal):
             return
@@ -264,6 +249,10 @@ class Verifier:
             time.monotonic() + _TIMES_PLANNED * self._pace() * planned + _MORE_THAN_PLANNED
         )
         self._begin_step()
+
+    def _is_prepared(self, goal: Any) -> bool:
+        """Tell whether a goal has neither ended nor begun its steps."""
+        return goal is self._action.running and self._phase is _Phase.PREPARING
 
     def _pace(self) -> float:
         """Return the steady time for one second of the samples' time."""
