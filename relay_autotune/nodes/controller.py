@@ -131,12 +131,13 @@ class ControllerNode(ServedNode):
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         if self._reported is None:
             self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
-        self.create_subscription(Bool, "hold_request", self._on_hold, quality.RESULT)
-        self.create_subscription(
-            RelayExperiment, "relay_experiment", self._on_experiment, quality.RESULT
-        )
-        self.create_subscription(PidGains, "pi_gains", self._on_gains, quality.RESULT)
-        self.create_subscription(ModelMessage, "transfer_function", self._on_model, quality.RESULT)
+        for kind, topic, take in (
+            (Bool, "hold_request", self._on_hold),
+            (RelayExperiment, "relay_experiment", self._on_experiment),
+            (PidGains, "pi_gains", self._on_gains),
+            (ModelMessage, "transfer_function", self._on_model),
+        ):
+            self.create_subscription(kind, topic, take, quality.RESULT)
         # The loop must keep running while these services wait for the disk or another node.
         waiting = ReentrantCallbackGroup()
         serve(self, Trigger, "~/apply", lambda _: self._apply(), callback_group=waiting)

@@ -135,16 +135,11 @@ class Ends:
         self.own = self.relay if self.is_reported else self.command
         """Where the message goes out that the node was given, and that may have to be repeated."""
         cycles_kept = max(node.get_parameter("max_cycles").value, CYCLES_KEPT)
-        self.cycles = quality.publisher(
-            node, RelayCycle, "relay_cycle", quality.latched(cycles_kept)
-        )
-        self.progress = quality.publisher(
-            node, ExperimentMessage, "relay_progress", quality.RESULT
-        )
-        self.experiments = quality.publisher(
-            node, ExperimentMessage, "relay_experiment", quality.RESULT
-        )
-        self.diagnostics = quality.publisher(node, DiagnosticArray, "/diagnostics", 1)
+        tells = partial(quality.publisher, node)
+        self.cycles = tells(RelayCycle, "relay_cycle", quality.latched(cycles_kept))
+        self.progress = tells(ExperimentMessage, "relay_progress", quality.RESULT)
+        self.experiments = tells(ExperimentMessage, "relay_experiment", quality.RESULT)
+        self.diagnostics = tells(DiagnosticArray, "/diagnostics", 1)
         self.reader = reader
         self._sensor = Following(node, reader, on_measurement, is_busy)
         self.models, self.gains = (
@@ -315,28 +310,22 @@ class LoopEnds:
         self._hold.publish(Bool(data=False))
         self._messages = ends.own.messages
         self._topic = ends.command.topic
+        kind, often = self._messages.kind, quality.MEASUREMENT
+        hears = partial(quality.subscription, node)
         if takeover:
             ends.command.sent = self._note_own
-            quality.subscription(
-                node, self._messages.kind, "command", self._on_command, quality.COMMAND
-            )
+            hears(kind, "command", self._on_command, quality.COMMAND)
         elif not ends.is_reported:
-            self._controller = quality.subscription(
-                node, Float64, "controller_command", self._on_controller, quality.MEASUREMENT
-            )
+            self._controller = hears(Float64, "controller_command", self._on_controller, often)
             node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._value("command_others") == "other_commands":
-            quality.subscription(
-                node, self._messages.kind, "other_commands", self._on_others, quality.MEASUREMENT
-            )
+            hears(kind, "other_commands", self._on_others, often)
         self.repeat_period: float = self._value("command_period")
         """Time without a command after which the last is sent again [s]; 0: never."""
         if self.repeat_period > 0.0:
             # A command is between one and two looks old when it is sent again.
             node.create_timer(0.5 * self.repeat_period, self._send_again, clock=STEADY)
-        quality.subscription(
-            node, Float64, "command_feedback", self._on_feedback, quality.MEASUREMENT
-        )
+        hears(Float64, "command_feedback", self._on_feedback, often)
 
     def _value(self, name: str) -> Any:
         return self._node.get_parameter(name).value

@@ -97,7 +97,8 @@ class ControllerManager:
     """
 
     def __init__(self, client: LoopClient, name: str, patience: float) -> None:
-        self._client = client
+        self.client = client
+        """The node of the graph that asks it."""
         self._kinds = {
             kind: interface_class("controller_manager_msgs", "srv", kind)
             for kind in ("ListControllers", "ListHardwareInterfaces", "SwitchController")
@@ -163,10 +164,6 @@ class ControllerManager:
             why = getattr(answer, "message", "") or "its log says why"
             raise LoopError(f"{self.name} refuses to switch controllers: {why}")
 
-    def rest(self, seconds: float) -> None:
-        """Let a time pass [s]."""
-        self._client.rest(seconds)
-
     def still_active(self, controller: str) -> Callable[[], str]:
         """Return what tells during a tune why a controller is not active; empty: it is.
 
@@ -190,7 +187,7 @@ class ControllerManager:
             # An answer that does not come is not waited for.
             if time.monotonic() >= next_at + (_LOST_AFTER if asked is not None else 0.0):
                 next_at = time.monotonic() + _LOOK_EVERY
-                asked = self._client.begin(kind, service, kind.Request())
+                asked = self.client.begin(kind, service, kind.Request())
             return ""
 
         return look
@@ -204,7 +201,7 @@ class ControllerManager:
     def _ask(self, kind: str, request: Any = None) -> Any:
         service = "".join(f"_{c.lower()}" if c.isupper() else c for c in kind).lstrip("_")
         asked = request if request is not None else self._kinds[kind].Request()
-        return self._client.call(self._kinds[kind], f"{self.name}/{service}", asked)
+        return self.client.call(self._kinds[kind], f"{self.name}/{service}", asked)
 
 
 def _listed(found: Iterable[Any]) -> tuple[ManagedController, ...]:
@@ -349,7 +346,7 @@ class Opened:
                 manager.switch(lacking, extra)
             except LoopError as error:
                 problem = str(error)
-                manager.rest(_AGAIN)
+                manager.client.rest(_AGAIN)
         typed = manager.command_for(self._former, [self._forward])
         raise LoopError(
             f"{', '.join(self._former)} could not be activated again"
@@ -577,6 +574,7 @@ def joint_loop(
         )
     own = _of_dof(client, node, parts.keys[place])
     description = _description(client, manager.namespace)
+    rate = found.rate or float(client.values(manager.name, ["update_rate"])["update_rate"])
     return JointLoop(
         **vars(parts),
         controller=controller,
@@ -585,7 +583,7 @@ def joint_loop(
         dof=parts.keys[place],
         follows=found.type_name == TRAJECTORY_CONTROLLER,
         interface=interface,
-        period=1.0 / _rate(client, manager, found),
+        period=1.0 / rate,
         is_simulated=client.values(node, ["use_sim_time"])["use_sim_time"],
         gains=(own["p"], own["i"], own["d"]),
         strategy=own["antiwindup_strategy"],
@@ -709,11 +707,6 @@ def put_gains(
 def told(gains: Mapping[str, float]) -> str:
     """Return gains in words, by the last letter of their parameters."""
     return ", ".join(f"{name[-1]} {value:.6g}" for name, value in gains.items())
-
-
-def _rate(client: LoopClient, manager: ControllerManager, found: ManagedController) -> float:
-    """Return the rate of a controller's updates [Hz]."""
-    return found.rate or float(client.values(manager.name, ["update_rate"])["update_rate"])
 
 
 def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:
