@@ -230,10 +230,9 @@ class RelayNode(ServedNode):
             repeats=self._hear is not None,
             one_clock=self._reported is not None,
         )
-        sample, recorded = self._recordings.begin(
+        session.sample, recorded = self._recordings.begin(
             identity, self.get_parameter("record_directory").value
         )
-        session.record_with(sample)
         if not converged:
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)

@@ -53,6 +53,10 @@ from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 # A measurement waits no longer than this for its callback, unless a clock was set back [ns].
 _LONGEST_WAIT_NS = 1_000_000_000
 
+# When a sample was received and measured [ns], the measurement, when it was answered [ns], and by
+# which command.
+_Sample = tuple[int, int, float, int, float]
+
 
 class Session:
     """A relay experiment fed with the samples of a topic.
@@ -91,7 +95,8 @@ class Session:
         self._period = sample_period
         self._clock = clock
         self._one_clock = one_clock
-        self._count = 0
+        self.sample_count = 0
+        """Number of samples answered."""
         self._last = (0, 0, 0.0, 0.0)
         self._first_answer_ns = 0
         self._repeated_ns = 0
@@ -99,7 +104,8 @@ class Session:
         self._received_ns = array.array("q")
         self._sent_ns = array.array("q")
         self.clocks = ClockWatch()
-        self._record_sample: Callable[[tuple[int, int, float, int, float]], None] | None = None
+        self.sample: Callable[[_Sample], None] | None = None
+        """Takes each sample and its answer, once the answer is out; None: nobody does."""
         if sample_period > 0.0:
             self.answer = self._answer_by_number
         elif clock is not None:
@@ -111,15 +117,6 @@ class Session:
 
     answer: Callable[[float, Mapping[str, Any]], float | None]
     """Take a measurement and its message info; return the command, or None for no answer."""
-
-    def record_with(self, sample: Callable[[tuple[int, int, float, int, float]], None]) -> None:
-        """Hand each sample and its answer to ``sample``, once the answer is out."""
-        self._record_sample = sample
-
-    @property
-    def sample_count(self) -> int:
-        """Number of samples answered."""
-        return self._count
 
     @property
     def has_news(self) -> bool:
@@ -156,8 +153,11 @@ class Session:
             sent = time.time_ns()
         self._received_ns.append(received)
         self._sent_ns.append(sent)
-        if self._record_sample is not None:
-            self._record_sample((received, source, measurement, sent, command))
+        self._hand_on((received, source, measurement, sent, command))
+
+    def _hand_on(self, sample: _Sample) -> None:
+        if self.sample is not None:
+            self.sample(sample)
 
     def record(self) -> Record:
         """Return the whole record.
@@ -239,9 +239,9 @@ class Session:
         self, received: int, source: int, measurement: float, step: Callable[[float, float], float]
     ) -> float:
         """Take a sample with its stamps [ns]; return the command."""
-        if self._count == 0:
+        if self.sample_count == 0:
             self.start_ns = source
-        self._count += 1
+        self.sample_count += 1
         # Relative to the first sample: a float of seconds since 1970 cannot hold microseconds.
         command = step((source - self.start_ns) * 1e-9, measurement)
         self._last = (received, source, measurement, command)
@@ -273,12 +273,12 @@ class Session:
         return self._answer_at(now, now, measurement, self._step)
 
     def _answer_by_number(self, measurement: float, info: Mapping[str, Any]) -> float | None:
-        k = self._count
+        k = self.sample_count
         if k == 0:
             self.start_ns = info["source_timestamp"] or time.time_ns()
         elif k == 1 and self._repeats(measurement, info["source_timestamp"]):
             return None
-        self._count = k + 1
+        self.sample_count = k + 1
         sampled = k * self._period
         command: float = self._step(sampled, measurement)
         stamp = self.start_ns + round(sampled * 1e9)
@@ -299,7 +299,7 @@ class Session:
 
     def answer_after_all(self) -> float | None:
         """Answer the sample that `answer` dropped as a repeat, if no sample has followed."""
-        if not self.may_be_no_repeat or self._count != 1:
+        if not self.may_be_no_repeat or self.sample_count != 1:
             return None
         self.may_be_no_repeat = False
         return self._answer_by_number(self._last[2], {"source_timestamp": None})
@@ -339,26 +339,14 @@ class SetpointSession(Session):
         super().__init__(*args, **options)
         self._actual = actual
         self._told: list[float] = []
-        self._record_later: Callable[[tuple[int, int, float, int, float]], None] | None = None
-        self._last_sample: tuple[int, int, float, int, float] | None = None
+        self._last_sample: _Sample | None = None
 
-    def record_with(self, sample: Callable[[tuple[int, int, float, int, float]], None]) -> None:
-        """Hand each sample and the controller's answer to ``sample``, one sample later."""
-        self._record_later = sample
-        super().record_with(self._keep)
-
-    def _keep(self, sample: tuple[int, int, float, int, float]) -> None:
-        self._hand_on()
+    def _hand_on(self, sample: _Sample | None) -> None:
+        if self._last_sample is not None:
+            told = self._actual()
+            self._told.append(told)
+            super()._hand_on((*self._last_sample[:4], told))
         self._last_sample = sample
-
-    def _hand_on(self) -> None:
-        last = self._last_sample
-        if last is None or self._record_later is None:
-            return
-        told = self._actual()
-        self._told.append(told)
-        self._record_later((*last[:4], told))
-        self._last_sample = None
 
     def record(self) -> Record:
         """Return the record, with the controller's commands.
@@ -369,7 +357,7 @@ class SetpointSession(Session):
         :raises RecordError: if there was no sample.
         """
         if self.experiment.finished:
-            self._hand_on()
+            self._hand_on(None)
         record = super().record()
         told = np.array(self._told[: len(record)])
         if told.size < len(record):
@@ -423,7 +411,7 @@ class Recorder:
         self._measurement, self._command = (topic.name for topic in self._topics[:2])
         self._start_ns = start_ns
         self._facts = dict(facts)
-        self._samples: SimpleQueue[tuple[int, int, float, int, float]] = SimpleQueue()
+        self._samples: SimpleQueue[_Sample] = SimpleQueue()
         self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
         self._opened = threading.Event()
         self._closing = threading.Event()

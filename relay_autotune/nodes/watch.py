@@ -85,12 +85,8 @@ class Repeater:
         self._repetition = Repetition(period)
         self._simulated = bool(node.get_parameter("use_sim_time").value)
         self._silent_at = math.nan
-        if self._simulated:
-            clock = node.get_clock()
-            self._now: Callable[[], float] = lambda: float(clock.now().nanoseconds) * 1e-9
-        else:
-            clock = STEADY
-            self._now = time.monotonic
+        clock = node.get_clock() if self._simulated else STEADY
+        self._now: Callable[[], float] = lambda: float(clock.now().nanoseconds) * 1e-9
         wait = _LEAST_WAIT if self._simulated else period
         self._timer = node.create_timer(wait, self._look, clock=clock)
         self._ear: Subscription | None = quality.subscription(

@@ -29,7 +29,7 @@ def info(source: int | None, received: int | None = None) -> dict[str, Any]:
 def test_samples_are_timed_by_their_source_stamps() -> None:
     session = Session(experiment(), "one")
     kept: list[Any] = []
-    session.record_with(kept.append)
+    session.sample = kept.append
     start = 1_700_000_000_000_000_000
     for k, source in enumerate((start, start + 90_000_001, start + 210_000_000)):
         before = time.time_ns()
@@ -81,7 +81,7 @@ def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.Monk
     session = Session(experiment(), "one", repeats=True)
     start = 1_700_000_000_000_000_000
     kept: list[Any] = []
-    session.record_with(kept.append)
+    session.sample = kept.append
     # The sensor's own clock is behind, and it was silent when the tune began.
     steps = [(0, True), (20, True), (33, False), (53, True), (52, False), (52, False), (60, False)]
     for milliseconds, repeated in steps:
