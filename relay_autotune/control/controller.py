@@ -110,10 +110,12 @@ class PidController:
         automatic: bool = True,
         usual_interval: float = 0.0,
     ) -> None:
-        self._gains = gains
+        self.gains = gains
+        """The gains in force; changed by `use`."""
         self._limits = limits
         self._automatic = automatic
-        self._command = limits.clip(command)
+        self.command = limits.clip(command)
+        """The last command [u]."""
         self._law: PidLaw | None = None
         self._time = math.nan
         self._nominal = math.nan
@@ -122,26 +124,16 @@ class PidController:
         self._align = True
 
     @property
-    def command(self) -> float:
-        """The last command [u]."""
-        return self._command
-
-    @property
-    def gains(self) -> Controller | None:
-        """The gains in force."""
-        return self._gains
-
-    @property
     def is_automatic(self) -> bool:
         """True if it controls, False if it holds its command."""
-        return self._automatic and self._gains is not None
+        return self._automatic and self.gains is not None
 
     def use(self, gains: Controller | None) -> None:
         """Change the gains without a bump.
 
         :param gains: the gains; None: hold the command.
         """
-        self._gains = gains
+        self.gains = gains
         self._nominal = math.nan
         self._align = True
 
@@ -151,7 +143,7 @@ class PidController:
         :param limits: range of the command.
         """
         self._limits = limits
-        self._command = limits.clip(self._command)
+        self.command = limits.clip(self.command)
 
     def switch(self, *, automatic: bool) -> None:
         """Go to automatic, from the present command on, or to manual."""
@@ -164,7 +156,7 @@ class PidController:
         :param command: ignored if it is not finite, or beyond `LARGEST_VALUE`.
         """
         if is_usable(command):
-            self._command = self._limits.clip(command)
+            self.command = self._limits.clip(command)
             self._align = True
 
     def step(self, time: float, setpoint: float, measurement: float) -> float:
@@ -176,19 +168,19 @@ class PidController:
             `LARGEST_VALUE`.
         """
         if not (is_usable(measurement) and is_usable(setpoint)):
-            return self._command
+            return self.command
         interval = 0.0 if math.isnan(self._time) else max(time - self._time, 0.0)
         self._time = time
-        gains = self._gains
+        gains = self.gains
         if gains is None:
-            return self._command
+            return self.command
         command = self._answer(gains, interval, setpoint, measurement)
         if is_usable(command):
-            self._command = command
+            self.command = command
         else:
             # The law's memory is no longer valid, so start again from this command.
             self._law, self._align = None, True
-        return self._command
+        return self.command
 
     def _answer(
         self, gains: Controller, interval: float, setpoint: float, measurement: float
@@ -196,9 +188,9 @@ class PidController:
         law = self._heard(gains, interval, measurement)
         if self._align or not self._automatic:
             # Set the integral so that the command continues from its present value.
-            law.integral = self._command - law.proportional(gains, setpoint)
+            law.integral = self.command - law.proportional(gains, setpoint)
             self._align = False
-            return self._command
+            return self.command
         if not math.isnan(self._nominal):
             interval = min(interval, _LONGEST_INTERVAL * max(self._nominal, self._usual))
         return law.command(gains, setpoint, interval, self._limits)
@@ -207,7 +199,7 @@ class PidController:
         """Pass a measurement to the filter, over an interval that may vary."""
         law = self._law
         if law is None:
-            self._law = law = PidLaw(measurement, self._command)
+            self._law = law = PidLaw(measurement, self.command)
         elif interval > 0.0:
             near = abs(interval - self._nominal) <= _JITTER * self._nominal
             motion = self._motion
@@ -242,12 +234,12 @@ class LawController(PidController):
         period = self._rate.period
         if self._align or not self._automatic:
             self._running = self._rate.of(gains).running()
-            self._running.take_over(setpoint, measurement, self._command)
+            self._running.take_over(setpoint, measurement, self.command)
             self._align, self._wait = False, period
-            return self._command
+            return self.command
         self._wait -= interval
         if self._wait > _EARLY * period:
-            return self._command
+            return self.command
         # A sensor that is slower than the law leaves runs out; they are not made up for.
         self._wait = max(self._wait, -0.5 * period) + period
         return self._running.step(setpoint, measurement, self._limits)

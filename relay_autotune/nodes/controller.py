@@ -157,8 +157,8 @@ class ControllerNode(ServedNode):
         )
         given = self._own(gains) if self._remote is None else None
         self._keeper = GainsKeeper(self, self._place, journal, given)
-        if self._remote is None and self._keeper.gains != given:
-            self._use(self._keeper.gains)
+        if self._remote is None and self._keeper.history.gains != given:
+            self._use(self._keeper.history.gains)
             self.get_logger().warning(
                 f"starts with {said(self._pid.gains)}, not with the parameters' {said(gains)}, "
                 f"for what was proven or failed before: see {journal.path}"
@@ -416,7 +416,7 @@ class ControllerNode(ServedNode):
             self._remote.require_ready()
             kept = await self._place.read()
         else:
-            kept = self._keeper.gains
+            kept = self._keeper.history.gains
         if kept is None or (self._remote is None and not self._pid.is_automatic):
             raise NotReadyError("the controller is not in automatic, or has no gains")
         model, doubt = self._predictors.of(kept)

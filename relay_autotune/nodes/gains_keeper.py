@@ -234,11 +234,6 @@ class GainsKeeper:
             self._write(self.history)
 
     @property
-    def gains(self) -> GainSet | None:
-        """The gains in force, as far as known."""
-        return self.history.gains
-
-    @property
     def is_at_work(self) -> bool:
         """True while gains are being put in force or verified, or are still to be undone."""
         return self._busy or self.history.work is not Work.NOTHING or self._goal is not None

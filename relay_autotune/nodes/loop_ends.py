@@ -211,13 +211,6 @@ class Handover:
         """Time since the controller's last command [s]; inf before the first."""
         return time.monotonic() - self._arrived
 
-    def is_connected(self, timeout: float) -> bool:
-        """Return True if the controller's commands come.
-
-        :param timeout: greatest age of the last one [s].
-        """
-        return self.age <= timeout
-
     def mean(self) -> float:
         """Return the mean of the controller's last commands [u]; NaN before the first."""
         return sum(self._kept) / len(self._kept) if self._kept else math.nan
@@ -339,7 +332,7 @@ class LoopEnds:
     @property
     def is_connected(self) -> bool:
         """True if commands of a present controller arrive on controller_command."""
-        return not self._takeover and self.handover.is_connected(self._value("controller_timeout"))
+        return not self._takeover and self.handover.age <= self._value("controller_timeout")
 
     def mean_command(self) -> float:
         """Return the mean of the present controller's last commands [u]; NaN without controller.
@@ -364,7 +357,7 @@ class LoopEnds:
                 "the messages of the measurement have it"
             )
         if self._takeover:
-            if self._driven and self.handover.is_connected(self._value("controller_timeout")):
+            if self._driven and self.handover.age <= self._value("controller_timeout"):
                 raise NotReadyError(
                     f"{self._topic} is being commanded by another node; have the controller hold "
                     "or track before the start"
@@ -523,7 +516,7 @@ class LoopEnds:
         if not self.is_driven:
             return
         timeout = self._value("controller_timeout")
-        if self.handover.is_connected(timeout):
+        if self.handover.age <= timeout:
             return
         given = self._value("safe_command")
         safe = self.handover.mean() if math.isnan(given) else given

@@ -168,16 +168,12 @@ class Readiness:
 
     :param node: relay_node.
     :param ends: its topics.
-    :param sensor: gives the age of the last measurement.
+    :param sensor: gives the last measurements, and their age.
     :param loop: the other nodes of the loop.
-    :param samples: the last measurements.
     """
 
-    def __init__(
-        self, node: Node, ends: Ends, sensor: Sensor, loop: LoopEnds, samples: LastSamples
-    ) -> None:
-        self._node, self._ends, self._sensor = node, ends, sensor
-        self._loop, self._samples = loop, samples
+    def __init__(self, node: Node, ends: Ends, sensor: Sensor, loop: LoopEnds) -> None:
+        self._node, self._ends, self._sensor, self._loop = node, ends, sensor, loop
 
     def of(
         self,
@@ -211,17 +207,17 @@ class Readiness:
         )
         checks.do(
             "present",
-            partial(_require_within_limits, parameters, self._samples.newest),
+            partial(_require_within_limits, parameters, self._sensor.samples.newest),
             lambda _: "the measurement is within its limits",
         )
         if checks.stops:
             return ready
         checks.tell("limits", *_limits_of(parameters))
-        checks.tell("at rest", *_rest_of(self._samples))
+        checks.tell("at rest", *_rest_of(self._sensor.samples))
         checks.tell("recording", *_recording_in(values["record_directory"]))
         checks.tell("model", *_identifier_of(self._node, self._ends.gains.topic_name))
         checks.tell("expected", _expected(parameters, last))
-        checks.tell("time", how_long(parameters, self._samples.interval, SETTLING_LIMIT))
+        checks.tell("time", how_long(parameters, self._sensor.samples.interval, SETTLING_LIMIT))
         return ready if checks.refusal is None else None
 
     def _planned(
@@ -256,7 +252,7 @@ class Readiness:
 
     def _heard(self) -> str:
         """Say who measures, and how."""
-        topic, last = self._ends.measurement.topic_name, self._samples
+        topic, last = self._ends.measurement.topic_name, self._sensor.samples
         rate = f"{1.0 / last.interval:.3g} per second" if last.interval > 0.0 else "rate not known"
         newest = "" if last.newest is None else f", newest {last.newest:.6g} y"
         sources = ", ".join(map(described, self._node.get_publishers_info_by_topic(topic)))

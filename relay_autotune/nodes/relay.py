@@ -31,7 +31,7 @@ from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, require_
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
-from relay_autotune.nodes.watch import LastSamples, Sensor, losses
+from relay_autotune.nodes.watch import Sensor, losses
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune
@@ -59,7 +59,6 @@ class RelayNode(ServedNode):
         self._after: Callable[[float], float] | None = None
         self._session: Session | None = None
         self._simulated = bool(self.get_parameter("use_sim_time").value)
-        self._last_samples = LastSamples()
         # Amplitude and last cycle of the last tune.
         self._last_cycle: tuple[float, Cycle] | None = None
         self._ahead = 0
@@ -82,7 +81,7 @@ class RelayNode(ServedNode):
         self._on_setpoint = self._ends.setpoint is not None
         self._loop = LoopEnds(self, self._ends, self._stop_now)
         self._sensor = Sensor(self, self._reader, repeat=self._on_silence, stop=self._stop_now)
-        self._readiness = Readiness(self, self._ends, self._sensor, self._loop, self._last_samples)
+        self._readiness = Readiness(self, self._ends, self._sensor, self._loop)
         self._hear = self._sensor.hear
         self._topic = self._ends.measurement.topic_name
         self._recordings = Recordings(self, self._ends.recorded)
@@ -127,7 +126,7 @@ class RelayNode(ServedNode):
         else:
             if not self._loop.is_driven:
                 self._answer_idle(value)
-            self._last_samples.add(value)
+            self._sensor.samples.add(value)
         if self._reported is not None:
             # After the answer: it belongs to this sample, and the one before is still needed.
             try:
@@ -196,7 +195,7 @@ class RelayNode(ServedNode):
             answer.reason = str(checks.refusal)
             return answer
         answer.accepted = True
-        takes = how_long(ready.parameters, self._last_samples.interval, SETTLING_LIMIT)
+        takes = how_long(ready.parameters, self._sensor.samples.interval, SETTLING_LIMIT)
         if dry_run:
             answer.reason = f"a tune could start: {ready.plan}; {takes}"
             return answer
@@ -222,7 +221,7 @@ class RelayNode(ServedNode):
                 policy=policy,
                 until_converged=converged,
                 from_small=ready.from_small,
-                before=self._last_samples.before() if present else None,
+                before=self._sensor.samples.before() if present else None,
             ),
             identity,
             sample_period=parameters.sample_period,
@@ -236,7 +235,7 @@ class RelayNode(ServedNode):
         if not converged:
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
-        self._last_samples.forget()
+        self._sensor.samples.forget()
         self._alarm = ""
         self._session = session
         self._sensor.watch()

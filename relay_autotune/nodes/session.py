@@ -413,7 +413,8 @@ class Recorder:
         self._facts = dict(facts)
         self._samples: SimpleQueue[_Sample] = SimpleQueue()
         self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
-        self._opened = threading.Event()
+        self.opened = threading.Event()
+        """Set once the folder was created or could not be."""
         self._closing = threading.Event()
         self._finished: Callable[[], object] = bool
         # Looked up once, because it is called for each sample.
@@ -433,10 +434,6 @@ class Recorder:
         """
         self._messages.put((topic, time_ns, message))
 
-    def wait_until_open(self, timeout: float) -> None:
-        """Wait at most ``timeout`` seconds until the folder was created or could not be."""
-        self._opened.wait(timeout)
-
     def close(self, finished: Callable[[], None]) -> None:
         """Request the end of the bag; returns at once.
 
@@ -455,7 +452,7 @@ class Recorder:
             writer = BagWriter(
                 self.path, self._topics, start_ns=self._start_ns, custom=self._facts
             )
-            self._opened.set()
+            self.opened.set()
             # Sleep for a period: a wake-up for each sample would compete with the relay.
             while not self._closing.wait(FLUSH_PERIOD):
                 self._drain(writer)
@@ -464,8 +461,8 @@ class Recorder:
             self._finished()
         except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
             told = str(error) or type(error).__name__
-            self.failure = told if self._opened.is_set() else f"not recorded: {told}"
-            self._opened.set()
+            self.failure = told if self.opened.is_set() else f"not recorded: {told}"
+            self.opened.set()
             # Nothing is written after a failure, so the queues are emptied.
             while not self._closing.wait(FLUSH_PERIOD):
                 self._discard()
@@ -560,7 +557,7 @@ class Recordings:
             facts={name: self._names[name] for name in ("measurement", "command")}
             | {"experiment_id": experiment_id},
         )
-        recorder.wait_until_open(OPEN_WITHIN)
+        recorder.opened.wait(OPEN_WITHIN)
         self._open[experiment_id] = recorder
         self._last = recorder
         if len(self._paths) > 1:

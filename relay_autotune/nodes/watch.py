@@ -297,6 +297,8 @@ class Sensor:
         self._timer: Timer | None = None
         self.hear = self._repeater.hear if self._repeater else None
         """To be called with each measurement; None: no call needed."""
+        self.samples = LastSamples()
+        """The last measurements."""
         self.misread = ""
         """Why the last message could not be read; empty: it could."""
         self.lost = 0
