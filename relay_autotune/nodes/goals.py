@@ -161,7 +161,8 @@ class TuneAction(OneGoal):
         self._id = experiment_id
         self._result = Tune.Result()
         self._newest = TransferFunction()
-        self._ultimate_gain = self._ultimate_gain_std = math.nan
+        # The newest model, which is kept beyond the feedback that tells it.
+        self._model: Any = None
 
     def _accept(self, goal: Any) -> None:
         request = goal.request
@@ -191,8 +192,8 @@ class TuneAction(OneGoal):
             remaining=experiment.remaining,
             period=math.nan,
             amplitude=math.nan,
-            ultimate_gain=self._ultimate_gain,
-            ultimate_gain_std=self._ultimate_gain_std,
+            ultimate_gain=self._model.ultimate_gain if self._model else math.nan,
+            ultimate_gain_std=self._model.ultimate_gain_std if self._model else math.nan,
             transfer_function=self._newest,
             status=status,
         )
@@ -213,9 +214,7 @@ class TuneAction(OneGoal):
         if self.running is None or message.experiment_id != self._id:
             return
         if name == "transfer_function":
-            self._newest = message
-            self._ultimate_gain = message.ultimate_gain
-            self._ultimate_gain_std = message.ultimate_gain_std
+            self._newest = self._model = message
             if message.final:
                 self._result.transfer_function = message
         elif message.final:

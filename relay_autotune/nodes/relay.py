@@ -177,7 +177,6 @@ class RelayNode(ServedNode):
 
     def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:
         checks = Checklist(self._name, stops=not dry_run)
-        answer = StartTune.Response()
         try:
             if self._session is not None:
                 raise NotReadyError(
@@ -187,23 +186,19 @@ class RelayNode(ServedNode):
             ready = self._readiness.of(amplitude, checks, self._held, self._last_cycle)
         except RelayAutotuneError as error:
             self.get_logger().warning(f"start refused: {error}")
-            answer.reason = str(error)
-            return answer
-        if dry_run:
-            answer.checks = checks.lines
+            return StartTune.Response(reason=str(error))
+        lines = checks.lines if dry_run else []
         if ready is None:
-            answer.reason = str(checks.refusal)
-            return answer
-        answer.accepted = True
+            return StartTune.Response(reason=str(checks.refusal), checks=lines)
         takes = how_long(ready.parameters, self._sensor.samples.interval, SETTLING_LIMIT)
         if dry_run:
-            answer.reason = f"a tune could start: {ready.plan}; {takes}"
-            return answer
-        answer.experiment_id, recorded = self._start(ready)
+            reason = f"a tune could start: {ready.plan}; {takes}"
+            return StartTune.Response(accepted=True, reason=reason, checks=lines)
+        identity, recorded = self._start(ready)
         reason = f"{ready.plan}; {recorded}; {takes}"
-        self.get_logger().info(f"tune {answer.experiment_id} started: {reason}")
-        answer.reason = f"{reason}; watch {WATCH.format(self._name)}"
-        return answer
+        self.get_logger().info(f"tune {identity} started: {reason}")
+        reason += f"; watch {WATCH.format(self._name)}"
+        return StartTune.Response(accepted=True, reason=reason, experiment_id=identity)
 
     def _start(self, ready: Ready) -> tuple[str, str]:
         parameters, policy = ready.parameters, ready.policy
