@@ -16,14 +16,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
-from relay_autotune.control.verification import (
-    Step,
-    StepRange,
-    allowed_steps,
-    noise_of,
-    plan,
-    proving_step,
-)
+from relay_autotune.control import verification
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -144,7 +137,7 @@ class GainsClient(LoopClient):
         :raises LoopError: if there is no model.
         """
         message = self._result(ModelMessage, "transfer_function")
-        return noise_of(message.noise_std, message.residual_rms)
+        return verification.noise_of(message.noise_std, message.residual_rms)
 
     def _result(self, kind: Any, topic: str) -> Any:
         found = self.latched(kind, topic, lambda m: m.final, _RESULT_WITHIN)
@@ -236,9 +229,11 @@ class GainsClient(LoopClient):
         record = self._record()
         if record is None:
             return None
-        return proving_step(record, self.model(), *self._limits(), self.noise()) or None
+        return (
+            verification.proving_step(record, self.model(), *self._limits(), self.noise()) or None
+        )
 
-    def allowed_steps(self, gains: Controller) -> StepRange:
+    def allowed_steps(self, gains: Controller) -> verification.StepRange:
         """Return the steps of the set-point that the limits of the node allow.
 
         Without the record of a tune it is not known where the loop rests: the node alone refuses.
@@ -248,12 +243,14 @@ class GainsClient(LoopClient):
         """
         record = self._record()
         if record is None:
-            return StepRange()
+            return verification.StepRange()
         names = ("law", "law_period", "apply_to")
         rate = rate_from(self.values(self.name, names))
         model = self.model()
-        peak = plan(gains, model, Step(setpoint=1.0), record.mean_interval, rate=rate).peak
-        return allowed_steps(record, model, *self._limits(), peak, self.noise())
+        peak = verification.plan(
+            gains, model, verification.Step(setpoint=1.0), record.mean_interval, rate=rate
+        ).peak
+        return verification.allowed_steps(record, model, *self._limits(), peak, self.noise())
 
     def _limits(self) -> tuple[Limits, Limits]:
         """Return the ranges of measurement and command."""

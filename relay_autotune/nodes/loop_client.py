@@ -245,7 +245,7 @@ class LoopClient:
         try:
             self.wait(lambda: mouth.get_subscription_count() > 0, ANSWER_WITHIN)
             yield lambda: mouth.publish(message)
-            # What nobody has taken yet ends with its publisher.
+            # A message that nobody has taken yet is lost with its publisher.
             mouth.wait_for_all_acked(Duration(seconds=_AGAIN))
         finally:
             self._node.destroy_publisher(mouth)

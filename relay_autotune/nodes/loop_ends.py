@@ -24,20 +24,10 @@ from std_msgs.msg import Bool, Float64
 
 from relay_autotune.errors import FieldError, NotReadyError
 from relay_autotune.experiment.experiment import RelayExperiment
-from relay_autotune.nodes import quality
+from relay_autotune.nodes import quality, watch
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import CommandMessage, Reader
 from relay_autotune.nodes.results import SIGNS_OF_LIFE
-from relay_autotune.nodes.watch import (
-    Following,
-    FollowWatch,
-    Guard,
-    Overtime,
-    namesake,
-    second_publisher,
-    second_source,
-    silence,
-)
 from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 
@@ -141,7 +131,7 @@ class Ends:
         self.experiments = tells(ExperimentMessage, "relay_experiment", quality.RESULT)
         self.diagnostics = tells(DiagnosticArray, "/diagnostics", 1)
         self.reader = reader
-        self._sensor = Following(node, reader, on_measurement, is_busy)
+        self._sensor = watch.Following(node, reader, on_measurement, is_busy)
         self.models, self.gains = (
             quality.subscription(node, kind, name, partial(on_result, name), quality.RESULT)
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
@@ -296,9 +286,9 @@ class LoopEnds:
         """A problem that an operator must act on, or ""."""
         # Time of the last feedback; inf: there is no feedback.
         self._feedback_at = math.inf
-        self._follow: FollowWatch | None = None
+        self._follow: watch.FollowWatch | None = None
         self._own: deque[float] = deque(maxlen=_OWN_KEPT)
-        self._guard = Guard(node, stop)
+        self._guard = watch.Guard(node, stop)
         self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
         self._hold.publish(Bool(data=False))
         self._messages = ends.own.messages
@@ -363,7 +353,7 @@ class LoopEnds:
                     "or track before the start"
                 )
             return
-        problem = second_publisher(self._node, self._topic)
+        problem = watch.second_publisher(self._node, self._topic)
         if problem:
             raise NotReadyError(
                 f"{problem}; remap the controller's output to controller_command, or give path "
@@ -372,10 +362,10 @@ class LoopEnds:
 
     def _several(self) -> str:
         """Return a sentence on a second sensor, controller or relay_node, or ""."""
-        several = second_source(self._node, self._ends.measurement)
+        several = watch.second_source(self._node, self._ends.measurement)
         if not several and not self._takeover and not self._ends.is_reported:
-            several = second_source(self._node, self._controller)
-        return several or namesake(self._node)
+            several = watch.second_source(self._node, self._controller)
+        return several or watch.namesake(self._node)
 
     def take(self, experiment: RelayExperiment, *, gives_back: bool) -> None:
         """Take the command for a tune.
@@ -388,24 +378,26 @@ class LoopEnds:
         self.commanded = math.nan
         if self._ends.setpoint is None:
             self.handover.take_over()
-        checks: list[Callable[[], str]] = [Overtime.of(experiment, self._node)]
+        checks: list[Callable[[], str]] = [watch.Overtime.of(experiment, self._node)]
         of_graph = [self._several]
         if not self._takeover:
-            of_graph.append(partial(second_publisher, self._node, self._topic))
+            of_graph.append(partial(watch.second_publisher, self._node, self._topic))
         if connected:
             timeout = self._value("controller_timeout")
             reported = self._ends.is_reported
             topic = (self._ends.measurement if reported else self._controller).topic_name
-            checks.append(silence(f"no command on {topic}", timeout, lambda: self.handover.age))
+            checks.append(
+                watch.silence(f"no command on {topic}", timeout, lambda: self.handover.age)
+            )
         timeout = self._value("feedback_timeout")
         self._follow = None
         if self._ends.setpoint is None:
             if not self._node.count_publishers("command_feedback"):
                 # No feedback now is no fault; feedback that starts later is checked from then on.
                 self._feedback_at = math.inf
-            self._follow = FollowWatch(self._tolerance(experiment), timeout)
+            self._follow = watch.FollowWatch(self._tolerance(experiment), timeout)
             checks.append(
-                silence(
+                watch.silence(
                     "no command_feedback",
                     2.0 * timeout,
                     lambda: time.monotonic() - self._feedback_at,

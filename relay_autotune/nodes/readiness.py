@@ -233,7 +233,8 @@ class Readiness:
             _require_known_range(parameters, values["baseline"])
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
-        # Who tells where the actuator is, tells of its ends, too.
+        # A feedback of the position, or the controller of a closed loop, also shows where the
+        # actuator ends.
         told = moves_setpoint or self._node.count_publishers("command_feedback") > 0
         from_small = not told and _is_beyond_known(parameters, baseline)
         return Ready(parameters, baseline, policy, from_small)

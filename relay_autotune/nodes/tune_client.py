@@ -81,8 +81,8 @@ class TuneClient(LoopClient):
         :param leave: returns True to stop waiting; this method then returns.
         :raises LoopError: if a node is missing; the sentence names the nodes that are there.
         """
-        # What reads a model takes most of a second to load: now, while the middleware looks for
-        # the nodes, and not at the first model in the middle of a tune.
+        # Reading a model needs modules that take most of a second to load: load them now, while
+        # the middleware looks for the nodes, and not at the first model in the middle of a tune.
         from relay_autotune.exchange import models  # noqa: F401
 
         deadline = time.monotonic() + patience
