@@ -24,9 +24,9 @@ from relay_autotune.control.controller import is_usable
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import (
     FieldError,
+    LoopError,
     NotReadyError,
     ParameterError,
-    RelayAutotuneError,
     TuningError,
 )
 from relay_autotune.loop.gains import Controller, Gains
@@ -43,10 +43,6 @@ NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
 TIMEOUT = 2.0
 # Relative difference of two periods that are the same.
 _SAME_RATE = 0.01
-
-
-class RemoteError(RelayAutotuneError):
-    """Another node did not take the gains."""
 
 
 def mapping_of(text: str) -> dict[str, str]:
@@ -77,7 +73,7 @@ def controller_of(gains: Mapping[str, float], feedforward: float = 0.0) -> Contr
     """
     proportional = gains.get("kc", gains.get("p"))
     if proportional is None or not {"ti", "i"} & set(gains):
-        raise RemoteError(
+        raise LoopError(
             f"only the gains {', '.join(gains)} are known, expected kc or p, and ti or i: name "
             "their parameters in apply_parameters"
         )
@@ -264,7 +260,7 @@ class RemoteGains(Place):
         values = {n: v for n, v in zip(names, found, strict=False) if isinstance(v, float)}
         missing = [name for name in names if name not in values]
         if missing:
-            raise RemoteError(f"{self.name} has no number {', '.join(missing)}")
+            raise LoopError(f"{self.name} has no number {', '.join(missing)}")
         return GainSet.of(values)
 
     async def put(self, gains: GainSet | None) -> None:
@@ -278,21 +274,19 @@ class RemoteGains(Place):
         wanted = [Parameter(name, value=value).to_parameter_msg() for name, value in gains.values]
         answer = await self._ask(self._set, SetParametersAtomically.Request(parameters=wanted))
         if not answer.result.successful:
-            raise RemoteError(f"{self.name} refused the gains: {answer.result.reason}")
+            raise LoopError(f"{self.name} refused the gains: {answer.result.reason}")
         found = await self.read()
         if not found.is_near(gains):
-            raise RemoteError(f"{self.name} did not take the gains: it has {found}, not {gains}")
+            raise LoopError(f"{self.name} did not take the gains: it has {found}, not {gains}")
 
     async def _ask(self, client: Any, request: Any) -> Any:
         if not client.service_is_ready():
-            raise RemoteError(f"the node {self.name} is not there, or has no parameter services")
+            raise LoopError(f"the node {self.name} is not there, or has no parameter services")
         answer = client.call_async(request)
 
         def give_up() -> None:
             if not answer.done():
-                answer.set_exception(
-                    RemoteError(f"{self.name} did not answer within {TIMEOUT:g} s")
-                )
+                answer.set_exception(LoopError(f"{self.name} did not answer within {TIMEOUT:g} s"))
 
         timer = self._node.create_timer(TIMEOUT, give_up, callback_group=self._group, clock=STEADY)
         try:
