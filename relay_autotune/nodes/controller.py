@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
-from relay_autotune.control.controller import GainBounds, is_usable, running
+from relay_autotune.control.controller import is_usable, running
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Step, runs_stably
 from relay_autotune.errors import (
@@ -67,11 +67,11 @@ class ControllerNode(ServedNode):
         super().__init__("controller_node")
         declare(self, (*tables.GAINS, *tables.OTHERS))
         declare(self, tables.FIXED, read_only=True)
-        values = values_of(self, (*tables.GAINS, *tables.OTHERS, *tables.FIXED))
+        values = values_of(self, tables.CONTROLLER_PARAMETERS)
         require_own_time(values["sample_period"], values["repeat_period"])
-        gains, self._rate = tables.gains_from(values), tables.rate_from(values)
-        if gains is not None:
-            tables.bounds_from(values, self._rate).require(gains)
+        self._rate = tables.rate_from(values)
+        self._settings = tables.settings_from(values, self._rate)
+        gains = self._settings.gains
         self._results = ResultCheck(self, lambda c, model: runs_stably(c, model, self._rate))
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
@@ -81,13 +81,11 @@ class ControllerNode(ServedNode):
         self._doubt = ""
         self._applying = False
         self._predictors = Predictors(self._results.models)
-        self._limits = tables.limits_from(values)
-        self._range = tables.range_from(values)
         self._pid = running(
             self._rate,
             gains,
             values["initial_command"],
-            limits=self._limits,
+            limits=self._settings.limits,
             automatic=not values["manual"],
             usual_interval=values["repeat_period"],
         )
@@ -231,7 +229,7 @@ class ControllerNode(ServedNode):
                 # An integral that went on would be a jump for whoever takes the commands later.
                 self._pid.track(self._pid.command)
             command = self._pid.step(at, self._setpoint + self._offset, value)
-            self._message.data = self._limits.clip(command + self._load)
+            self._message.data = self._settings.limits.clip(command + self._load)
             self._commands.publish(self._message)
             self._commanded = True
         if math.isfinite(value) and math.isfinite(command):
@@ -254,7 +252,8 @@ class ControllerNode(ServedNode):
         return untaken
 
     def _is_possible(self, value: float) -> bool:
-        return is_usable(value) and self._range.low <= value <= self._range.high
+        within = self._settings.within
+        return is_usable(value) and within.low <= value <= within.high
 
     def _on_setpoint(self, message: Float64) -> None:
         value = message.data
@@ -299,7 +298,7 @@ class ControllerNode(ServedNode):
         name = message.experiment_id
         try:
             self._place.require_law(gains)
-            self._bounds.require(gains)
+            self._settings.bounds.require(gains)
             self._keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
             self._results.refusals.say("gains", name, error)
@@ -321,10 +320,6 @@ class ControllerNode(ServedNode):
                 )
             )
         self._apply_by_itself()
-
-    @property
-    def _bounds(self) -> GainBounds:
-        return tables.bounds_from(values_of(self, tables.OTHERS), self._rate)
 
     def _on_model(self, message: Any) -> None:
         if message.final and self._results.model(message) is not None:
@@ -365,7 +360,7 @@ class ControllerNode(ServedNode):
         try:
             # The record may have come after the gains.
             self._results.check(name, gains)
-            self._bounds.require(gains)
+            self._settings.bounds.require(gains)
             if self._doubt and not self.get_parameter("accept_doubtful").value:
                 raise TuningError(
                     f"they are {self._doubt}; set the parameter accept_doubtful to true to have "
@@ -427,7 +422,7 @@ class ControllerNode(ServedNode):
             )
         gains, steps = self._place.controller_of(kept), self._steps_of(request)
         await self._keeper.begin_verification()
-        return Verifiable(steps, gains, model, self._limits, self._rate)
+        return Verifiable(steps, gains, model, self._settings.limits, self._rate)
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value
@@ -489,7 +484,7 @@ class ControllerNode(ServedNode):
         elif self._commanded and not self._held:
             given = self.get_parameter("safe_command").value
             last = self._pid.command if math.isnan(rested) else rested
-            safe = self._limits.clip(last if math.isnan(given) else given)
+            safe = self._settings.limits.clip(last if math.isnan(given) else given)
             self._message.data = safe
             self._commands.publish(self._message)
             self._commands.wait_for_all_acked(ACKNOWLEDGE)
@@ -519,27 +514,19 @@ class ControllerNode(ServedNode):
         if self._verifier.is_running:
             raise ParameterError("parameters stay as they are while a verification runs")
         values = merged(self, (*tables.GAINS, *tables.OTHERS), changes)
-        tables.limits_from(values)
-        tables.range_from(values)
-        gains, bounds = tables.gains_from(values), tables.bounds_from(values, self._rate)
-        if gains is not None:
-            bounds.require(gains)
+        gains = tables.settings_from(values, self._rate).gains
         if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
             self._keeper.require_editable(self._own(gains))
 
     def _after_set(self, changes: list[Parameter]) -> None:
         if self._following:
             return
-        names = {change.name for change in changes}
         values = values_of(self, (*tables.GAINS, *tables.OTHERS))
-        if names & NAMES_OF_GAINS and self._remote is None:
-            gains = tables.gains_from(values)
-            self._pid.use(gains)
-            self._keeper.edited(self._own(gains))
-        self._range = tables.range_from(values)
-        if names & {"command_min", "command_max"}:
-            self._limits = tables.limits_from(values)
-            self._pid.limit(self._limits)
+        self._settings = tables.settings_from(values, self._rate)
+        if {change.name for change in changes} & NAMES_OF_GAINS and self._remote is None:
+            self._pid.use(self._settings.gains)
+            self._keeper.edited(self._own(self._settings.gains))
+        self._pid.limit(self._settings.limits)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from relay_autotune.control.controller import LARGEST_GAIN, LARGEST_VALUE, LONGEST_TIME, GainBounds
@@ -235,47 +236,41 @@ FIXED = (
 CONTROLLER_PARAMETERS = (*GAINS, *OTHERS, *FIXED)
 
 
-def gains_from(values: Mapping[str, Any]) -> Controller | None:
-    """Return the gains that the parameters give, None if there are none.
+@dataclass(frozen=True)
+class Settings:
+    """What the parameters of controller_node that may change give.
+
+    :param gains: the controller; None: there are no gains, the command is held.
+    :param bounds: bounds for new gains.
+    :param limits: range of the command.
+    :param within: range of the measurement.
+    """
+
+    gains: Controller | None
+    bounds: GainBounds
+    limits: Limits
+    within: Limits
+
+
+def settings_from(values: Mapping[str, Any], rate: LawRate | None) -> Settings:
+    """Return what the parameters give.
 
     :param values: the parameters by name.
-    :raises RelayAutotuneError: if they are not valid.
+    :param rate: of `rate_from`.
+    :raises RelayAutotuneError: if a range is empty, or the gains are not valid or out of bounds.
     """
-    if values["kc"] == 0.0:
-        return None
-    return Controller(**{entry.name: values[entry.name] for entry in GAINS})
-
-
-def limits_from(values: Mapping[str, Any]) -> Limits:
-    """Return the range of the command.
-
-    :param values: the parameters by name.
-    :raises RelayAutotuneError: if the range is empty.
-    """
-    return Limits(values["command_min"], values["command_max"])
-
-
-def range_from(values: Mapping[str, Any]) -> Limits:
-    """Return the range of the measurement.
-
-    :param values: the parameters by name.
-    :raises ParameterError: if the range is empty.
-    """
+    limits = Limits(values["command_min"], values["command_max"])
     low, high = values["measurement_min"], values["measurement_max"]
     if not low < high:
         raise ParameterError(
             f"measurement_min {low:g} and measurement_max {high:g} leave no range"
         )
-    return Limits(low, high)
-
-
-def bounds_from(values: Mapping[str, Any], rate: LawRate | None) -> GainBounds:
-    """Return the bounds for new gains.
-
-    :param values: the parameters by name.
-    :param rate: of `rate_from`.
-    """
-    return GainBounds(values["kc_max"], values["ti_min"], rate)
+    bounds = GainBounds(values["kc_max"], values["ti_min"], rate)
+    gains = None
+    if values["kc"] != 0.0:
+        gains = Controller(**{entry.name: values[entry.name] for entry in GAINS})
+        bounds.require(gains)
+    return Settings(gains, bounds, limits, Limits(low, high))
 
 
 def rate_from(values: Mapping[str, Any]) -> LawRate | None:
