@@ -121,9 +121,7 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
     role, named = ("command", command) if measurement is None else ("measurement", measurement)
     given = None if named is None else _checked(topics, role, named)
     signals = [timed.signal for timed in topics.signals().values()]
-    place = 1 if role == "command" else 0
-    pairs = [p for p in plausible_pairs(signals, given) if given in (None, p[place])]
-    return _only(topics, pairs)
+    return _only(topics, plausible_pairs(signals, **({} if given is None else {role: given})))
 
 
 def _checked(topics: Topics, role: str, wanted: str) -> str:
@@ -159,25 +157,28 @@ def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[
     )
 
 
-def plausible_pairs(signals: Sequence[Signal], given: str | None = None) -> list[Pair]:
+def plausible_pairs(
+    signals: Sequence[Signal], *, measurement: str | None = None, command: str | None = None
+) -> list[Pair]:
     """Return the pairs that look like measurement and command of one loop, likeliest kind only.
 
     A pair whose names tell its roles comes before one whose names do not; then a pair within one
     namespace comes before one across two.
 
     :param signals: the recording's numeric signals.
-    :param given: name of a signal that the user chose; it may look like anything.
+    :param measurement: name of the measurement that the user chose, which may look like anything.
+    :param command: name of the command that the user chose.
     """
     looks = {signal.name: characterise(signal) for signal in signals}
     found = []
-    for measurement, command in itertools.permutations(signals, 2):
-        names = (measurement.name, command.name)
-        if given is not None and given not in names:
+    for y, u in itertools.permutations(signals, 2):
+        names = (y.name, u.name)
+        if measurement not in (None, names[0]) or command not in (None, names[1]):
             continue
         if (
-            (names[0] == given or _may_be_measurement(measurement, looks[names[0]].kind))
-            and (names[1] == given or _may_be_command(command, looks[names[1]].kind))
-            and _overlap(measurement, command)
+            (names[0] == measurement or _may_be_measurement(y, looks[names[0]].kind))
+            and (names[1] == command or _may_be_command(u, looks[names[1]].kind))
+            and _overlap(y, u)
         ):
             named = (role_by_name(names[0]) == "measurement") + (
                 role_by_name(names[1]) == "command"

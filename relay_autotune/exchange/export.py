@@ -16,7 +16,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from relay_autotune.errors import SelectionError
+from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS, OWN_LAW, Law, SampledLaw
 from relay_autotune.quantities import told_fields
@@ -181,7 +181,10 @@ def number(value: float) -> str:
     """Return a finite number so that YAML, and `ros2 param load` after it, reads a double.
 
     :param value: rounded to ten digits, or to as many more as it takes.
+    :raises ParameterError: if it is not finite.
     """
+    if not math.isfinite(value):
+        raise ParameterError(f"a file of gains cannot hold {value:g}; expected a finite number")
     rounded = float(f"{value:.{_DIGITS}g}")
     text = repr(rounded if math.isfinite(rounded) else float(value))
     while "." not in text:

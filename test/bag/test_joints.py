@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from robot_bags import Robot, write_robot
 
+from relay_autotune.bag.pairing import plausible_pairs
 from relay_autotune.bag.reader import Recording, read_experiments
-from relay_autotune.bag.signals import Selection
+from relay_autotune.bag.signals import Selection, Signal
 from relay_autotune.errors import SelectionError
 
 JOINTS = ["left_wheel", "right_wheel", "arm"]
@@ -161,3 +162,17 @@ def test_a_bag_without_joints(tmp_path: Path, robot: Robot) -> None:
     path = write_robot(tmp_path / "bag.mcap", 20, commands=(ARRAY, robot.commands))
     with pytest.raises(SelectionError, match="has no topic whose messages name joints"):
         read(path, "arm")
+
+
+def test_a_named_command_is_paired_although_its_name_is_that_of_a_measurement():
+    time_ns = np.arange(400) * 10**8
+    wave = np.sin(np.arange(400) / 20.0)
+    steps = np.where(np.arange(400) // 100 % 2, 1.0, 0.0)
+    speed, current, pwm = (
+        Signal(f"/wheel/{name}", time_ns, values)
+        for name, values in (("speed", wave), ("current", 1.5 + wave**2), ("pwm", steps))
+    )
+    ((*names, _),) = plausible_pairs((speed, current, pwm), command="/wheel/speed")
+    assert names == ["/wheel/current", "/wheel/speed"]
+    ((*names, _),) = plausible_pairs((speed, current, pwm), measurement="/wheel/speed")
+    assert names == ["/wheel/speed", "/wheel/pwm"]

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.cli import replay, terminal, tune
-from relay_autotune.errors import SelectionError
+from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import Target, exported, number, pid_controller, plain
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
@@ -261,3 +261,9 @@ def test_a_document_tells_the_law_and_without_one_nothing(capsys):
     (told,) = json.loads(capsys.readouterr().out)["gains"]
     assert "law" not in told
     assert "law_period" not in told
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_a_number_that_is_not_finite_is_refused(value):
+    with pytest.raises(ParameterError, match="expected a finite number"):
+        number(value)
