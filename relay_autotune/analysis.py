@@ -390,10 +390,7 @@ def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneErro
 
 
 def _judged(
-    found: Analysis,
-    evidence: Evidence,
-    records: Sequence[Record],
-    tuning: _Tuning,
+    found: Analysis, evidence: Evidence, records: Sequence[Record], tuning: _Tuning
 ) -> Analysis:
     """Judge the model, add gains if they are allowed, and judge the gains."""
     refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")

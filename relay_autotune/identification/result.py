@@ -57,10 +57,7 @@ def determined_combinations(
         (name, unit, found.uncertain(function)) for name, unit, function in _asked(found.model)
     ]
     if math.isfinite(point[0].value):
-        asked += [
-            ("ultimate_gain", "u/y", point[0]),
-            ("ultimate_frequency", "rad/s", point[1]),
-        ]
+        asked += [("ultimate_gain", "u/y", point[0]), ("ultimate_frequency", "rad/s", point[1])]
     combinations = (
         Combination(name, unit, e.value, e.std, e.low, e.high) for name, unit, e in asked
     )
@@ -73,9 +70,7 @@ def point_of(model: TransferFunction) -> tuple[float, float]:
     return (math.nan, math.nan) if point is None else (point.gain, point.frequency)
 
 
-def _asked(
-    model: TransferFunction,
-) -> list[tuple[str, str, Callable[[TransferFunction], float]]]:
+def _asked(model: TransferFunction) -> list[tuple[str, str, Callable[[TransferFunction], float]]]:
     """Return names, units and functions of the combinations that may be determined."""
     lags = len(model.time_constants)
     found: list[tuple[str, str, Callable[[TransferFunction], float]]] = []

@@ -22,13 +22,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 
 from relay_autotune.control.controller import is_usable
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.errors import (
-    FieldError,
-    LoopError,
-    NotReadyError,
-    ParameterError,
-    TuningError,
-)
+from relay_autotune.errors import FieldError, LoopError, NotReadyError, ParameterError, TuningError
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS, LawRate
 from relay_autotune.nodes import quality

@@ -202,11 +202,7 @@ def _normalised(y: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def integrated_error(
-    model: TransferFunction,
-    process: TransferFunction,
-    frequency: float,
-    *,
-    relative: bool = True,
+    model: TransferFunction, process: TransferFunction, frequency: float, *, relative: bool = True
 ) -> float:
     """Return the error of a model over two decades about w_u (eqs 29 and 30).
 

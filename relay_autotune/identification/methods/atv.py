@@ -25,11 +25,7 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.lags import (
-    MODEL_4,
-    Solution,
-    require_equal_lags,
-)
+from relay_autotune.identification.methods.lags import MODEL_4, Solution, require_equal_lags
 from relay_autotune.identification.methods.symmetric_method import (
     Found,
     SymmetricMethod,

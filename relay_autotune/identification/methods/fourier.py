@@ -239,10 +239,7 @@ def _covered(frequency: float, points: tuple[FrequencyPoint, ...]) -> bool:
 
 
 def _with_static_gain(
-    test: RelayTest,
-    record: Record,
-    points: tuple[FrequencyPoint, ...],
-    structure: Structure,
+    test: RelayTest, record: Record, points: tuple[FrequencyPoint, ...], structure: Structure
 ) -> _Points:
     """Add the static gain as a point at w = 0, where the means show it and the model has one."""
     frequency = [p.frequency for p in points]

@@ -396,10 +396,7 @@ def _fits(
 
 
 def _shape_misfit(
-    tests: Sequence[RelayTest],
-    cycles: Sequence[SymmetricCycle],
-    model: Structure,
-    fit: JointFit,
+    tests: Sequence[RelayTest], cycles: Sequence[SymmetricCycle], model: Structure, fit: JointFit
 ) -> float:
     """Return how far the half cycles of all tests are from a model's, over their amplitudes."""
     squares = 0.0

@@ -335,10 +335,7 @@ def _jacobian(solve: Callable[[Shape], FloatArray], reading: Reading) -> FloatAr
 
 
 def _literal(
-    solver: Solver,
-    shape: Shape,
-    scaled: Callable[[FloatArray], FloatArray],
-    found: Identification,
+    solver: Solver, shape: Shape, scaled: Callable[[FloatArray], FloatArray], found: Identification
 ) -> list[str]:
     """Return what the paper's equations give, where that differs."""
     begin = f"as in the paper, for an ideal relay, {solver.equations} "

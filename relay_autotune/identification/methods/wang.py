@@ -387,10 +387,7 @@ def _identified(
     covariance = None
     if len(cycles) >= _LEAST_CYCLES:
         covariance = _jackknife(
-            record,
-            cycles,
-            lambda part: values(part, facts),
-            partly=method == "wang_biased",
+            record, cycles, lambda part: values(part, facts), partly=method == "wang_biased"
         )
     if covariance is not None:
         for other in uncertain:
@@ -405,11 +402,7 @@ def _identified(
 
 
 def _jackknife(
-    record: Record,
-    cycles: tuple[int, ...],
-    measure: Callable[[Fold], FloatArray],
-    *,
-    partly: bool,
+    record: Record, cycles: tuple[int, ...], measure: Callable[[Fold], FloatArray], *, partly: bool
 ) -> FloatArray | None:
     """Return the covariance by leaving out one cycle after the other; None: too few solve.
 

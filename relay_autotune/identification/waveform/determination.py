@@ -212,10 +212,7 @@ def profile_ends(
     centre = parameter(state.theta, state.coefficients)
     below, above = (
         _end(
-            problem,
-            state,
-            parameter,
-            _Search(centre, side, std, quantile, least, unit, farthest),
+            problem, state, parameter, _Search(centre, side, std, quantile, least, unit, farthest)
         )
         for side in (-1.0, 1.0)
     )

@@ -395,11 +395,7 @@ def responses(
 
 
 def free_motion(
-    denominator: Denominator,
-    theta: FloatArray,
-    time: FloatArray,
-    *,
-    growing_only: bool = False,
+    denominator: Denominator, theta: FloatArray, time: FloatArray, *, growing_only: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Return what a free initial state adds to the output, and its derivatives.
 

@@ -193,8 +193,7 @@ class Problem:
 
 
 def problem_of(
-    records: Sequence[tuple[FloatArray, FloatArray, Input]],
-    structure: Structure,
+    records: Sequence[tuple[FloatArray, FloatArray, Input]], structure: Structure
 ) -> Problem:
     """Return the problem of fitting a structure to one or several experiments.
 

@@ -182,12 +182,7 @@ def unstable(task: DesignTask) -> tuple[Controller, str]:
 
 
 def _gains(
-    task: DesignTask,
-    model: TransferFunction,
-    tau: float,
-    late: float,
-    closed: float,
-    pid: bool,
+    task: DesignTask, model: TransferFunction, tau: float, late: float, closed: float, pid: bool
 ) -> Controller:
     size = abs(model.gain) * model.process_sign
     t = closed * (closed / tau + 2.0)

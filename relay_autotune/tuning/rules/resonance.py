@@ -124,13 +124,7 @@ def _intervals(
 
 
 def _refined(
-    loop: TransferFunction,
-    w: FloatArray,
-    i: int,
-    square: float,
-    which: int,
-    first: int,
-    last: int,
+    loop: TransferFunction, w: FloatArray, i: int, square: float, which: int, first: int, last: int
 ) -> float:
     sign = 1.0 if which == 0 else -1.0
     at = float(_roots(loop, w[i : i + 1], square)[which][0])
