@@ -13,6 +13,7 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
+from relay_autotune.analysis import analyse_alone
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.identification.waveform.coloured import _simulates, in_colour
 from relay_autotune.identification.waveform.method import identify_waveform
@@ -300,3 +301,15 @@ def test_a_growing_mode_is_tried_where_a_relay_held_the_process(sign):
     ground = Ground.of(problem, 0.0, sign)
     fit_all(Watched(ground.problem, ground.fopdt, ground.starts, ground.floor, sign))
     assert ("unstable_fopdt" in tried) is bool(sign)
+
+
+def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(1500)
+    u = 60.0 + 20.0 * np.sin(time) + 0.15 * np.cumsum(rng.normal(0.0, 1.0, time.size))
+    wheel = TransferFunction(6.0, (0.004,), integrators=1)
+    y = response(wheel, time, PiecewiseConstant(time, u, 0.0))
+    noise = lfilter([0.3], [1.0, -0.9], rng.normal(0.0, 1.0, time.size))
+    found = analyse_alone(Record(time=time, measurement=y + noise, command=u))
+    assert found.model.model.integrators == 1
+    assert found.model.model.gain == pytest.approx(6.0, rel=0.01)
+    assert found.best_gains is not None

@@ -168,8 +168,9 @@ def _is_told(candidate: Candidate) -> bool:
     """Return whether the samples determine each parameter.
 
     The standard deviation of a gain or a lag is compared with its value, that of a zero or a dead
-    time with all times together. It is larger where a lag is shorter than the sampling interval
-    or longer than the record, or where two lags cannot be told apart.
+    time with all times together. It is larger where a lag is shorter than the sampling interval,
+    or where two lags cannot be told apart. A lag of more than two lengths of the record is that of
+    an integrator.
     """
     problem, state = candidate.problem, candidate.state
     estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise(False))
@@ -178,6 +179,8 @@ def _is_told(candidate: Candidate) -> bool:
     deviation = np.sqrt(np.einsum("pk,pk->p", estimate.root, estimate.root))
     model = estimate.model
     slow = model.dead_time + sum(abs(t) for t in model.time_constants)
+    if any(abs(t) > _LASTING * float(np.ptp(problem.time)) for t in model.time_constants):
+        return False
     pairs = zip(estimate.structure.parameters, estimate.values, strict=True)
     size = [abs(float(v)) if p.logarithmic else slow for p, v in pairs]
     return bool(np.all(deviation <= _TOLD * np.maximum(size, 1e-300)))
