@@ -205,6 +205,11 @@ def _nanoseconds(
 ) -> tuple[IntArray, bool]:
     """Return times in nanoseconds, and whether they are dates."""
     if times["dates"]:
+        if max(map(abs, times["dates"])) >= 2**63:
+            raise BagError(
+                f"{path}: the column {name!r} has dates before 1678 or after 2262, which cannot "
+                "be counted in nanoseconds; expected those of a recording"
+            )
         notes.append(f"the column {name!r} is taken as dates in UTC, unless they name a zone")
         return np.array(times["dates"], dtype=np.int64), True
     if times["times of day"]:

@@ -207,6 +207,14 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     shown = StatusLine()
     try:
         result = client.prove(step, options.load, settles, options.wait, shown)
+    except KeyboardInterrupt:
+        shown.clear()
+        say(
+            PROGRAM,
+            f"{client.name} ends the step by itself, and its gains stay; {PROGRAM} --revert takes "
+            "back those before",
+        )
+        raise
     finally:
         shown.clear()
     lines = verdict_lines(result, client.in_force(), width(), stays=options.stays, noise_std=noise)

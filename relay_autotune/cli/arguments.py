@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib.util
 import math
 import os
@@ -120,6 +121,10 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     except Exception as error:
         if os.environ.get(DEBUG):
             raise
+        if isinstance(error, OSError) and error.errno in _FULL:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            say(program, f"standard output cannot be written: {error.strerror}")
+            return NOTHING_FOUND
         say(program, f"stopped by {defect(error)}")
         return NOTHING_FOUND
     finally:
@@ -128,6 +133,8 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     return status
 
 
+# A disk, or what stands for one, that takes no more.
+_FULL = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 _KINDS: dict[type, Callable[[str], Any]] = {int: int, float: finite}
 
 

@@ -90,6 +90,11 @@ def _convert(options: argparse.Namespace) -> int:
                 f"given with --measurement-topic and --command-topic"
             )
     epoch_ns = round(options.epoch * 1e9)
+    if not epoch_ns + int(measurement.time_ns[-1]) < 2**63:
+        raise SelectionError(
+            f"--epoch {options.epoch:g} s is after the year 2262, which no bag can hold; expected "
+            "seconds since 1970"
+        )
     if epoch_ns + int(measurement.time_ns[0]) < 0:
         raise BagError(
             f"{options.csv} begins at {measurement.time_ns[0] / 1e9:g} s, but a bag has no time "

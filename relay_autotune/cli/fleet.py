@@ -77,6 +77,8 @@ class ResultsFile:
                 f"{self._table} exists, and there is no {self.path} that it was made of; name "
                 "another file, or remove it"
             )
+        if self.path.exists() and not self.path.is_file():
+            raise BagError(f"{self.path} is no regular file; name another one")
         self.done: set[str] = set()
         self.status = DONE
         try:

@@ -186,6 +186,12 @@ def _from_document(name: str, experiment: int | None) -> dict[str, Any]:
             f"{name} is not a JSON document ({error.msg} in line {error.lineno}); if it is a "
             "replay of several bags, give one of its lines"
         ) from error
+    except SelectionError:
+        raise
+    except (ValueError, RecursionError):
+        raise SelectionError(
+            f"{name} holds numbers of too many digits, or too many brackets within one another"
+        ) from None
     if not isinstance(found, dict):
         raise SelectionError(f"{name} holds a JSON {type(found).__name__}, expected an object")
     if "experiments" in found:
@@ -206,6 +212,8 @@ def _no_constant(text: str) -> float:
 
 def _selected(name: str, document: dict[str, Any], which: int | None) -> dict[str, Any]:
     experiments = document["experiments"]
+    if not isinstance(experiments, list):
+        raise SelectionError(f"{name}: 'experiments' must be a list, as replay --json writes it")
     if which is not None and not 1 <= which <= len(experiments):
         raise SelectionError(
             f"{name} has {len(experiments)} experiments, found --experiment {which}"
@@ -218,14 +226,22 @@ def _selected(name: str, document: dict[str, Any], which: int | None) -> dict[st
         raise SelectionError(
             f"{name} has {len(with_model)} experiments with a model: choose one by --experiment"
         )
-    model: dict[str, Any] = with_model[0]["models"][with_model[0]["selected"]]
+    try:
+        model = with_model[0]["models"][with_model[0]["selected"]]
+    except (KeyError, IndexError, TypeError):
+        model = None
+    if not isinstance(model, dict):
+        raise SelectionError(f"{name}: 'selected' names no entry of 'models'")
     return model
 
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SelectionError(f"{name} must be a number, found {value!r}")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise SelectionError(f"{name} is beyond the numbers of a computer") from None
 
 
 def _constants(name: str, values: Any) -> tuple[complex, ...]:

@@ -395,3 +395,10 @@ def test_fewer_names_than_cells_are_not_taken_and_said(tmp_path):
     path = write(tmp_path / "a.csv", f"t,y,u\n{body}")
     found = read_experiments(path, Selection(measurement="2", command="3"))
     assert found.notes[0].startswith("line 1 has 3 names and the rows have 4 cells")
+
+
+@pytest.mark.parametrize("year", [1677, 2263, 9999])
+def test_a_date_beyond_nanoseconds_is_a_sentence(tmp_path, year):
+    body = "".join(f"{year}-06-01 00:00:{k:02},{k % 7},{k // 5 % 2}\n" for k in range(20))
+    with pytest.raises(BagError, match="before 1678 or after 2262"):
+        read_experiments(write(tmp_path / "a.csv", f"time,y,u\n{body}"))

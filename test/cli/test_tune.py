@@ -336,3 +336,23 @@ def test_compensators_stand_beside_the_rules(capsys):
     assert [c["name"] for c in found] == ["dead_time_compensator"]
     assert found[0]["closed_loop_time"] == 30.0
     assert found[0]["mt"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"experiments": 3}',
+        '{"experiments": [{"selected": 0}]}',
+        '{"experiments": [{"selected": 5, "models": [{}]}]}',
+        '{"experiments": [{"selected": "a", "models": [{}]}]}',
+        '{"experiments": [{"selected": 0, "models": [3]}]}',
+        '{"gain": 1' + "0" * 400 + "}",
+        '{"gain": 1' + "0" * 5000 + "}",
+        "[" * 200_000,
+    ],
+)
+def test_a_document_that_nobody_wrote_is_refused_in_a_line(tmp_path, capsys, text):
+    path = tmp_path / "model.json"
+    path.write_text(text)
+    assert tune.main([str(path)]) == 2
+    assert "defect" not in capsys.readouterr().err
