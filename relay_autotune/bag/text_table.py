@@ -123,8 +123,12 @@ class TextTable:
             raise BagError(f"{self._path} is empty; expected a header line, then rows of numbers")
         self._waiting = rows[data:]
         width = len(self._waiting[0][1]) if self._waiting else 0
-        above = [(line, _bare(cells, width)) for line, cells in rows[:data]]
-        fits = [self._is_header(cells, width) for _, cells in above]
+        # A separator at the end of each line makes no column.
+        filled = max(
+            (k + 1 for _, row in self._waiting for k, c in enumerate(row) if c), default=0
+        )
+        above = [(line, _bare(cells, filled)) for line, cells in rows[:data]]
+        fits = [self._is_header(cells, filled) for _, cells in above]
         if not fits or not fits[-1]:
             if not width:
                 raise BagError(
@@ -146,8 +150,7 @@ class TextTable:
             self.notes.append(f"line {line} holds no number and is taken for units")
             units, (line, cells) = cells, above[-2]
         self._head = cells
-        # A separator at the end of each line makes no column.
-        while not cells[-1] and not any(row[len(cells) - 1 :] > [""] for _, row in self._waiting):
+        while not cells[-1] and len(cells) > filled:
             cells = cells[:-1]
         names = [visible(name) for name in cells]
         self.units = {name: unit for name, unit in zip(names, units, strict=False) if unit}

@@ -384,9 +384,10 @@ def test_rows_that_share_a_coarse_stamp_are_spread_up_to_the_next_one(tmp_path):
     assert "about 4 rows share each time stamp" in found.notes[-1]
 
 
-def test_a_separator_at_the_end_of_each_line_makes_no_column(tmp_path):
-    body = "".join(f"{k * 0.1!r},{k % 7},{k // 5 % 2},\n" for k in range(20))
-    (record,) = read_experiments(write(tmp_path / "a.csv", f"t,y,u,\n{body}")).experiments
+@pytest.mark.parametrize(("head", "tail"), [(",", ","), ("", ","), (",,", ",,"), ("", ",,")])
+def test_a_separator_at_the_end_of_each_line_makes_no_column(tmp_path, head, tail):
+    body = "".join(f"{k * 0.1!r},{k % 7},{k // 5 % 2}{tail}\n" for k in range(20))
+    (record,) = read_experiments(write(tmp_path / "a.csv", f"t,y,u{head}\n{body}")).experiments
     np.testing.assert_array_equal(record.measurement, np.arange(20) % 7)
 
 
