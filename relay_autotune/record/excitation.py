@@ -138,17 +138,18 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
     after = held.times > record.time[first]
     inside = (after if first else held.times >= record.time[0]) & (held.times <= record.time[last])
     times, values = held.times[inside], held.values[inside]
+    # Rows that share a time stamp are one instant, at which the command changes once.
+    instants = np.count_nonzero(np.diff(record.time[first : last + 1]))
+    varies = times.size >= max(_FEWEST_CHANGES, _CONTINUOUS * instants)
+    if times.size and not varies and times[-1] == record.time[last]:
+        # A change at the last sample, as when all is switched off, has no response behind it.
+        times, values, last = times[:-1], values[:-1], last - 1
     if times.size == 0:
         return []
     earlier = held.values[: int(np.argmax(inside))]
     before = float(earlier[-1]) if earlier.size else held.initial
-    # Rows that share a time stamp are one instant, at which the command changes once.
-    instants = np.count_nonzero(np.diff(record.time[first : last + 1]))
-    if times.size >= max(_FEWEST_CHANGES, _CONTINUOUS * instants):
+    if varies:
         found = _moving_parts(record, first, last)
-    elif times[-1] == record.time[last]:
-        # A change at the last sample, as when all is switched off, has no response behind it.
-        return _in_part(record, first, last - 1)
     else:
         changes = _Changes(times, np.concatenate(([before], values)))
         found = _switching_parts(record, last, changes)

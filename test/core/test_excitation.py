@@ -220,6 +220,16 @@ def test_a_change_at_the_last_sample_is_left_out():
     (found,) = find_experiments(record)
     assert found.reason == "step of the command from 0 to 1 to 0.5"
     assert found.last == len(record) - 2
+    assert find_experiments(commanded([TIME[-1]], [0, 1])) == ()
+
+
+@pytest.mark.parametrize("samples", [200, 1900])
+def test_a_record_that_ends_within_a_ramp_of_the_command_is_an_experiment(samples):
+    times = TIME[-samples:]
+    (found,) = find_experiments(commanded(times, np.linspace(0.0, 50.0, samples + 1), noise=0.001))
+    assert found.kind == "steps"
+    assert TIME[found.first] < times[0]
+    assert found.last == TIME.size - 2
 
 
 def test_an_even_ramp_under_a_command_that_varies_all_the_time_is_an_experiment():
