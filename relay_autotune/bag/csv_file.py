@@ -204,21 +204,21 @@ def _nanoseconds(
     path: Path, name: str, times: Times, given: str | None, notes: list[str]
 ) -> tuple[IntArray, bool]:
     """Return times in nanoseconds, and whether they are dates."""
-    if times["dates"]:
-        if max(map(abs, times["dates"])) >= 2**63:
+    if times.dates:
+        if max(map(abs, times.dates)) >= 2**63:
             raise BagError(
                 f"{path}: the column {name!r} has dates before 1678 or after 2262, which cannot "
                 "be counted in nanoseconds; expected those of a recording"
             )
         notes.append(f"the column {name!r} is taken as dates in UTC, unless they name a zone")
-        return np.array(times["dates"], dtype=np.int64), True
-    if times["times of day"]:
+        return np.array(times.dates, dtype=np.int64), True
+    if times.clock:
         notes.append(f"the column {name!r} is taken as the time of day")
-        clock = np.array(times["times of day"], dtype=np.int64)
+        clock = np.array(times.clock, dtype=np.int64)
         half_day = 43200 * 10**9
         midnights = np.cumsum(np.diff(clock, prepend=clock[0]) < -half_day)
         return clock + 2 * half_day * midnights, False
-    time = np.array(times["numbers"])
+    time = np.array(times.numbers)
     largest = float(np.abs(time).max())
     step = float(np.median(np.abs(np.diff(time))))
     unit = given or _unit_of(name)

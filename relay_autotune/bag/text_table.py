@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, timezone
 from itertools import chain, islice, pairwise
 from pathlib import Path
@@ -48,9 +49,18 @@ _DATE = re.compile(
 )
 
 
-# The times of the rows in one of three forms, the others empty; all empty: the rows have none.
-# Numbers are as they stand, dates in nanoseconds since 1970, times of day in nanoseconds.
-Times = dict[str, list[float]]
+@dataclass(frozen=True)
+class Times:
+    """The times of the rows in one of three forms, the others empty; all empty: they have none.
+
+    :param numbers: as they stand.
+    :param dates: nanoseconds since 1970.
+    :param clock: times of day [ns].
+    """
+
+    numbers: list[float] = field(default_factory=list)
+    dates: list[int] = field(default_factory=list)
+    clock: list[int] = field(default_factory=list)
 
 
 class TextTable:
@@ -201,7 +211,7 @@ class TextTable:
         :param places: of the other columns.
         :raises BagError: if a cell holds anything but a number.
         """
-        times: Times = {"numbers": [], "dates": [], "times of day": []}
+        times = Times()
         values: list[list[float]] = [[] for _ in places]
         suffixes: list[str | None] = [None] * len(places)
         lines: list[int] = []
@@ -240,11 +250,11 @@ class TextTable:
             raise damaged[0]
         if len(lines) < 2:
             raise BagError(f"{self._path} has {len(lines)} rows of numbers; expected at least two")
-        for what in ("dates", "times of day"):
-            if time is not None and 0 < len(times[what]) < len(lines):
+        for count, what in ((len(times.dates), "dates"), (len(times.clock), "times of day")):
+            if time is not None and 0 < count < len(lines):
                 raise BagError(
-                    f"{self._path}: of {len(lines)} cells of {self.names[time]!r} "
-                    f"{len(times[what])} are {what}, the others not; expected one of them"
+                    f"{self._path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
+                    f"{what}, the others not; expected one of them"
                 )
         if self._commas and self._points:
             raise BagError(
@@ -266,9 +276,9 @@ class TextTable:
     def _stamp(self, line: int, at: int, cell: str, times: Times) -> None:
         date = None if _is_number(cell) else _date(cell)
         if date is None:
-            times["numbers"].append(self._number(line, at, cell)[0])
+            times.numbers.append(self._number(line, at, cell)[0])
         else:
-            times["dates" if date[1] else "times of day"].append(date[0])
+            (times.dates if date[1] else times.clock).append(date[0])
 
     def _number(self, line: int, at: int, cell: str) -> tuple[float, str]:
         """Return a number, NaN of an empty cell, and the unit behind it."""
