@@ -46,6 +46,7 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import Starts, refine_best, start_fopdt
+from relay_autotune.process.transfer_function import TransferFunction
 
 # Probability as white noise below which a residual has a colour.
 _WHITE = 1e-3
@@ -179,7 +180,7 @@ def _is_told(candidate: Candidate) -> bool:
     deviation = np.sqrt(np.einsum("pk,pk->p", estimate.root, estimate.root))
     model = estimate.model
     slow = model.dead_time + sum(abs(t) for t in model.time_constants)
-    if any(abs(t) > _LASTING * float(np.ptp(problem.time)) for t in model.time_constants):
+    if _outlasts(model, float(np.ptp(problem.time))):
         return False
     pairs = zip(estimate.structure.parameters, estimate.values, strict=True)
     size = [abs(float(v)) if p.logarithmic else slow for p, v in pairs]
@@ -322,9 +323,14 @@ def _earned(candidate: Candidate, length: float) -> Candidate:
     :param length: of the record [s].
     """
     model = candidate.model
-    if model.is_stable and all(abs(t) <= _LASTING * length for t in model.time_constants):
+    if model.is_stable and not _outlasts(model, length):
         return candidate
     return replace(candidate, criterion=candidate.criterion + _EARNED)
+
+
+def _outlasts(model: TransferFunction, length: float) -> bool:
+    """Return whether a lag is so long beside a record that it is that of an integrator."""
+    return any(abs(t) > _LASTING * length for t in model.time_constants)
 
 
 def _simulates(found: list[Candidate], simulated: list[Candidate]) -> bool:
