@@ -155,16 +155,9 @@ def _visible(evidence: Evidence) -> Measured | None:
     return Measured(float(share[at]), f"{w[at]:.3g} rad/s")
 
 
-def _worst(
-    loop: Loop, models: Sequence[TransferFunction], sign: int = 0
-) -> tuple[float, TransferFunction]:
-    """Return the largest Ms of the gains on models, and its model.
-
-    :param sign: on a process of another sign Ms is infinite; 0: any sign.
-    """
+def _worst(loop: Loop, models: Sequence[TransferFunction]) -> tuple[float, TransferFunction]:
+    """Return the largest Ms of the gains on models, and its model."""
     ms = loop.ms_of(models)
-    if sign:
-        ms = np.where([m.process_sign == sign for m in models], ms, math.inf)
     at = int(np.argmax(ms))
     return float(ms[at]), models[at]
 
@@ -204,10 +197,10 @@ def _halves_direction(evidence: Evidence) -> Measured | None:
 
 
 def _plain(evidence: Evidence) -> Measured | None:
-    loop, sign = evidence.loop, evidence.found.model.process_sign
+    loop = evidence.loop
     if loop is None or not evidence.plain:
         return None
-    ms, model = _worst(loop, evidence.plain, sign)
+    ms, model = _worst(loop, evidence.plain)
     return Measured(ms / loop.ms, process_text(model))
 
 
@@ -482,7 +475,7 @@ LOOP_CHECKS = (
         name="plain",
         title="Plain models",
         what="Ms of the gains on the worst of one or two lags with dead time, where these explain "
-        "the record as well, over Ms on the model; infinite: the direction is the other one",
+        "the record as well, over Ms on the model",
         unit="",
         doubtful=2.0,
         sentence="{detail}, which is simpler and explains the record as well, has an Ms {value} "
