@@ -15,16 +15,10 @@ from scipy.signal import lfilter
 
 from relay_autotune.analysis import analyse_alone
 from relay_autotune.identification.known import NOTHING
-from relay_autotune.identification.waveform.coloured import _simulates, in_colour
+from relay_autotune.identification.waveform.candidates import FitContext, nuisances_of, support
+from relay_autotune.identification.waveform.choice import _compared, _simulates, chosen_fit
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import colour_of, slow_colour
-from relay_autotune.identification.waveform.selection import (
-    Ground,
-    fit_all,
-    fit_one,
-    nuisances_of,
-    support,
-)
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
@@ -131,8 +125,7 @@ def test_in_a_colour_structures_are_weighted_by_akaikes_criterion():
     rng = np.random.default_rng(5)
     record = relay_test(0.09 * correlated(0.9, 1400, rng), np.zeros(1400))
     problem = problem_of([(record.time, record.measurement, record.drive())], FOPDT)
-    fit = in_colour(problem, 1.0, NOTHING, 1, held=False)
-    assert fit is not None
+    fit = chosen_fit(problem, NOTHING, 1, 1.0, held=False)
     stable = [c for c in fit.candidates if c.model.is_stable]
     n = stable[0].problem.time.size
     criteria = [n * math.log(c.state.cost) + 2 * c.state.parameters for c in stable]
@@ -207,8 +200,8 @@ def test_a_process_that_visibly_rested_needs_no_past():
     u = PiecewiseConstant(np.array([40.0]), np.array([1.0]), initial=0.0)
     y = response(TransferFunction.sopdt(1.0, (150.0, 12.0), 5.0), time, u) ** 1.5
     y = np.round(150.0 * y / y.max()) / 150.0
-    ground = Ground.of(problem_of([(time, y, u)], FOPDT), time.size * 1e-18)
-    best = fit_all(ground)[0]
+    context = FitContext.of(problem_of([(time, y, u)], FOPDT), 0, held=False)
+    best = _compared(context, NOTHING)[0]
     assert best.model.gain > 0.0
     assert nuisances_of(best.problem)[1:] == (False, False)
 
@@ -275,9 +268,8 @@ def test_a_model_whose_response_the_colour_explains_does_not_simulate():
     u = PiecewiseConstant(np.array([6.0, 30.0]), np.array([1.0, 0.3]), 0.0)
     noise = 0.02 * np.random.default_rng(3).standard_normal(time.size)
     problem = problem_of([(time, response(PROCESS, time, u) + noise, u)], FOPDT)
-    ground = Ground.of(problem, 0.0, 1)
-    right = fit_one(ground, "fopdt")
-    assert right is not None
+    context = FitContext.of(problem, 1, held=False)
+    (right,) = context.fit(["fopdt"])
     bent = replace(
         right, state=evaluate(problem, right.state.theta + np.array((math.log(3.0), 0.0)))
     )
@@ -292,14 +284,13 @@ def test_a_growing_mode_is_tried_where_a_relay_held_the_process(sign):
     problem = problem_of([(record.time, record.measurement, record.drive())], FOPDT).thinned(150)
     tried = []
 
-    class Watched(Ground):
+    class Watched(FitContext):
         def fit(self, names, order=0, ready=()):
             names = list(names)
             tried.extend(names)
             return super().fit(names, order, ready)
 
-    ground = Ground.of(problem, 0.0, sign)
-    fit_all(Watched(ground.problem, ground.fopdt, ground.starts, ground.floor, sign))
+    _compared(Watched.of(problem, sign, held=bool(sign)), NOTHING)
     assert ("unstable_fopdt" in tried) is bool(sign)
 
 

@@ -20,7 +20,7 @@ from relay_autotune.identification.waveform.rational import (
     partial_fractions,
     responses,
 )
-from relay_autotune.identification.waveform.selection import support
+from relay_autotune.identification.waveform.candidates import support
 from relay_autotune.identification.waveform.starts import is_unseen
 from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
@@ -278,7 +278,7 @@ def test_a_response_that_turns_only_after_the_record_is_unseen():
 
 def test_the_support_of_candidates_that_are_not_in_order():
     found = support(
-        [SimpleNamespace(criterion=c, lenience=0.0) for c in (-36500.0, -38748.0, -38746.0)]
+        [SimpleNamespace(score=c, bic_minus_aic=0.0) for c in (-36500.0, -38748.0, -38746.0)]
     )
     assert found[0] == pytest.approx(0.0, abs=1e-300)
     assert found[1] == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))

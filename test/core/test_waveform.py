@@ -18,7 +18,6 @@ from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
-from relay_autotune.identification.waveform.selection import Ground, of_shown_direction
 from relay_autotune.identification.waveform.separable import problem_of
 from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.response import response
@@ -358,16 +357,3 @@ def test_a_dead_time_that_hides_the_first_response_is_no_explanation():
     found = identify_waveform(Record(time, response(process, time, felt) + noise, command))
     assert found.model.dead_time < 20.0
     assert 20.0 < sum(abs(t) for t in found.model.time_constants) < 80.0
-
-
-@pytest.mark.parametrize(("noise", "settled"), [(0.02, True), (3.0, False)])
-def test_a_fopdt_that_explains_nearly_all_settles_the_direction(noise, settled):
-    time = np.arange(0.0, 60.0, 0.25)
-    u = PiecewiseConstant(np.array([5.0, 25.0, 45.0]), np.array([1.0, 0.4, -0.5]), 0.0)
-    y = response(TransferFunction.fopdt(2.0, 3.0, 1.0), time, u)
-    y += noise * np.random.default_rng(2).standard_normal(time.size)
-    ground = Ground.of(problem_of([(time, y, u)], TABLE["fopdt"]), 0.0)
-    (plain,) = ground.fit(["fopdt"])
-    (other,) = ground.fit(["sopdt"])
-    turned = replace(other, model=replace(plain.model, gain=-2.0))
-    assert of_shown_direction([turned, plain]) == ([plain] if settled else [turned, plain])

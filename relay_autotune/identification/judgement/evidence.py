@@ -30,9 +30,9 @@ from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
+    NEGLIGIBLE,
     Problem,
     Trial,
     information_criterion,

@@ -22,7 +22,6 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.fit_covariance import (
-    NEGLIGIBLE,
     Fit,
     Noise,
     estimate_of,
@@ -30,6 +29,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
 from relay_autotune.identification.waveform.rational import theta_of, unit_steps
 from relay_autotune.identification.waveform.residuals import worth
 from relay_autotune.identification.waveform.separable import (
+    NEGLIGIBLE,
     Problem,
     Trial,
     evaluate,

@@ -23,12 +23,11 @@ from relay_autotune.identification.result import (
     is_determined,
 )
 from relay_autotune.identification.waveform.fit_covariance import (
-    NEGLIGIBLE,
     Fit,
     Noise,
     estimate_of,
 )
-from relay_autotune.identification.waveform.separable import Problem, Trial, refine
+from relay_autotune.identification.waveform.separable import NEGLIGIBLE, Problem, Trial, refine
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 

@@ -28,10 +28,10 @@ from relay_autotune.identification.result import (
     identified,
     point_of,
 )
-from relay_autotune.identification.waveform.coloured import PLAIN
+from relay_autotune.identification.waveform.candidates import Candidate, support
+from relay_autotune.identification.waveform.choice import PLAIN
 from relay_autotune.identification.waveform.determination import with_what_is_determined
 from relay_autotune.identification.waveform.fit_covariance import (
-    NEGLIGIBLE,
     Fit,
     Noise,
     estimate_of,
@@ -39,8 +39,13 @@ from relay_autotune.identification.waveform.fit_covariance import (
     raw_residual,
 )
 from relay_autotune.identification.waveform.residuals import ljung_box
-from relay_autotune.identification.waveform.selection import Candidate, support
-from relay_autotune.identification.waveform.separable import Problem, Trial, evaluate, refine
+from relay_autotune.identification.waveform.separable import (
+    NEGLIGIBLE,
+    Problem,
+    Trial,
+    evaluate,
+    refine,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record

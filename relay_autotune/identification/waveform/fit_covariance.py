@@ -13,6 +13,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.estimate import Estimate, jacobian, relative_steps
+from relay_autotune.identification.waveform.candidates import Candidate
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
     covariance_meat,
@@ -20,12 +21,9 @@ from relay_autotune.identification.waveform.residuals import (
     scale_of,
     weights,
 )
-from relay_autotune.identification.waveform.selection import Candidate
-from relay_autotune.identification.waveform.separable import Problem, Trial
+from relay_autotune.identification.waveform.separable import NEGLIGIBLE, Problem, Trial
 from relay_autotune.record.record import Record
 
-# Residual that is rounding, as a share of the measurement's range.
-NEGLIGIBLE = 1e-10
 _EPSILON = float(np.finfo(float).eps)
 
 

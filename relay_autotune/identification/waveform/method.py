@@ -15,7 +15,7 @@ drift and initial state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,30 +25,14 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.coloured import (
-    in_colour,
-    is_an_event,
-    is_clearly_coloured,
-    is_coloured,
-)
+from relay_autotune.identification.waveform.choice import NO_RESPONSE, chosen_fit, responds
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit, raw_residual
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, weights
-from relay_autotune.identification.waveform.selection import (
-    Candidate,
-    Ground,
-    after_the_unknown,
-    choose,
-    fit_all,
-    fit_one,
-    of_shown_direction,
-)
 from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
-    information_criterion,
-    left_of,
     problem_of,
     refine,
 )
@@ -72,7 +56,6 @@ _MOST_ROUNDS = 20
 _SETTLED = 1e-6
 _STEADY = 0.02
 _LEAST_NOISE = 1e-3
-_SEEN = "a response that the samples show (it is over between two of them)"
 
 
 def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
@@ -129,24 +112,13 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
 
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
-    """Fit by least squares, or in the colour of the noise where that is not white."""
-    # The choice among all structures takes longest on such data; one alone is soon fitted.
-    free = not held and known.loss == LOSSES[0] and not known.structure
-    clear = free and is_clearly_coloured(problem, sign)
-    if clear:
-        coloured = in_colour(problem, scale, known, sign, held=held)
-        if coloured is not None and _responds(coloured.problem, coloured.state, _SEARCHED):
-            return coloured
-    fit = _fit(problem, known, sign, scale)
-    fit = _by_noise(problem, fit, known, sign)
-    fit = _spared_of_outliers(problem, fit, known, sign)
-    if clear or not is_coloured(fit) or (held and is_an_event(fit)):
-        return fit
-    rest = replace(fit.problem, structure=FOPDT)
-    coloured = in_colour(rest, scale, known, sign, held=held)
-    if coloured is None or not _responds(coloured.problem, coloured.state, _SEARCHED):
-        return fit
-    return replace(coloured, warnings=fit.warnings)
+    """Fit, again with each experiment weighted by its noise, and again without spikes."""
+
+    def chosen(samples: Problem) -> Fit:
+        return chosen_fit(samples, known, sign, scale, held=held)
+
+    fit = _by_noise(problem, chosen(problem), chosen)
+    return _spared_of_outliers(problem, fit, known, chosen)
 
 
 def _measured(records: Sequence[Record]) -> list[FloatArray]:
@@ -168,39 +140,7 @@ def _sign(records: Sequence[Record]) -> int:
     return found.pop() if found else 0
 
 
-def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
-    # The choice on some thousand samples is the same as on a million.
-    part = problem.thinned(_MOST_FOR_CHOICE)
-    ground = Ground.of(part, part.time.size * NEGLIGIBLE**2, sign)
-    candidates = _candidates(ground, known)
-    rest = candidates if sign or known.structure else of_shown_direction(candidates)
-    while rest:
-        picked = choose(rest)
-        chosen = ground.with_nuisances(picked)
-        nuisances = chosen.problem
-        whole = replace(
-            problem,
-            structure=nuisances.structure,
-            drift=nuisances.drift,
-            relaxation=nuisances.relaxation,
-            past=nuisances.past,
-        )
-        whole = after_the_unknown(whole, chosen.state)
-        state = refine(whole, chosen.state.theta)
-        # With a drift, a fit may still run off to a model that is no process; and where no
-        # structure explains a disturbance, the simplest may explain nothing at all.
-        if ground.candidate(whole, state) is not None and (
-            known.structure or len(rest) == 1 or _responds(whole, state)
-        ):
-            return Fit(whole, state, (chosen,) if known.structure else tuple(rest), scale)
-        rest = [c for c in rest if c is not picked]
-    raise IdentificationError(
-        "no structure fits the record with a process that the samples can show: record longer, or "
-        "check that command and measurement belong to one loop"
-    )
-
-
-def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
+def _by_noise(problem: Problem, fit: Fit, chosen: Callable[[Problem], Fit]) -> Fit:
     """Fit again with each experiment weighted by its noise, where noises differ."""
     parts = fit.problem.experiments
     if len(parts) == 1:
@@ -216,7 +156,7 @@ def _by_noise(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
         noise = _noise_of_each(part, state)
         if float(np.abs(noise / earlier - 1.0).max()) <= _STEADY:
             break
-    return _fit(_weighted(problem, noise), known, sign, fit.scale)
+    return chosen(_weighted(problem, noise))
 
 
 def _noise_of_each(problem: Problem, state: Trial) -> FloatArray:
@@ -233,7 +173,9 @@ def _weighted(problem: Problem, noise: FloatArray) -> Problem:
     return replace(problem, weight=weight)
 
 
-def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, sign: int) -> Fit:
+def _spared_of_outliers(
+    problem: Problem, fit: Fit, known: Known, chosen: Callable[[Problem], Fit]
+) -> Fit:
     """Fit again without isolated spikes, or with the loss that was asked for."""
     base = np.ones(problem.time.size)
     if fit.problem.weight is not None:
@@ -242,14 +184,14 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, sign: int) -> 
         # Outliers may have pulled the choice too: it is made again with the first weights.
         first, weight = _reweighted(problem, fit, known.loss, base), base.copy()
         weight[_places(problem, first.problem)] = first.problem.weight
-        again = _fit(replace(problem, weight=weight), known, sign, fit.scale)
+        again = chosen(replace(problem, weight=weight))
         return _reweighted(problem, again, known.loss, base)
     outlying = _outliers(problem, fit.problem, fit.state)
     if not np.any(outlying):
         return fit
     # They would pull both the choice and the fit.
     rest = replace(problem, weight=base) if len(problem.bounds) > 1 else problem
-    again = _fit(rest.part(~outlying), known, sign, fit.scale)
+    again = chosen(rest.part(~outlying))
     told = (
         f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
         "off every model and were left out: check the sensor for spikes"
@@ -295,25 +237,6 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     return found
 
 
-def _candidates(ground: Ground, known: Known) -> list[Candidate]:
-    if not known.structure:
-        candidates = fit_all(ground)
-        if not candidates:
-            raise IdentificationError(
-                "no structure explains the record with "
-                + ("a gain in the direction of the relay" if ground.sign else _SEEN)
-                + ": check that command and measurement belong to one loop"
-            )
-        return candidates
-    found = fit_one(ground, known.structure, known.order)
-    if found is None:
-        raise IdentificationError(
-            f"no {known.structure} model explains the record; leave the structure open to have "
-            "it chosen"
-        )
-    return [found]
-
-
 def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
     if y.size < _LEAST_SAMPLES:
         raise IdentificationError(
@@ -340,24 +263,6 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
         )
 
 
-def _responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
-    """Return whether a fit explains more than its parameters cost, beside drift and the like.
-
-    :param problem: what was fitted.
-    :param state: its fit.
-    :param evidence: by how much more, in units of the criterion.
-    """
-    n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
-    nuisance = state.columns[len(problem.structure.powers) :]
-    y = problem.seen(problem.y)
-    left = left_of(y, nuisance)
-    without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
-    return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
-
-
 def _require_response(problem: Problem, state: Trial) -> None:
-    if not _responds(problem, state, _SEARCHED):
-        raise IdentificationError(
-            "the measurement shows no response to the command beyond its noise: raise the "
-            "amplitude, or check that both topics belong to one loop"
-        )
+    if not responds(problem, state, _SEARCHED):
+        raise IdentificationError(NO_RESPONSE)

@@ -27,6 +27,8 @@ from relay_autotune.identification.waveform.residuals import Colour
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
 
+# Residual that is rounding, as a share of the measurement's range.
+NEGLIGIBLE = 1e-10
 _MOST_ITERATIONS = 80
 _MOST_ROUGH_ITERATIONS = 25
 _LEAST_GAIN = 1e-15

@@ -1,0 +1,286 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The choice among all candidates: structure, terms beside the model, and colour of the noise.
+
+Noise and models are estimated in turn (Cochrane and Orcutt 1949, iterated): every structure is
+fitted by generalised least squares (Aitken 1935) in the colour of the best one's residual, an
+autoregression of the order that the data choose. White noise is its order 0. A criterion that
+took correlated samples for independent ones would prefer models that follow the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.known import Known
+from relay_autotune.identification.waveform.candidates import (
+    Candidate,
+    FitContext,
+    drop_first_dead_time,
+)
+from relay_autotune.identification.waveform.fit_covariance import Fit
+from relay_autotune.identification.waveform.rational import unit_steps
+from relay_autotune.identification.waveform.residuals import Colour, colour_of, slow_colour
+from relay_autotune.identification.waveform.separable import (
+    NEGLIGIBLE,
+    Problem,
+    Trial,
+    information_criterion,
+    left_beside,
+    left_of,
+    refine,
+)
+from relay_autotune.process.structures import (
+    FOPDT,
+    INTEGRATOR_INVERSE,
+    INTEGRATOR_LAG,
+    IPDT,
+    LAG_N,
+    LAG_N_ZERO,
+    SOPDT,
+    SOPDT_ZERO,
+    THREE_LAGS,
+    TWO_EQUAL_ONE,
+    UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
+)
+
+NO_RESPONSE = (
+    "the measurement shows no response to the command beyond its noise: raise the amplitude, "
+    "record longer, or check that both topics belong to one loop"
+)
+# Order in which structures are fitted: first those that show which others are hopeless.
+_TRIED = (
+    *(FOPDT, SOPDT, LAG_N, THREE_LAGS, TWO_EQUAL_ONE, LAG_N_ZERO, SOPDT_ZERO),
+    *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
+)
+# By these it is decided what is estimated beside the model: a command off the balance of an
+# integrator looks like a drift.
+_SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
+# Gains have to hold on the models of these, too.
+PLAIN = (FOPDT.name, SOPDT.name)
+# Numbers of samples, and samples for each response of the process. More correlated samples tell
+# little, unless the process is fast; much denser ones would favour what is faster than it.
+_FEW, _MOST = 1200, 4000
+_A_RESPONSE = 5.0
+# In white noise every sample tells something; more than these change no choice.
+_MOST_WHITE = 16_384
+_MOST_TIMES = 4
+# Score beyond which a structure is not tried in the next colour: odds of e^15. The plain ones
+# always are: gains have to hold on their models, too.
+_HOPELESS = 30.0
+# Length of the record in correlation times of the slow disturbance that is tried first.
+_SLOWEST = 10.0
+_ALIKE = 0.01
+_STEPS = 15
+# Scores that differ by less do not tell two structures apart.
+_INDIFFERENT = 2.0
+# Largest standard deviation of a parameter that the samples determine, relative to its size.
+_DETERMINED = 1.0
+# Share of the sum of squares that a model in colour may always leave, and how many times that of
+# the best simulation it may leave: a colour near a random walk explains the response itself.
+_EXPLAINS, _WORSE = 0.05, 25.0
+
+
+def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
+    """Return the fit of the best structure, in the colour of its noise.
+
+    :param problem: samples and input, with a FOPDT structure.
+    :param known: the structure, if it is known.
+    :param sign: direction of the relay, 1 or -1; 0: not known.
+    :param scale: range of the measurement [y].
+    :param held: True: a relay held the process, so that it may be unstable.
+    :raises IdentificationError: if no structure explains the record.
+    """
+    few = _dense_enough(problem, sign, held)
+    found = _compared(few, known)
+    if found and found[0].problem.colour is None and few.problem.time.size < problem.time.size:
+        dense = problem.thinned(_MOST_WHITE)
+        if dense.time.size > few.problem.time.size:
+            again = _compared(FitContext.of(dense, sign, held=held), known)
+            if again and again[0].problem.colour is None:
+                found = again
+    for candidate in _by_rank(found):
+        fit = _finished(candidate, found, problem, scale)
+        if fit is not None and (known.structure or responds(fit.problem, fit.state)):
+            return fit
+    if known.structure:
+        raise IdentificationError(
+            f"no {known.structure} model explains the record; leave the structure open to have "
+            "it chosen"
+        )
+    raise IdentificationError(NO_RESPONSE)
+
+
+def responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
+    """Return whether a fit explains more than its parameters cost, beside drift and the like.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    :param evidence: by how much more, in units of the score.
+    """
+    n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
+    nuisance = state.columns[len(problem.structure.powers) :]
+    left = left_of(problem.seen(problem.y), nuisance)
+    without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
+    return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
+
+
+def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
+    """Return the context of evenly spaced samples, a few for each response of the process."""
+    few = FitContext.of(problem.thinned(_FEW), sign, held=held)
+    if few.problem.time.size == problem.time.size:
+        return few
+    log_tau, dead_time = few.fopdt.theta
+    responses = float(np.ptp(problem.time)) / (math.exp(log_tau) + dead_time)
+    count = int(min(max(_A_RESPONSE * responses, _FEW), _MOST))
+    more = problem.thinned(count)
+    if more.time.size == few.problem.time.size:
+        return few
+    return FitContext.of(more, sign, held=held)
+
+
+def _compared(context: FitContext, known: Known) -> list[Candidate]:
+    """Return all structures in one colour, the best first.
+
+    What is estimated beside the model is decided with a few simple structures, and again with
+    the best one of all.
+    """
+    names = [known.structure] if known.structure else [s.name for s in _TRIED]
+    if not context.held and not known.structure:
+        # What runs away by itself is not recorded, except where a relay held it.
+        names = [s.name for s in _TRIED if not s.unstable]
+    simple = context.fit(names if known.structure else _SIMPLE, known.order)
+    if not simple:
+        return []
+    decided = _with_best_terms(context, simple)
+    found = _of_all(context.with_nuisances_of(decided), names, known, simple)
+    if not found or known.structure:
+        return found
+    again = _with_best_terms(context, [context.refit(found[0], None, _STEPS) or found[0]])
+    if again.score < decided.score and _terms(again) != _terms(decided):
+        other = _of_all(context.with_nuisances_of(again), names, known, simple)
+        return min(found, other, key=lambda f: f[0].score if f else math.inf)
+    return found
+
+
+def _terms(candidate: Candidate) -> tuple[bool, bool, bool]:
+    problem = candidate.problem
+    return problem.drift, problem.relaxation, problem.past
+
+
+def _with_best_terms(context: FitContext, found: Iterable[Candidate]) -> Candidate:
+    """Return the candidate of the best score, each set of terms in its own colour."""
+    rows = [c for each in found for c in context.with_nuisances(each)]
+    in_colour = (context.refit(c, _colour(c.problem, c.state), _STEPS) for c in rows)
+    return min((c for c in (*rows, *in_colour) if c is not None), key=lambda c: c.score)
+
+
+def _of_all(
+    context: FitContext, names: list[str], known: Known, ready: list[Candidate]
+) -> list[Candidate]:
+    """Return all structures in the colour of the best one, the best first.
+
+    The colour is found from two starts: the residual of the best simulation, and a slow
+    disturbance, which a simulation would follow. The more likely result counts.
+    """
+    simulated = sorted(context.fit(names, known.order, ready), key=lambda c: c.score)
+    if not simulated or simulated[0].state.cost <= context.floor:
+        return simulated
+    own = _colour(simulated[0].problem, simulated[0].state)
+    if own is None:
+        return simulated
+    slow = slow_colour(1.0 - _SLOWEST / context.problem.time.size)
+    ends = [
+        _converged(_in(colour, simulated, context), context, simulated) for colour in (own, slow)
+    ]
+    return min(ends, key=lambda f: f[0].score if f else math.inf) or simulated
+
+
+def _converged(
+    found: list[Candidate], context: FitContext, simulated: list[Candidate]
+) -> list[Candidate]:
+    """Fit in the colour of the best one's residual, again until that changes no more."""
+    for _ in range(_MOST_TIMES):
+        if not found:
+            return []
+        best = found[0]
+        near = [c for c in found if c.score <= best.score + _HOPELESS or c.structure.name in PLAIN]
+        found = _in(_colour(best.problem, best.state), near, context)
+        if found and found[0].structure == best.structure:
+            scale = unit_steps(best.structure, best.state.theta)
+            change = np.abs(found[0].state.theta - best.state.theta) / scale
+            if float(change.max()) <= _ALIKE:
+                break
+    return found if _simulates(found, simulated) else []
+
+
+def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
+    """Return candidates fitted in one colour, the best first."""
+    again = (context.refit(c, colour, _STEPS) for c in found)
+    return sorted((c for c in again if c is not None), key=lambda c: c.score)
+
+
+def _colour(problem: Problem, state: Trial) -> Colour | None:
+    """Return the colour of a fit's weighted residual; None: it is white."""
+    columns, _ = problem.columns(state.theta)
+    left = problem.y - state.coefficients @ columns
+    if problem.weight is not None:
+        left = left * problem.weight
+    return colour_of([left[part] for part in problem.experiments])
+
+
+def _simulates(found: list[Candidate], simulated: list[Candidate]) -> bool:
+    """Return whether a model simulates the record about as well as the best simulation does.
+
+    :param found: fitted in a colour, the best first.
+    :param simulated: fitted to the measurement itself.
+    """
+    if not found:
+        return False
+    left, total = left_beside(replace(found[0].problem, colour=None), found[0].state)
+    square = float(left @ left)
+    return square <= max(_EXPLAINS * float(total @ total), _WORSE * simulated[0].state.cost)
+
+
+def _by_rank(found: list[Candidate]) -> Iterable[Candidate]:
+    """Yield candidates, the one to choose first: the simplest that the score does not refuse.
+
+    One whose parameters the samples determine comes before one of which they do not: where a pole
+    and a zero cancel, the criterion counts a parameter that does nothing.
+    """
+    rest = sorted(found, key=lambda c: c.score)
+    while rest:
+        near = [c for c in rest if c.score <= rest[0].score + _INDIFFERENT]
+        chosen = min(near, key=lambda c: (c.state.parameters, c.structure.order, c.score))
+        yield chosen
+        rest = [c for c in rest if c is not chosen]
+
+
+def _finished(
+    candidate: Candidate, found: list[Candidate], problem: Problem, scale: float
+) -> Fit | None:
+    """Return the fit of a candidate to the end, in white noise to all samples."""
+    own = candidate.problem
+    if own.colour is not None:
+        state = refine(own, candidate.state.theta)
+    else:
+        own = replace(
+            problem,
+            structure=own.structure,
+            drift=own.drift,
+            relaxation=own.relaxation,
+            past=own.past,
+        )
+        own = drop_first_dead_time(own, candidate.state)
+        state = refine(own, candidate.state.theta)
+    if own.structure.model_at(state.theta, state.coefficients) is None:
+        return None
+    others = (c for c in found if c is not candidate)
+    return Fit(own, state, (candidate, *others), scale)
