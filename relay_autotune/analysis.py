@@ -54,9 +54,6 @@ _NO_GAINS = {
     Outcome.ABORTED: "the experiment was aborted",
     Outcome.FAILED: "the experiment failed",
 }
-# Parameters of a load step: its instant and size.
-_LOAD = 2
-
 # The structure of a running experiment is chosen again at the latest when its record has grown by
 # this factor.
 _CHOSEN_ANEW = 1.1
@@ -329,10 +326,6 @@ def _assessed(chosen: _Chosen, models: Sequence[Identification], tuning: _Tuning
     evidence = Evidence(
         record,
         found.models[0],
-        beside=0 if chosen.driven is record else _LOAD,
-        free=not tuning.task.known.structure,
-        samples=chosen.model.method == DEFAULT_METHOD,
-        others=found.models[1:],
         settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
         driven=chosen.driven,
     )
@@ -378,7 +371,7 @@ def analyse_jointly(
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
     found = Analysis(first, cycles, assess((chosen,), first), 0)
-    evidence = Evidence(first, found.models[0], free=False, samples=method == DEFAULT_METHOD)
+    evidence = Evidence(first, found.models[0])
     simple = _simple(records, known, chosen)
     return _judged(found, evidence, records, _Tuning(task, _first(rule), simple, rng))
 

@@ -61,8 +61,7 @@ class Shaping:
         loop = Loop(
             controller=gains,
             ms_of=lambda models: ensemble_peaks(gains, self.task.set_of(models)).ms,
-            ms=gains.ms,
-            ms_95=gains.ms_95,
+            asked=max(self.task.options.ms, gains.ms),
             added_delay=self.task.options.added_delay,
         )
         found = judge(LOOP_CHECKS, self.evidence.with_loop(loop))

@@ -285,9 +285,7 @@ class Estimate:
 
         return deviation(gain_changes), deviation(frequency_changes)
 
-    def draws(
-        self, count: int, rng: np.random.Generator, logarithmic: NDArray[np.bool_]
-    ) -> Iterator[TransferFunction]:
+    def draws(self, count: int, rng: np.random.Generator) -> Iterator[TransferFunction]:
         """Draw models from the uncertainty.
 
         Correlations are kept, which matters: a gain and a time constant that are each uncertain
@@ -295,9 +293,8 @@ class Estimate:
 
         :param count: models to draw.
         :param rng: the source.
-        :param logarithmic: which values are drawn by their logarithms, shape (p,): at least those
-            that cannot change sign.
         """
+        logarithmic = self.structure.logarithmic
         changes = rng.multivariate_normal(
             np.zeros(self.values.size),
             self._spread(logarithmic),

@@ -166,6 +166,25 @@ class FitReport:
 
 
 @dataclass(frozen=True)
+class Part:
+    """The models that a part of a record allows.
+
+    :param begin: its first time [s].
+    :param end: its last time [s].
+    :param models: drawn from their posterior, each as likely as the others.
+    """
+
+    begin: float
+    end: float
+    models: tuple[TransferFunction, ...]
+
+    @property
+    def span(self) -> str:
+        """Its times as text."""
+        return f"{self.begin:.4g} s to {self.end:.4g} s"
+
+
+@dataclass(frozen=True)
 class Rival:
     """Another structure that the data do not rule out.
 
@@ -244,9 +263,10 @@ class Identification:
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
     # record, and so in no document or message.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
-    # Models on which gains have to hold, too: of the halves of the record where they differ by
-    # more than chance, and plain ones that simulate it nearly as well.
-    parts: tuple[TransferFunction, ...] = ()
+    # Models that the record allows, of either direction, each as likely as the others; empty: the
+    # method knows the covariance alone. And those that each half of it allows by itself.
+    draws: tuple[TransferFunction, ...] = ()
+    halves: tuple[Part, ...] = ()
 
     def __repr__(self) -> str:
         """Return the model on one line; the fields have the rest."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
-from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.stability import (
@@ -28,61 +27,26 @@ from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.task import DesignTask, HeldSet, ModelSet
 
 _MODELS = 100
-# One model in this number is one of another structure on which the gains have to hold.
-_PART = 10
-# Correlation from which two values count as coupled.
-_COUPLED = 0.9
 
 
 def ensemble(
     identification: Identification, count: int = _MODELS, *, rng: np.random.Generator
 ) -> tuple[TransferFunction, ...]:
-    """Draw models from the uncertainty of an identification.
+    """Return models within the uncertainty of an identification, of its direction.
 
-    Other structures that the data do not rule out have a share by their support. Each model on
-    which gains have to hold, too, has one in ten, so that no promise for 95 % leaves it out.
+    They are those that the record allows, or drawn from the covariance of the parameters where the
+    method knows no more.
 
-    :param identification: with a covariance; without one the ensemble is empty.
-    :param count: models to draw.
+    :param identification: with draws or a covariance; without both the ensemble is empty.
+    :param count: models to draw from a covariance.
     :param rng: source of the random numbers.
     """
+    if identification.draws:
+        sign = identification.model.process_sign
+        return tuple(m for m in identification.draws if m.process_sign == sign)
     if not identification.estimate.known:
         return ()
-    rivals = [
-        rival.model
-        for rival in identification.rivals
-        for _ in range(round(count * rival.support))
-        if rival.model.process_sign == identification.model.process_sign
-    ][: count // 2]
-    parts = [
-        part
-        for part in identification.parts
-        for _ in range(count // _PART)
-        if part.process_sign == identification.model.process_sign
-    ]
-    others = (*rivals, *parts)
-    estimate = identification.estimate
-    sure = np.sign(identification.ci95_low) * np.sign(identification.ci95_high) > 0.0
-    zeros = np.isinf(estimate.structure.least) & ~estimate.structure.logarithmic
-    logarithmic = estimate.structure.logarithmic | (zeros & (sure | _coupled(estimate)))
-    return (*estimate.draws(count - len(others), rng, logarithmic), *others)
-
-
-def _coupled(estimate: Estimate) -> NDArray[np.bool_]:
-    """Return which values have a product with a gain or a lag that is known better, shape (p,).
-
-    Of a slow lag with a zero the data show the ratio. To first order the zero would lie on the
-    other side in many draws, with a fast response that the data exclude.
-    """
-    std = estimate.std
-    with np.errstate(divide="ignore", invalid="ignore"):
-        correlation = np.abs(estimate.covariance / np.outer(std, std))
-    others = estimate.structure.logarithmic & (std > 0.0)
-    if not others.any():
-        return np.zeros(std.size, dtype=np.bool_)
-    return np.asarray(
-        (correlation[:, others].max(axis=1) > _COUPLED) & (np.abs(estimate.values) > std)
-    )
+    return tuple(identification.estimate.draws(count, rng))
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the checks look at: the record, the selected model, its rivals, the gains.
-
-A process with an inverse response (a zero in the right half plane) first answers the other way.
-A relay of the wrong direction then oscillates on that first answer, and models of the relay's
-direction explain the cycles well enough, with a drift or a load for what they lack. The gains of
-such a model have the wrong sign, and the loop would run away. So models of the other direction are
-tried as well.
+"""What the checks look at: the record, the selected model, the models it allows, the gains.
 
 The record also shows the process without any structure. The model is simulated with the recorded
 command, from rest at an unknown constant command and without drift or load. Its residual is
@@ -28,128 +22,10 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.residuals import worth
-from relay_autotune.identification.waveform.separable import (
-    NEGLIGIBLE,
-    Problem,
-    Trial,
-    information_criterion,
-    problem_of,
-)
-from relay_autotune.identification.waveform.starts import (
-    Starts,
-    is_unseen,
-    refine_best,
-    start_fopdt,
-    two_lags,
-)
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import FOPDT, INTEGRATOR_INVERSE, SOPDT_ZERO
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Input, Outcome, PiecewiseConstant, Record
-
-_MOST_SAMPLES = 4096
-# Least correlation of neighbours that counts, in standard errors.
-_CORRELATED = 2.0
-# Least share of the measurement's range that counts as estimated beside the model.
-_BESIDE = 1e-6
-# Slow lags at the start, relative to the fast one.
-_SLOWER = (2.0, 6.0, 20.0)
-# Latest turn of an inverse response, in lengths of the test: a later one is a drift.
-_HORIZON = 2.0
-_TRIAL = 1e-6
-
-
-@dataclass(frozen=True)
-class OtherDirection:
-    """A model of the opposite direction to the relay's.
-
-    :param model: the best one.
-    :param lead: criterion of the relay's own direction minus this one's; a difference of 6 is
-        odds of e^3.
-    """
-
-    model: TransferFunction
-    lead: float
-
-
-def other_direction(
-    found: Identification, record: Record, *, beside: int = 0
-) -> OtherDirection | None:
-    """Return the best model of the other direction; None: the record does not ask for one.
-
-    A process at rest before the relay needs neither drift nor load nor initial state in its own
-    direction. So the other one is fitted without them, and only where the model of the relay's
-    direction needs them or leaves something unexplained. The two are compared by the Bayesian
-    information criterion.
-
-    :param found: what was identified from all samples, in the direction of the relay.
-    :param record: the relay test.
-    :param beside: number of parameters that were estimated beside the model, as those of a load.
-    """
-    drive = record.drive()
-    residual = (record.measurement - found.fitted)[np.isfinite(found.fitted)]
-    moved, left_out = _moved_beside(found, record, drive), residual.size < len(record)
-    if not (moved or left_out or beside or worth(residual, _CORRELATED) < 1.0):
-        return None
-    sign, scale = found.model.process_sign, float(np.ptp(record.measurement))
-    y = (record.measurement - record.measurement[0]) / scale
-    whole = problem_of([(record.time, y, drive)], FOPDT)
-    problem = whole.thinned(_MOST_SAMPLES)
-    horizon = _HORIZON * float(record.time[-1] - drive.times[0])
-    inverse = [
-        f
-        for f in _inverse(problem, sign)
-        if f[0].process_sign == -sign and any(-horizon < z.real < 0.0 for z in f[0].zeros)
-    ]
-    if not inverse:
-        return None
-    n = problem.time.size
-    floor = n * NEGLIGIBLE**2
-    model, state = min(
-        inverse, key=lambda f: information_criterion(f[1].cost, n, f[1].parameters, floor)
-    )
-    # The worth of a sample in both criteria comes from the other direction's residual.
-    each = worth(state.residual)
-    parameters = len(found.parameters) + 1 + beside + moved + left_out
-    left = n * float(np.mean(residual**2)) / scale**2
-    told = information_criterion(left, n, parameters, floor, each)
-    other = information_criterion(state.cost, n, state.parameters, floor, each)
-    return OtherDirection(model, told - other)
-
-
-def _moved_beside(found: Identification, record: Record, drive: Input) -> bool:
-    """Return whether more than an offset was estimated beside the model."""
-    stable = all(t.real > 0.0 for t in found.model.time_constants)
-    if not (stable and isinstance(drive, PiecewiseConstant)):
-        return True
-    rest: FloatArray = found.fitted - response(found.model, record.time, drive)
-    return not float(np.ptp(rest)) <= _BESIDE * float(np.ptp(record.measurement))
-
-
-def _inverse(problem: Problem, sign: int) -> list[tuple[TransferFunction, Trial]]:
-    """Fit structures with an inverse response; with others no oscillation lasts.
-
-    In the direction of the relay, a FOPDT shows the fast part of an inverse response.
-    """
-    first = refine_best(problem, start_fopdt(problem, sign), tolerance=_TRIAL)
-    starts = Starts(problem, first)
-    fast, dead_time = starts.tau, starts.dead_time
-    tried = (
-        (SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
-        (INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
-    )
-    found = []
-    for structure, thetas in tried:
-        plain = replace(problem, structure=structure)
-        state = refine_best(plain, thetas, tolerance=_TRIAL)
-        model = structure.model_at(state.theta, state.coefficients)
-        if model is not None:
-            found.append((model, state))
-    return found
-
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 24
 _MOST_COMPARED = 2000
@@ -248,9 +124,6 @@ def _integral(u: PiecewiseConstant, at: FloatArray) -> FloatArray:
 
 # Number of time constants within which an unstable process leaves any rest.
 MOST_GROWTH = 7.0
-# Largest residual of a rival relative to the model's, and its least share of the support.
-_AS_WELL = 1.1
-_WORTH_HEARING = 0.01
 
 
 @dataclass(frozen=True)
@@ -259,15 +132,13 @@ class Loop:
 
     :param controller: -command per measurement at complex frequencies s [u/y].
     :param ms_of: Ms of the loops that these gains make with models; inf: unstable.
-    :param ms: Ms on the selected model.
-    :param ms_95: Ms that 95 % of the models within its uncertainty stay below.
+    :param asked: Ms that was asked of the gains, or theirs on the model where that is larger.
     :param added_delay: dead time of the loop beside the process's own [s].
     """
 
     controller: Callable[[ComplexArray], ComplexArray]
     ms_of: Callable[[Sequence[TransferFunction]], FloatArray]
-    ms: float
-    ms_95: float
+    asked: float
     added_delay: float = 0.0
 
 
@@ -277,10 +148,6 @@ class Evidence:
 
     :param record: the samples.
     :param found: the selected model, with its uncertainty, its fit and its limit cycle.
-    :param beside: number of parameters that were estimated beside the model, as those of a load.
-    :param free: True if the structure was chosen from the data, False if it was given.
-    :param samples: True if the model was fitted to the samples themselves.
-    :param others: other methods' models of the record, with the quality of their fit.
     :param settled: True if the record has a limit cycle whose last cycles agree.
     :param loop: the gains; None: there are none yet.
     :param driven: the record with the estimated load added to its command; None: no load.
@@ -288,10 +155,6 @@ class Evidence:
 
     record: Record
     found: Identification
-    beside: int = 0
-    free: bool = True
-    samples: bool = True
-    others: tuple[Identification, ...] = ()
     settled: bool = False
     loop: Loop | None = None
     driven: Record | None = None
@@ -302,18 +165,8 @@ class Evidence:
         :param loop: the gains.
         """
         found = replace(self, loop=loop)
-        for name in ("visible", "rivals", "halves", "plain"):
-            found.__dict__[name] = getattr(self, name)
+        found.__dict__["visible"] = self.visible
         return found
-
-    @cached_property
-    def other(self) -> OtherDirection | None:
-        """The best model of the opposite direction to the relay's; None: not needed."""
-        ended_well = self.record.outcome in (Outcome.COMPLETED, Outcome.UNKNOWN)
-        relay = self.record.settings is not None and ended_well
-        if not (relay and self.samples and self.free):
-            return None
-        return other_direction(self.found, self.record, beside=self.beside)
 
     @cached_property
     def visible(self) -> VisibleError | None:
@@ -322,41 +175,6 @@ class Evidence:
             return visible_error(self.found.model, self.record)
         except (ModelError, np.linalg.LinAlgError):
             return None
-
-    @cached_property
-    def rivals(self) -> tuple[TransferFunction, ...]:
-        """Other models that explain the record nearly as well."""
-        most = _AS_WELL * self.found.fit.residual_rms
-        models = (
-            *(r.model for r in self.found.rivals if r.support > _WORTH_HEARING),
-            *(m.model for m in self.others if m.fit.residual_rms <= most),
-        )
-        interval = self.record.mean_interval
-        return tuple(
-            m
-            for m in models
-            if self.growth(m) <= MOST_GROWTH and not is_unseen(m, interval, self.record.duration)
-        )
-
-    @cached_property
-    def halves(self) -> tuple[Part, ...]:
-        """The models that each half of the record allows in the chosen structure; may be empty."""
-        if not self.samples:
-            return ()
-        try:
-            return halves(self.found, self.driven or self.record)
-        except (ModelError, np.linalg.LinAlgError):
-            return ()
-
-    @cached_property
-    def plain(self) -> tuple[TransferFunction, ...]:
-        """Plain models of the whole record that explain it as well; may be empty."""
-        if not self.samples:
-            return ()
-        try:
-            return plain_models(self.found, self.driven or self.record)
-        except (ModelError, np.linalg.LinAlgError):
-            return ()
 
     def growth(self, model: TransferFunction) -> float:
         """Return the longest time of a constant command in time constants of a model's growth.

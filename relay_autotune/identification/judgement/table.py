@@ -22,36 +22,15 @@ from relay_autotune.identification.judgement.checks import (
     lost_effect,
 )
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
-from relay_autotune.identification.judgement.refits import other_sign
 from relay_autotune.identification.result import NOT_AT_REST
 from relay_autotune.identification.waveform.starts import latest_dead_time
-from relay_autotune.process.transfer_function import TransferFunction, process_text
-from relay_autotune.quantities import NORMAL_95
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured
 
 _FREQUENCIES = 300
-# Quantile of Ms over the models of a half that counts: nine of ten are worse.
-_BUT_FEW = 0.1
-# Half width of the interval of K_u, relative to K_u, up to which K_u is known.
-_KNOWN = 0.2
-# Residual of a half's best model on the whole record, over the least one, from which the whole
-# overrules the half; the share that then counts is doubtful.
-_FAR_WORSE, _OVERRULED = 3.0, 0.8
-
-
-def _direction(evidence: Evidence) -> Measured | None:
-    other = evidence.other
-    if other is None:
-        return None
-    sign = other.model.process_sign
-    raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
-    return Measured(
-        other.lead,
-        f"the relay assumed that a higher command {lowers} the measurement; a process where it "
-        f"first {lowers} and then {raises} it fits the record as well: test with "
-        f"process_gain_sign {sign} (0: it is found)",
-    )
+# Ms over the asked one from which gains are bad on a model.
+_FAR_ABOVE = 1.25
 
 
 def _fed_back(evidence: Evidence) -> Measured | None:
@@ -62,22 +41,6 @@ def _fed_back(evidence: Evidence) -> Measured | None:
 def _fed_back_changes(evidence: Evidence) -> Measured | None:
     share = followed_changes(evidence.record, evidence.found.model.process_sign)
     return None if share is None else Measured(share)
-
-
-def _rival_direction(evidence: Evidence) -> Measured | None:
-    models = (*evidence.rivals, *evidence.plain)
-    if not models:
-        return None
-    other = [m for m in models if m.process_sign != evidence.found.model.process_sign]
-    return Measured(len(other), process_text(other[0]) if other else "")
-
-
-def _open_dead_time(evidence: Evidence) -> Measured | None:
-    found = evidence.found
-    high = dict(zip(found.parameters, found.ci95_high, strict=True)).get("dead_time", math.nan)
-    if math.isnan(high):
-        return None
-    return Measured(float(high) / evidence.record.duration)
 
 
 def _first_response(evidence: Evidence) -> Measured | None:
@@ -124,18 +87,6 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
     return Measured(away, f"{first}the same relay on the model {said}")
 
 
-def _ultimate(evidence: Evidence) -> Measured | None:
-    found = evidence.found
-    if not math.isfinite(found.ultimate_gain) or math.isnan(found.ultimate_gain_std):
-        return None
-    return Measured(NORMAL_95 * found.ultimate_gain_std / abs(found.ultimate_gain))
-
-
-def _models_around(evidence: Evidence) -> Measured | None:
-    loop = evidence.loop
-    return None if loop is None else Measured(loop.ms_95 / loop.ms)
-
-
 def _growth(evidence: Evidence) -> Measured | None:
     growth = evidence.growth(evidence.found.model)
     return Measured(growth) if growth > 0.0 else None
@@ -155,65 +106,36 @@ def _visible(evidence: Evidence) -> Measured | None:
     return Measured(float(share[at]), f"{w[at]:.3g} rad/s")
 
 
-def _worst(loop: Loop, models: Sequence[TransferFunction]) -> tuple[float, TransferFunction]:
-    """Return the largest Ms of the gains on models, and its model."""
-    ms = loop.ms_of(models)
-    at = int(np.argmax(ms))
-    return float(ms[at]), models[at]
+def _risk(evidence: Evidence) -> Measured | None:
+    loop, draws = evidence.loop, evidence.found.draws
+    return Measured(_bad(loop, draws)) if loop is not None and draws else None
 
 
-def _rivals(evidence: Evidence) -> Measured | None:
-    loop = evidence.loop
-    if loop is None or not evidence.rivals:
-        return None
-    ms, model = _worst(loop, evidence.rivals)
-    return Measured(ms / loop.ms, process_text(model))
+def _bad(loop: Loop, models: Sequence[TransferFunction]) -> float:
+    """Return the share of models on which gains are unstable, or Ms is far above what was asked.
+
+    A process of the other direction makes the loop unstable.
+    """
+    return float(np.mean(loop.ms_of(models) > _FAR_ABOVE * loop.asked))
 
 
 def _halves(evidence: Evidence) -> Measured | None:
-    loop = evidence.loop
-    if loop is None or not evidence.halves:
+    loop, halves = evidence.loop, evidence.found.halves
+    if loop is None or not halves:
         return None
-    # Nine of ten models have to be bad, so that a half that determines little does not count.
-    found = [
-        (float(np.quantile(loop.ms_of(part.models), _BUT_FEW, method="lower")), part)
-        for part in evidence.halves
-    ]
-    ms, part = max(found, key=lambda pair: pair[0])
-    return Measured(ms / loop.ms, part.span)
-
-
-def _halves_direction(evidence: Evidence) -> Measured | None:
-    sign = evidence.found.model.process_sign
-    found = []
-    for part in evidence.halves:
-        share = other_sign(part.models, sign)
-        # Feedback or a disturbance in one half does not overrule the whole record.
-        found.append((min(share, _OVERRULED) if part.worse > _FAR_WORSE else share, part))
-    if not found:
-        return None
-    share, part = max(found, key=lambda pair: pair[0])
+    share, part = max(((_bad(loop, part.models), part) for part in halves), key=lambda f: f[0])
     return Measured(share, part.span)
 
 
-def _plain(evidence: Evidence) -> Measured | None:
-    loop = evidence.loop
-    if loop is None or not evidence.plain:
-        return None
-    ms, model = _worst(loop, evidence.plain)
-    return Measured(ms / loop.ms, process_text(model))
-
-
-def _beyond(evidence: Evidence) -> Measured | None:
+def _direction(evidence: Evidence) -> Measured | None:
     found = evidence.found
-    half = NORMAL_95 * found.ultimate_gain_std / abs(found.ultimate_gain)
-    longest = max(
-        (abs(t) for t in (*found.model.time_constants, found.model.dead_time)), default=0
-    )
-    # Of a lag much longer than the record the loop needs the slope alone, which is part of K_u.
-    if half <= _KNOWN or not evidence.record.duration > 0.0:
-        return None
-    return Measured(longest / evidence.record.duration)
+    models = [("the record", found.draws), *((part.span, part.models) for part in found.halves)]
+    shares = [
+        (float(np.mean([m.process_sign != found.model.process_sign for m in draws])), span)
+        for span, draws in models
+        if draws
+    ]
+    return Measured(*max(shares)) if shares else None
 
 
 def _left_out(evidence: Evidence) -> Measured | None:
@@ -231,26 +153,14 @@ MODEL_CHECKS = (
     Check(
         name="direction",
         title="Direction",
-        what="criterion of the best model in the relay's direction minus that of the best one in "
-        "the other (6 is odds of e^3)",
+        what="largest share of the models that the record, or one half of it, allows in which a "
+        "higher command moves the measurement the other way",
         unit="",
-        failed=-6.0,
-        sentence="{detail}",
-        remedy="test again when nothing drifts",
+        doubtful=0.5,
+        failed=0.9,
+        sentence="{detail} also fits a process of the other direction",
+        remedy="test again when nothing drifts, with larger moves of the command",
         measure=_direction,
-    ),
-    Check(
-        name="rival_direction",
-        title="Direction of rivals",
-        what="number of models of the other direction among the other models that explain the "
-        "record as well",
-        unit="",
-        failed=0.0,
-        sentence="{detail} explains the record as well, and in it a higher command moves the "
-        "measurement the other way",
-        remedy="run a test with larger moves of the command, or record from rest without other "
-        "inputs",
-        measure=_rival_direction,
     ),
     Check(
         name="fed_back",
@@ -280,16 +190,6 @@ MODEL_CHECKS = (
         remedy="move the set-point while recording, or let a relay work in place of the "
         "controller",
         measure=_fed_back_changes,
-    ),
-    Check(
-        name="dead_time_open",
-        title="Dead time",
-        what="upper end of the dead time's interval over the length of the record",
-        unit="",
-        failed=1.0,
-        sentence="the record fits a dead time of any length, so that no gain is known to be safe",
-        remedy="record a relay test, or a step that stands clear of the noise",
-        measure=_open_dead_time,
     ),
     Check(
         name="first_response",
@@ -346,6 +246,7 @@ MODEL_CHECKS = (
         what="share of the measurement's variance that neither model nor noise explains",
         unit="",
         doubtful=0.1,
+        failed=0.5,
         sentence="{value} of the measurement's variance is not explained",
         remedy="keep other inputs constant, or use a larger amplitude",
         measure=_share,
@@ -375,29 +276,6 @@ MODEL_CHECKS = (
         measure=_limit_cycle,
     ),
     Check(
-        name="ultimate_gain",
-        title="K_u",
-        what="half width of the 95 % interval of K_u over K_u",
-        unit="",
-        doubtful=2.0,
-        sentence="the 95 % interval of K_u reaches {value} of K_u to either side",
-        remedy="run more cycles, or use a larger amplitude",
-        measure=_ultimate,
-    ),
-    Check(
-        name="beyond_record",
-        title="Long times",
-        what="longest time of the model over the length of the record, where K_u is not known "
-        "within a fifth",
-        unit="",
-        doubtful=1.0,
-        failed=10.0,
-        sentence="a time of the model is {value} times as long as the record, which cannot show "
-        "it, and K_u depends on it",
-        remedy="record longer, or run a relay test, which shows K_u directly",
-        measure=_beyond,
-    ),
-    Check(
         name="clipped",
         title="Clipping",
         what="share of their effect that commands surely lose on one side of a level; above 1 "
@@ -410,30 +288,32 @@ MODEL_CHECKS = (
         "command_min and command_max",
         measure=_clipped,
     ),
-    Check(
-        name="halves_direction",
-        title="Direction in halves",
-        what="share of the models that one half of the record allows in which a higher command "
-        "moves the measurement the other way",
-        unit="",
-        doubtful=0.5,
-        failed=0.9,
-        sentence="from {detail} the record also fits a process of the other direction",
-        remedy="keep other inputs constant, or start the record from rest",
-        measure=_halves_direction,
-    ),
 )
 
 LOOP_CHECKS = (
     Check(
-        name="models_around",
-        title="Models around",
-        what="Ms that 95 % of the models within the uncertainty stay below, over Ms on the model",
+        name="risk",
+        title="Risk",
+        what="share of the models that the record allows on which the gains are unstable or have "
+        "an Ms of more than 1.25 times what was asked",
         unit="",
-        doubtful=1.8,
-        sentence="on models that the data allow Ms is up to {value} times as large",
-        remedy="run more cycles, use a larger amplitude, or choose the rule robust",
-        measure=_models_around,
+        doubtful=0.1,
+        failed=0.5,
+        sentence="on {value} of the models that the record allows the loop is unstable or nearly "
+        "so",
+        remedy="run more cycles, use a larger amplitude, or record a longer test",
+        measure=_risk,
+    ),
+    Check(
+        name="halves",
+        title="Halves",
+        what="the same share of the models that one half of the record allows",
+        unit="",
+        doubtful=0.9,
+        sentence="{detail} of the record alone shows another process: on {value} of its models "
+        "the loop is unstable or nearly so",
+        remedy="see whether load, operating point or other inputs changed, and record again",
+        measure=_halves,
     ),
     Check(
         name="visible_response",
@@ -447,41 +327,6 @@ LOOP_CHECKS = (
         remedy="look at the model over the data; name another structure, or record from rest "
         "without other inputs",
         measure=_visible,
-    ),
-    Check(
-        name="rivals",
-        title="Rivals",
-        what="Ms of the gains on the worst of the other models that explain the record as well, "
-        "over Ms on the selected model",
-        unit="",
-        doubtful=2.0,
-        sentence="{detail} explains the record as well, and on it Ms is {value} times as large",
-        remedy="run a test that tells them apart: a biased relay, or a longer step",
-        measure=_rivals,
-    ),
-    Check(
-        name="halves",
-        title="Halves",
-        what="Ms that the gains exceed on nine of ten models that one half of the record allows, "
-        "over Ms on the model",
-        unit="",
-        doubtful=2.0,
-        sentence="{detail} of the record alone shows a process on which Ms is at least {value} "
-        "times as large",
-        remedy="see whether load, operating point or other inputs changed, and record again",
-        measure=_halves,
-    ),
-    Check(
-        name="plain",
-        title="Plain models",
-        what="Ms of the gains on the worst of one or two lags with dead time, where these explain "
-        "the record as well, over Ms on the model",
-        unit="",
-        doubtful=2.0,
-        sentence="{detail}, which is simpler and explains the record as well, has an Ms {value} "
-        "times as large",
-        remedy="name the structure that you expect, or record a larger or longer test",
-        measure=_plain,
     ),
 )
 

@@ -81,8 +81,6 @@ _ALIKE = 0.01
 _STEPS = 15
 # Scores that differ by less do not tell two structures apart.
 _INDIFFERENT = 2.0
-# Largest standard deviation of a parameter that the samples determine, relative to its size.
-_DETERMINED = 1.0
 # Share of the sum of squares that a model in colour may always leave, and how many times that of
 # the best simulation it may leave: a colour near a random walk explains the response itself.
 _EXPLAINS, _WORSE = 0.05, 25.0
@@ -250,11 +248,7 @@ def _simulates(found: list[Candidate], simulated: list[Candidate]) -> bool:
 
 
 def _by_rank(found: list[Candidate]) -> Iterable[Candidate]:
-    """Yield candidates, the one to choose first: the simplest that the score does not refuse.
-
-    One whose parameters the samples determine comes before one of which they do not: where a pole
-    and a zero cancel, the criterion counts a parameter that does nothing.
-    """
+    """Yield candidates, the one to choose first: the simplest that the score does not refuse."""
     rest = sorted(found, key=lambda c: c.score)
     while rest:
         near = [c for c in rest if c.score <= rest[0].score + _INDIFFERENT]
@@ -280,6 +274,10 @@ def _finished(
         )
         own = drop_first_dead_time(own, candidate.state)
         state = refine(own, candidate.state.theta)
+        if own.time.size > candidate.problem.time.size and _colour(own, state) is not None:
+            # Samples so dense are correlated: those that were compared are not.
+            own = candidate.problem
+            state = refine(own, candidate.state.theta)
     if own.structure.model_at(state.theta, state.coefficients) is None:
         return None
     others = (c for c in found if c is not candidate)

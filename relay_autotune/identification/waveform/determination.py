@@ -398,7 +398,7 @@ def _profiled(found: Identification, fit: Fit, quantile: float) -> Identificatio
     # With fewer samples the curve is less steep, by the ratio of their numbers.
     fewer = few.time.size / fit.problem.time.size
     low, high = found.ci95_low.copy(), found.ci95_high.copy()
-    white = estimate_of(fit.problem, fit.state, fit, Noise(False), bounded=True)
+    white = estimate_of(fit.problem, fit.state, fit, Noise(), bounded=True)
     assert white is not None
     for i in sorted(wide):
         parameter, value = parameters[i], float(found.values[i])

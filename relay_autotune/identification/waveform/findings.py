@@ -19,7 +19,6 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
-from relay_autotune.identification.judgement.refits import Halves, halves_of
 from relay_autotune.identification.result import (
     NOT_AT_REST,
     FitReport,
@@ -29,15 +28,17 @@ from relay_autotune.identification.result import (
     point_of,
 )
 from relay_autotune.identification.waveform.candidates import Candidate, support
-from relay_autotune.identification.waveform.choice import PLAIN
 from relay_autotune.identification.waveform.determination import with_what_is_determined
 from relay_autotune.identification.waveform.fit_covariance import (
     Fit,
     Noise,
+    coarse_step,
     estimate_of,
-    noise_of,
+    noise_inflation,
     raw_residual,
 )
+from relay_autotune.identification.waveform.posterior import posterior
+from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
@@ -46,7 +47,6 @@ from relay_autotune.identification.waveform.separable import (
     evaluate,
     refine,
 )
-from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
 
@@ -122,15 +122,12 @@ def _within_reach(rival: Estimate, root: FloatArray, frequency: float) -> Estima
 
 
 _UNEXPLAINED = 1.5
-_WHITE = 1e-3
 _WORTH_TELLING = 1e-3
 # Rivals with more support than this have a share in the uncertainty of K_u and w_u.
 _WORTH_COUNTING = 1e-2
 _MOST_COUNTED = 6
 _OPEN = 0.01
 _PREDICTED = 1e-6
-# Largest excess of a plain structure's residual over a richer one's, as a share of the spread.
-_AS_WELL = 0.02
 
 
 def report(records: Sequence[Record], fit: Fit) -> Identification:
@@ -145,17 +142,10 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     residual = raw_residual(problem, state)
     rms = scale * math.sqrt(float(residual @ residual) / n)
     exact = rms <= scale * NEGLIGIBLE
-    # Whiteness of the residual once the estimated colour is taken out.
-    whiteness = math.nan if exact else ljung_box(state.residual)
-    noise = noise_of(records, rms, not math.isnan(whiteness) and whiteness < _WHITE)
-    if problem.colour is not None:
-        # The colour includes that rounding errors stay alike from sample to sample.
-        noise = replace(noise, inflation=1.0)
+    shares = support(fit.candidates)
+    allowed = posterior(fit, shares, noise_inflation(records, rms, fit), _frequency(fit))
+    noise = Noise(noise_inflation(records, rms, fit) * allowed.temper)
     estimate = estimate_of(problem, state, fit, noise, bounded=True)
-    halves = None if problem.colour is None or estimate is None else _halves(fit, estimate.model)
-    if halves is not None and not halves.agree:
-        noise = replace(noise, inflation=noise.inflation * halves.apart)
-        estimate = estimate_of(problem, state, fit, noise, bounded=True)
     if estimate is None:
         raise IdentificationError(
             f"the fit of a {problem.structure.name} model left its structure; name another "
@@ -169,11 +159,11 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         residual_rms=rms,
         noise_std=_measured_noise(records),
         fit=1.0 - rms / spread if spread > 0.0 else math.nan,
-        whiteness_p=whiteness if exact or problem.colour is None else ljung_box(residual),
+        whiteness_p=math.nan if exact else ljung_box(residual),
         prediction=scale * _prediction(records, problem, state),
     )
     quantile = float(stdtrit(max(n - state.parameters, 1), 0.975))
-    warnings = (*fit.warnings, *_warnings(records, quality, noise, fit, residual))
+    warnings = (*fit.warnings, *_warnings(records, quality, fit, residual))
     found = identified(
         "waveform",
         estimate,
@@ -190,53 +180,32 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         for note in _checks(record, found, gain_std, curve)
     ]
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(notes)))
-    found = _beside_rivals(found, fit, noise)
-    if halves is not None and not halves.agree:
+    found = _beside_rivals(found, fit, shares, noise)
+    found = replace(found, draws=allowed.models, halves=allowed.halves)
+    if allowed.temper > 1.0:
         told = (
-            f"two halves of the record give models that differ {math.sqrt(halves.apart):.2g} "
+            f"two halves of the record give models that differ {math.sqrt(allowed.temper):.2g} "
             "times as much as their noise explains: the process, its load or its operating point "
             "changed; intervals are widened to hold both, and gains have to hold on both"
         )
-        found = replace(found, parts=halves.models, warnings=(*found.warnings, told))
-    if problem.colour is not None:
-        found = replace(found, parts=(*found.parts, *_plain(fit, rms, spread)))
+        found = replace(found, warnings=(*found.warnings, told))
     return with_what_is_determined(found, records, fit, quantile)
 
 
-def _plain(fit: Fit, rms: float, spread: float) -> list[TransferFunction]:
-    """Return the best plain models, if they simulate the record nearly as well as the fit.
-
-    :param fit: in colour.
-    :param rms: of the fit's residual [y].
-    :param spread: of the measurement [y].
-    """
-    found = []
-    for candidate in fit.candidates:
-        if candidate.structure.name not in PLAIN:
-            continue
-        problem = replace(candidate.problem, colour=None)
-        state = refine(problem, candidate.state.theta, tolerance=_PREDICTED)
-        left = fit.scale * math.sqrt(state.cost / state.residual.size)
-        model = problem.structure.model_at(state.theta, fit.scale * state.coefficients)
-        if model is not None and left <= rms + _AS_WELL * spread:
-            found.append(model)
-    return found
-
-
-def _halves(fit: Fit, model: TransferFunction) -> Halves | None:
-    """Compare the halves of a record at about the frequency of the loop."""
-    point = ultimate_point(model)
-    slow = model.dead_time + sum(abs(t) for t in model.time_constants)
-    if point is None and not slow > 0.0:
-        return None
-    return halves_of(fit, 1.0 / slow if point is None else point.frequency)
+def _frequency(fit: Fit) -> float:
+    """Return about the frequency of the loop [rad/s]."""
+    model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
+    point = None if model is None else ultimate_point(model)
+    slow = unit_steps(fit.problem.structure, fit.state.theta)[-1]
+    return 1.0 / float(slow) if point is None else point.frequency
 
 
 def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatArray:
     """Return the fitted measurement of the first record; NaN where samples were left out."""
     record, problem, scale = records[0], fit.problem, fit.scale
     fitted = np.full(len(record), math.nan)
-    if problem.colour is not None and len(records) == 1:
+    thinned = problem.colour is not None or 2 * problem.time.size <= len(record)
+    if thinned and len(records) == 1:
         # It was fitted to some of the samples only.
         every = replace(
             problem,
@@ -264,9 +233,10 @@ def _checks(
     return [note for note in notes if note]
 
 
-def _beside_rivals(found: Identification, fit: Fit, noise: Noise) -> Identification:
+def _beside_rivals(
+    found: Identification, fit: Fit, shares: Sequence[float], noise: Noise
+) -> Identification:
     """Add the rivals, and widen the uncertainty of K_u and w_u by theirs."""
-    shares = support(list(fit.candidates))
     chosen = fit.problem.structure
     own = 0.0
     rivals: list[Rival] = []
@@ -346,7 +316,7 @@ def _from_baseline(record: Record) -> bool:
 
 
 def _warnings(
-    records: Sequence[Record], quality: FitReport, noise: Noise, fit: Fit, residual: FloatArray
+    records: Sequence[Record], quality: FitReport, fit: Fit, residual: FloatArray
 ) -> list[str]:
     found = []
     if fit.problem.colour is not None:
@@ -355,15 +325,10 @@ def _warnings(
             f"autoregression of order {fit.problem.colour.order}), and intervals and the choice "
             "of a structure allow for it"
         )
-    elif noise.coloured:
+    step = coarse_step(records, quality.residual_rms)
+    if step:
         found.append(
-            f"the residual is not white (p = {quality.whiteness_p:.2g}): something is not in the "
-            "model, such as a second input, another structure or a disturbance; the intervals "
-            "are widened for it, but do not cover a wrong structure"
-        )
-    if noise.step:
-        found.append(
-            f"the measurement comes in steps of {noise.step:.3g}, which are larger than its noise "
+            f"the measurement comes in steps of {step:.3g}, which are larger than its noise "
             f"({quality.residual_rms:.3g} rms): rounding is no noise, and the intervals are "
             "widened for it; a finer sensor or a larger amplitude would help"
         )

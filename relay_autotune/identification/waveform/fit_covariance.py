@@ -16,7 +16,6 @@ from relay_autotune.identification.estimate import Estimate, jacobian, relative_
 from relay_autotune.identification.waveform.candidates import Candidate
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
-    covariance_meat,
     mean_slope,
     scale_of,
     weights,
@@ -54,14 +53,10 @@ class Fit:
 class Noise:
     """Properties of the residual.
 
-    :param coloured: True: its samples are correlated.
     :param inflation: ratio of the covariance to that of white noise of the same size.
-    :param step: of the sensor's grid [y]; 0: none, or far below the noise.
     """
 
-    coloured: bool
     inflation: float = 1.0
-    step: float = 0.0
 
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:
@@ -72,17 +67,33 @@ def raw_residual(problem: Problem, state: Trial) -> FloatArray:
     return np.asarray(problem.y - state.coefficients @ columns)
 
 
-def noise_of(records: Sequence[Record], rms: float, coloured: bool) -> Noise:
-    """Recognise correlated noise, and a sensor whose steps are larger than its noise."""
+def coarse_step(records: Sequence[Record], rms: float) -> float:
+    """Return the largest step of a sensor that exceeds the residual [y]; 0: none does.
+
+    :param records: what was fitted.
+    :param rms: of the residual [y].
+    """
     step = max(quantisation_step(r.measurement) for r in records)
-    if step == 0.0 or rms >= step:
-        return Noise(coloured)
-    # Rounding errors stay alike until the next level is crossed: each held level counts as one
-    # sample with the variance of a rounding, however many samples it lasts.
+    return step if rms < step else 0.0
+
+
+def noise_inflation(records: Sequence[Record], rms: float, fit: Fit) -> float:
+    """Return the ratio of the covariance to that of white noise of the residual's size.
+
+    Rounding errors stay alike until the next level is crossed: each held level counts as one
+    sample with the variance of a rounding, however many samples it lasts. A colour includes that.
+
+    :param records: what was fitted.
+    :param rms: of the residual [y].
+    :param fit: their fit.
+    """
+    step = coarse_step(records, rms)
+    if step == 0.0 or fit.problem.colour is not None:
+        return 1.0
     held = sum(1 + int(np.count_nonzero(np.diff(r.measurement))) for r in records)
     samples = sum(len(r) for r in records)
     larger = max(step**2 / 12.0 / rms**2, 1.0) if rms > 0.0 else 1.0
-    return Noise(coloured, larger * samples / held, step)
+    return larger * samples / held
 
 
 def estimate_of(
@@ -110,10 +121,9 @@ def estimate_of(
 def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise, bounded: bool) -> FloatArray:
     """Return B of the covariance B B' of all linear coefficients and theta, in this order.
 
-    For least squares that is ``s^2 (J'J)^-1``, for coloured noise with the long-run covariance of
-    ``J r`` between two inverses. For a robust loss r is the loss's derivative, over the mean of
-    its second one (Huber 1981). With J = Q R, R is inverted: J'J would lose half of the digits
-    where two parameters can hardly be told apart.
+    For least squares that is ``s^2 (J'J)^-1``. For a robust loss r is the loss's derivative, over
+    the mean of its second one (Huber 1981). With J = Q R, R is inverted: J'J would lose half of
+    the digits where two parameters can hardly be told apart.
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)
@@ -124,22 +134,14 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise, bounded: bool)
         jacobian, scores = np.append(jacobian, prior, axis=1), np.append(scores, 0.0)
     size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
     size[size == 0.0] = 1.0
-    q, r = np.linalg.qr((jacobian / size[:, None]).T)
+    r = np.linalg.qr((jacobian / size[:, None]).T, mode="r")
     left, singular, right = np.linalg.svd(r, full_matrices=False)
     # A direction whose effect is below rounding counts as uncertain, not as exact.
     singular = np.maximum(singular, _EPSILON * n * singular[0])
     inverse = (right.T / singular) @ left.T / size[:, None]
     degrees = max(n - state.parameters, 1)
-    if not noise.coloured:
-        variance = float(scores @ scores) / degrees * noise.inflation
-        return np.asarray(inverse * math.sqrt(variance) / slope)
-    meat = covariance_meat(q.T * scores, scores) * (n / degrees)
-    variances, axes = np.linalg.eigh(meat)
-    root = inverse @ (axes * np.sqrt(np.maximum(variances, 0.0)))
-    white = np.sum(inverse**2, axis=1) * (float(scores @ scores) / degrees)
-    # Correlation and rounding both leave fewer independent samples: the larger effect counts.
-    larger = np.sqrt(white * noise.inflation / np.maximum(np.sum(root**2, axis=1), 1e-300))
-    return np.asarray(root * np.maximum(larger, 1.0)[:, None] / slope)
+    variance = float(scores @ scores) / degrees * noise.inflation
+    return np.asarray(inverse * math.sqrt(variance) / slope)
 
 
 def _scores(problem: Problem, state: Trial, fit: Fit) -> tuple[FloatArray, FloatArray, float]:

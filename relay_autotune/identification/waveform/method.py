@@ -27,10 +27,11 @@ from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.choice import NO_RESPONSE, chosen_fit, responds
 from relay_autotune.identification.waveform.findings import report
-from relay_autotune.identification.waveform.fit_covariance import NEGLIGIBLE, Fit, raw_residual
+from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, weights
 from relay_autotune.identification.waveform.separable import (
+    NEGLIGIBLE,
     Problem,
     Trial,
     problem_of,

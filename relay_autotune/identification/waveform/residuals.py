@@ -90,25 +90,6 @@ def ljung_box(residual: FloatArray, lags: int = 20) -> float:
     return float(gammaincc(m / 2.0, q / 2.0))
 
 
-def covariance_meat(scores: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the long-run covariance of the scores (Newey and West 1987).
-
-    ``S = Gamma_0 + sum_l (1 - l/(L+1)) (Gamma_l + Gamma_l')``, with L twice the lag at which the
-    residual's autocorrelation has died away.
-
-    :param scores: Jacobian times residual, sample by sample, shape (p, n).
-    :param residual: shape (n,).
-    """
-    n = residual.size
-    longest = max(n // 4, 1)
-    rho = autocorrelation(residual, longest)
-    quiet = np.flatnonzero(np.abs(rho) < 2.0 / math.sqrt(n))
-    bandwidth = min(2 * (int(quiet[0]) + 1 if quiet.size else longest), longest)
-    weight = 1.0 - np.arange(bandwidth + 1) / (bandwidth + 1.0)
-    weighted = _products(scores, bandwidth) @ weight
-    return np.asarray(weighted + weighted.T - scores @ scores.T)
-
-
 # 95 % as efficient as least squares where the noise is normal.
 _HUBER = 1.345
 _TUKEY = 4.685
