@@ -35,10 +35,8 @@ _ALIKE = 1e-6
 _LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
 # Least range of the command on one side but for few samples [%], as a share of the whole range.
 _BUT_FEW, _OWN = (1.0, 99.0), 0.2
-# Largest share left unexplained at the same instant, relative to that left one sample away.
-_AT_ONCE = 0.5
-# Earlier changes of the measurement that a controller's law may hold, and the last changes of a
-# record that are looked at.
+# Earlier samples that a controller's law may hold, a PID's with a filter, and the last samples of
+# a record that are looked at.
 _PAST, _MOST_CHANGES = 3, 20_000
 
 
@@ -153,57 +151,46 @@ def lost_effect(
     return max(found, default=None)
 
 
-def followed_share(record: Record, sign: int) -> float | None:
-    """Return the share of the command's variance that follows the measurement at once.
+def read_backward(record: Record, model: TransferFunction) -> float | None:
+    """Return how much of the command is a controller's whose inverse the model is, 0 to 1.
 
-    A proportional controller makes ``u = c + b y``, with b against the process's sign. In a
-    process y comes after u; so the share at the same instant, the square of the correlation, has
-    to stand out from those one sample earlier and later.
-
-    :param record: any record.
-    :param sign: of the process; with a b of the same sign a loop would run away.
-    :return: None where b has the other sign, or the share at the same instant does not stand out.
-    """
-    u, y = record.command, record.measurement
-    if len(record) < _LEAST_SAMPLES or not (np.ptp(u) > 0.0 and np.ptp(y) > 0.0):
-        return None
-    at_once = float(np.corrcoef(u, y)[0, 1])
-    beside = [
-        0.0 if not (np.ptp(a) > 0.0 and np.ptp(b) > 0.0) else float(np.corrcoef(a, b)[0, 1])
-        for a, b in ((u[1:], y[:-1]), (u[:-1], y[1:]))
-    ]
-    left = 1.0 - at_once**2
-    if at_once * sign <= 0.0 or left > _AT_ONCE * min(1.0 - r**2 for r in beside):
-        return None
-    return at_once**2
-
-
-def followed_changes(record: Record, sign: int) -> float | None:
-    """Return the share of the command's changes that the measurement's last change adds.
-
-    A controller with derivative action makes ``du[k] = b0 dy[k] + b1 dy[k - 1] + ...``, with b0
-    against the process's sign, whereas the changes of a process come after those of its command.
-    The share is what ``dy[k]`` adds to the coefficient of determination of three earlier changes.
+    A command that a controller makes, ``u_k = sum_i a_i u_(k-i) + sum_j b_j y_(k-j) + c``, follows
+    each measurement at once, whereas a process answers later. The share s of what its own past
+    does not tell of u and y does is the controller's (as in Granger 1969); the rest came from
+    outside, and shows the process. With C = B/(1 - A) the law that was found and G the model, the
+    part of the command's power over frequency on which G is 1/C, ``d = 1 - |1 - G C|^2``, tells
+    whether the model is that law read backward. The number is ``s d``.
 
     :param record: any record.
-    :param sign: of the process; with a b0 of the same sign a loop would run away.
-    :return: None where b0 has the other sign, or the command does not vary all the time.
+    :param model: the model fitted to it.
+    :return: None where samples are few, or the command does not vary.
     """
-    du, dy = np.diff(record.command[-_MOST_CHANGES:]), np.diff(record.measurement[-_MOST_CHANGES:])
-    if len(record) < _LEAST_SAMPLES or not np.ptp(du) > 0.0:
+    u, y = (x[-_MOST_CHANGES:] - x.mean() for x in (record.command, record.measurement))
+    if u.size < _LEAST_SAMPLES or not (np.ptp(u) > 0.0 and np.ptp(y) > 0.0):
         return None
-    if 2 * np.count_nonzero(du) < du.size:
+    u_size, y_size = float(np.std(u)), float(np.std(y))
+    u, y = u / u_size, y / y_size
+    own = [u[_PAST - k : u.size - k] for k in range(1, _PAST + 1)]
+    seen = [y[_PAST - k : y.size - k] for k in range(_PAST + 1)]
+    now, constant = u[_PAST:], np.ones(u.size - _PAST)
+
+    def fitted(rows: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+        columns = np.stack((*rows, constant), axis=1)
+        factors = np.linalg.lstsq(columns, now, rcond=_ALIKE**1.5)[0]
+        return factors, float(np.sum((now - columns @ factors) ** 2))
+
+    _, alone = fitted(own)
+    factors, left = fitted((*own, *seen))
+    if not alone > _ALIKE * now.size:
         return None
-    lags = np.stack([dy[_PAST - k : dy.size - k] for k in range(_PAST + 1)], axis=1)
-    lags, now = lags - lags.mean(axis=0), du[_PAST:] - du[_PAST:].mean()
-    left = []
-    for columns in (lags, lags[:, 1:]):
-        factors, *_ = np.linalg.lstsq(columns, now, rcond=_ALIKE)
-        left.append((float(np.sum((now - columns @ factors) ** 2)), float(factors[0])))
-    (both, at_once), (earlier, _) = left
-    if at_once * sign <= 0.0:
-        return None
-    return (earlier - both) / float(now @ now)
+    interval = record.mean_interval
+    w = 2.0 * math.pi * np.fft.rfftfreq(u.size, interval)[1:]
+    power = np.abs(np.fft.rfft(u * np.hanning(u.size))[1:]) ** 2
+    delay = np.exp(-1j * w * interval) ** np.arange(_PAST + 1)[:, None]
+    law = (factors[_PAST:-1] @ delay) / (1.0 - factors[:_PAST] @ delay[1:])
+    away = np.abs(1.0 - model(1j * w) * law * (u_size / y_size)) ** 2
+    alike = 1.0 - float(power @ np.minimum(away, 1.0)) / float(power.sum())
+    return (1.0 - left / alone) * alike
 
 
 def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:

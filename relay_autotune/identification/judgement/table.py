@@ -17,9 +17,8 @@ import numpy as np
 
 from relay_autotune.identification.judgement.assessment import misfit, unexplained_share
 from relay_autotune.identification.judgement.checks import (
-    followed_changes,
-    followed_share,
     lost_effect,
+    read_backward,
 )
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
 from relay_autotune.identification.result import NOT_AT_REST
@@ -34,12 +33,7 @@ _FAR_ABOVE = 1.25
 
 
 def _fed_back(evidence: Evidence) -> Measured | None:
-    share = followed_share(evidence.record, evidence.found.model.process_sign)
-    return None if share is None else Measured(share)
-
-
-def _fed_back_changes(evidence: Evidence) -> Measured | None:
-    share = followed_changes(evidence.record, evidence.found.model.process_sign)
+    share = read_backward(evidence.record, evidence.found.model)
     return None if share is None else Measured(share)
 
 
@@ -165,31 +159,15 @@ MODEL_CHECKS = (
     Check(
         name="fed_back",
         title="Feedback",
-        what="share of the command's variance that follows the measurement at the same instant, "
-        "in the direction that the model says would run away",
+        what="share of the command's changes that the measurement explains at once, times the "
+        "share of the command's power on which the model is the inverse of that law",
         unit="",
-        failed=0.98,
-        sentence="the command follows the measurement ({value} of its variance), in a direction "
-        "in which a loop with this process would have run away: the model is the controller, read "
-        "backward",
+        failed=0.5,
+        sentence="the command follows the measurement, and {value} of the model is that "
+        "controller, read backward",
         remedy="move the set-point while recording, or let a relay work in place of the "
         "controller",
         measure=_fed_back,
-    ),
-    Check(
-        name="fed_back_changes",
-        title="Feedback of changes",
-        what="share of the variance of the command's changes that the measurement's change at the "
-        "same instant explains beyond its earlier ones, in the direction that the model says "
-        "would run away",
-        unit="",
-        failed=0.5,
-        sentence="the command's changes follow those of the measurement ({value} of their "
-        "variance), in a direction in which a loop with this process would have run away: the "
-        "model is the controller, read backward",
-        remedy="move the set-point while recording, or let a relay work in place of the "
-        "controller",
-        measure=_fed_back_changes,
     ),
     Check(
         name="first_response",

@@ -10,11 +10,11 @@ that colour, and the priors of the table below.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +78,8 @@ _BEYOND_HOPE = 4.0
 # second, in squares of the range, the residual is curvature, which the promise neglects.
 _NO_PROMISE = 6.0
 _CLEAN = 1e-6
+# What may be estimated beside the model, as fields of a problem.
+TERMS = ("drift", "relaxation", "past", "unequal")
 # Structures that are fitted to the end, whatever residual they leave.
 _ALWAYS = (FOPDT.name, IPDT.name)
 
@@ -226,21 +228,20 @@ class FitContext:
             imitations += lasting or not model.is_stable
         return score + IMITATES_A_DRIFT * imitations
 
-    def with_nuisances(self, candidate: Candidate) -> list[Candidate]:
-        """Return a candidate with each set of terms beside the model that a record may need.
+    def with_one_more_term(self, candidate: Candidate) -> list[Candidate]:
+        """Return a candidate with each further term beside the model that a record may need.
 
         :param candidate: in white noise.
         """
         found = []
-        for terms in self.terms:
-            drift, relaxation, past = terms
-            if relaxation and not candidate.structure.factors:
+        for term in self.terms:
+            if getattr(candidate.problem, term):
+                continue
+            if term == "relaxation" and not candidate.structure.factors:
                 # The free state of an integrator is the offset.
                 continue
-            if terms == nuisances_of(candidate.problem):
-                found.append(candidate)
-                continue
-            problem = replace(candidate.problem, drift=drift, relaxation=relaxation, past=past)
+            changed: dict[str, Any] = {term: True}
+            problem = replace(candidate.problem, **changed)
             state = refine(problem, candidate.state.theta, tolerance=TRIAL)
             other = self.candidate(problem, state)
             if other is not None:
@@ -248,15 +249,16 @@ class FitContext:
         return found
 
     @cached_property
-    def terms(self) -> list[tuple[bool, bool, bool]]:
-        """Sets of drift, free initial state and command before that the record may need."""
+    def terms(self) -> list[str]:
+        """Names of the terms beside the model that the record may need."""
         rested = needs_no_past(self.problem, self.sign)
-        return [
-            (drift, relaxation, past)
-            for drift, relaxation, past in itertools.product((False, True), repeat=3)
-            if not (past and not self.problem.past_is_open)
-            and not ((relaxation or past) and rested)
-        ]
+        needed = {
+            "drift": True,
+            "relaxation": not rested,
+            "past": not rested and self.problem.past_is_open,
+            "unequal": self.problem.acts_both_ways,
+        }
+        return [term for term in TERMS if needed[term]]
 
     def with_nuisances_of(self, candidate: Candidate) -> FitContext:
         """Return the context with the terms beside the model of a candidate.
@@ -359,9 +361,9 @@ class FitContext:
         return np.array((best.theta[0], 0.0, best.theta[1]))
 
 
-def nuisances_of(problem: Problem) -> tuple[bool, bool, bool]:
-    """Return whether drift, initial state and the command before are estimated."""
-    return problem.drift, problem.relaxation, problem.past
+def nuisances_of(problem: Problem) -> tuple[bool, ...]:
+    """Return which of the terms beside the model are estimated."""
+    return tuple(getattr(problem, term) for term in TERMS)
 
 
 def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | None:

@@ -12,7 +12,7 @@ took correlated samples for independent ones would prefer models that follow the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,9 +20,11 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
+    TERMS,
     Candidate,
     FitContext,
     drop_first_dead_time,
+    nuisances_of,
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit
 from relay_autotune.identification.waveform.rational import unit_steps
@@ -162,22 +164,38 @@ def _compared(context: FitContext, known: Known) -> list[Candidate]:
     if not found or known.structure:
         return found
     again = _with_best_terms(context, [context.refit(found[0], None, _STEPS) or found[0]])
-    if again.score < decided.score and _terms(again) != _terms(decided):
+    if again.score < decided.score and nuisances_of(again.problem) != nuisances_of(
+        decided.problem
+    ):
         other = _of_all(context.with_nuisances_of(again), names, known, simple)
         return min(found, other, key=lambda f: f[0].score if f else math.inf)
     return found
 
 
-def _terms(candidate: Candidate) -> tuple[bool, bool, bool]:
-    problem = candidate.problem
-    return problem.drift, problem.relaxation, problem.past
+def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candidate:
+    """Return the candidate of the best score, with the terms beside the model that improve it.
+
+    They are added one after the other, each time the one that improves the score most in the
+    colour of its own residual.
+    """
+    best = min((_in_own_colour(context, c) for c in found), key=lambda c: c.score)
+    for start in found:
+        now, score = start, _in_own_colour(context, start).score
+        while more := context.with_one_more_term(now):
+            ranked = [(_in_own_colour(context, c), c) for c in more]
+            coloured, plain = min(ranked, key=lambda r: r[0].score)
+            if coloured.score >= score:
+                break
+            now, score = plain, coloured.score
+            best = min(best, coloured, key=lambda c: c.score)
+    return best
 
 
-def _with_best_terms(context: FitContext, found: Iterable[Candidate]) -> Candidate:
-    """Return the candidate of the best score, each set of terms in its own colour."""
-    rows = [c for each in found for c in context.with_nuisances(each)]
-    in_colour = (context.refit(c, _colour(c.problem, c.state), _STEPS) for c in rows)
-    return min((c for c in (*rows, *in_colour) if c is not None), key=lambda c: c.score)
+def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
+    """Return a candidate in the colour of its residual, or white where that is likelier."""
+    colour = _colour(candidate.problem, candidate.state)
+    coloured = None if colour is None else context.refit(candidate, colour, _STEPS)
+    return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
 
 def _of_all(
@@ -268,9 +286,7 @@ def _finished(
         own = replace(
             problem,
             structure=own.structure,
-            drift=own.drift,
-            relaxation=own.relaxation,
-            past=own.past,
+            **{term: getattr(own, term) for term in TERMS},
         )
         own = drop_first_dead_time(own, candidate.state)
         state = refine(own, candidate.state.theta)

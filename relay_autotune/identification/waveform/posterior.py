@@ -100,6 +100,20 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     return Posterior(tuple(models), halves, temper)
 
 
+def effects(problem: Problem, state: Trial) -> tuple[float, float]:
+    """Return how strongly commands above and below the first one act, relative to the model.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    """
+    if not problem.unequal:
+        return 1.0, 1.0
+    count = len(problem.structure.powers)
+    rest = state.coefficients.size - len(problem.bounds) * (1 + problem.drift)
+    share = float(state.coefficients[rest - count] / state.coefficients[0])
+    return 1.0 + share, 1.0 - share
+
+
 def _plain(fit: Fit) -> list[TransferFunction]:
     """Return the plain models that simulate the record nearly as well as a fit in colour.
 
@@ -134,7 +148,13 @@ def _draws(
     # Fewer samples tell as much as all of them together did.
     inflation *= few.time.size / problem.time.size
     gain = state.coefficients[: len(problem.structure.powers)]
-    return _allowed(few, gain, state.theta, scale, inflation, count, rng)
+    models = _allowed(few, gain, state.theta, scale, inflation, count, rng)
+    above, below = effects(problem, state)
+    # Gains have to hold on both sides.
+    return tuple(
+        replace(m, gain=m.gain * (above, below)[i % 2]) if min(above, below) > 0.0 else m
+        for i, m in enumerate(models)
+    )
 
 
 def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, ...]:

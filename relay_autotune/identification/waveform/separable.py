@@ -63,6 +63,7 @@ class Problem:
     :param weight: square root of each sample's weight, shape (n,); None: all are equal.
     :param past: True: the command before each experiment is estimated: the process rested, or
         moved freely, under another level than its first one.
+    :param unequal: True: commands above and below the first one have effects of their own.
     :param colour: of the noise; None: white.
     :param averaged: True: each sample is the mean of several.
     """
@@ -77,6 +78,7 @@ class Problem:
     relaxation: bool = False
     weight: FloatArray | None = None
     past: bool = False
+    unequal: bool = False
     colour: Colour | None = None
     averaged: bool = False
 
@@ -86,6 +88,16 @@ class Problem:
         return all(
             not (u.times.size and u.times[0] <= self.time[part][0])
             for part, u in zip(self.experiments, self.inputs, strict=True)
+        )
+
+    @property
+    def acts_both_ways(self) -> bool:
+        """True if each command moves to both sides of its first level."""
+        return all(
+            isinstance(u, PiecewiseConstant)
+            and bool(u.values.size)
+            and float(u.values.min()) < u.initial < float(u.values.max())
+            for u in self.inputs
         )
 
     @property
@@ -151,6 +163,12 @@ class Problem:
             before, before_by_theta = columns_of(self.structure, theta, time, step)
             own = np.concatenate((own, before))
             own_by_theta = np.concatenate((own_by_theta, before_by_theta), axis=1)
+        if self.unequal:
+            folded, folded_by_theta = columns_of(
+                self.structure, theta, time, _folded(self.inputs[number])
+            )
+            own = np.concatenate((own, folded))
+            own_by_theta = np.concatenate((own_by_theta, folded_by_theta), axis=1)
         rest = np.ones((1 + self.drift, time.size))
         if self.drift:
             rest[1] = (time - time.mean()) / np.ptp(time)
@@ -192,6 +210,12 @@ class Problem:
         for part, step in zip(parts, steps, strict=True):
             chosen[part][::step] = True
         return self.part(chosen)
+
+
+def _folded(u: Input) -> PiecewiseConstant:
+    """Return the distance of a held command from its first level."""
+    assert isinstance(u, PiecewiseConstant)
+    return PiecewiseConstant(u.times, np.abs(u.values - u.initial), 0.0)
 
 
 def problem_of(
