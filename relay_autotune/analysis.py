@@ -18,7 +18,7 @@ from relay_autotune.errors import IdentificationError, RelayAutotuneError, Tunin
 from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
-from relay_autotune.identification.judgement.disturbance import with_its_load, without_disturbance
+from relay_autotune.identification.judgement.disturbance import without_disturbance
 from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.identification.judgement.table import MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING, Known
@@ -136,7 +136,7 @@ def analyse(
     if isinstance(chosen, Analysis):
         return chosen
     tell("comparing methods")
-    models = [chosen.model, *_others(chosen.driven, task, chosen.model)]
+    models = [chosen.model, *_others(chosen.record, task, chosen.model)]
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
     return _assessed(chosen, models, _Tuning(task, _first(rule), simple, rng, tell))
 
@@ -231,13 +231,11 @@ class _Chosen:
     :param record: the record.
     :param cycles: its whole cycles.
     :param model: the identification.
-    :param driven: the record including the load step, if one was found.
     """
 
     record: Record
     cycles: tuple[Cycle, ...]
     model: Identification
-    driven: Record
 
     @property
     def alone(self) -> Analysis:
@@ -250,7 +248,7 @@ class _Chosen:
             return self.model.model
         if task.rule == DEFAULT_RULE:
             return None
-        return _simple((self.driven,), task.known, self.model)
+        return _simple((self.record,), task.known, self.model)
 
 
 @dataclass(frozen=True)
@@ -294,15 +292,7 @@ def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     chosen = without_disturbance(
         chosen, record, cycles, lambda part: _guarded(part, task.method, task.known)
     )
-    if chosen.method != DEFAULT_METHOD or task.known.structure:
-        return _Chosen(record, cycles, chosen, record)
-    loaded = with_its_load(
-        chosen,
-        record,
-        cycles,
-        lambda part, kind: _guarded(part, task.method, replace(task.known, structure=kind)),
-    )
-    return _Chosen(record, cycles, *loaded)
+    return _Chosen(record, cycles, chosen)
 
 
 def _chosen_so_far(record: Record, task: Task) -> _Chosen | Analysis:
@@ -327,7 +317,6 @@ def _assessed(chosen: _Chosen, models: Sequence[Identification], tuning: _Tuning
         record,
         found.models[0],
         settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
-        driven=chosen.driven,
     )
     return _judged(found, evidence, (record,), tuning)
 

@@ -150,14 +150,12 @@ class Evidence:
     :param found: the selected model, with its uncertainty, its fit and its limit cycle.
     :param settled: True if the record has a limit cycle whose last cycles agree.
     :param loop: the gains; None: there are none yet.
-    :param driven: the record with the estimated load added to its command; None: no load.
     """
 
     record: Record
     found: Identification
     settled: bool = False
     loop: Loop | None = None
-    driven: Record | None = None
 
     def with_loop(self, loop: Loop) -> Evidence:
         """Return the same experiment with some gains, and what was computed without them.

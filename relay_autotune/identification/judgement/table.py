@@ -139,7 +139,7 @@ def _left_out(evidence: Evidence) -> Measured | None:
 
 def _clipped(evidence: Evidence) -> Measured | None:
     model, fitted = evidence.found.model, evidence.found.fitted
-    found = lost_effect(evidence.driven or evidence.record, model, fitted)
+    found = lost_effect(evidence.record, model, fitted)
     return None if found is None else Measured(found[0], f"{found[1]:.4g}")
 
 

@@ -24,7 +24,9 @@ from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
     Problem,
     Trial,
+    evaluate,
     information_criterion,
+    left_of,
     refine,
 )
 from relay_autotune.identification.waveform.starts import (
@@ -79,7 +81,9 @@ _BEYOND_HOPE = 4.0
 _NO_PROMISE = 6.0
 _CLEAN = 1e-6
 # What may be estimated beside the model, as fields of a problem.
-TERMS = ("drift", "relaxation", "past", "unequal")
+TERMS = ("drift", "relaxation", "past", "unequal", "load")
+# Instants at which a load is tried, and steps towards the best one.
+_INSTANTS, _STEPS_IN_TIME = 60, 4
 # Structures that are fitted to the end, whatever residual they leave.
 _ALWAYS = (FOPDT.name, IPDT.name)
 
@@ -235,14 +239,17 @@ class FitContext:
         """
         found = []
         for term in self.terms:
-            if getattr(candidate.problem, term):
+            if getattr(candidate.problem, term) not in (False, None):
                 continue
             if term == "relaxation" and not candidate.structure.factors:
                 # The free state of an integrator is the offset.
                 continue
-            changed: dict[str, Any] = {term: True}
-            problem = replace(candidate.problem, **changed)
-            state = refine(problem, candidate.state.theta, tolerance=TRIAL)
+            if term == "load":
+                problem, state = with_load(candidate.problem, candidate.state)
+            else:
+                changed: dict[str, Any] = {term: True}
+                problem = replace(candidate.problem, **changed)
+                state = refine(problem, candidate.state.theta, tolerance=TRIAL)
             other = self.candidate(problem, state)
             if other is not None:
                 found.append(other)
@@ -257,6 +264,8 @@ class FitContext:
             "relaxation": not rested,
             "past": not rested and self.problem.past_is_open,
             "unequal": self.problem.acts_both_ways,
+            # Between a few steps, a load cannot be told from a slow disturbance.
+            "load": self.held and len(self.problem.bounds) == 1,
         }
         return [term for term in TERMS if needed[term]]
 
@@ -363,7 +372,45 @@ class FitContext:
 
 def nuisances_of(problem: Problem) -> tuple[bool, ...]:
     """Return which of the terms beside the model are estimated."""
-    return tuple(getattr(problem, term) for term in TERMS)
+    return tuple(getattr(problem, term) not in (False, None) for term in TERMS)
+
+
+def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
+    """Return a problem with a step of the load, at the instant that explains most, and its fit.
+
+    At each of some instants the least squares are found with the model linearised about its fit
+    without a load. From the best one, the instant is moved by what the pulse beside the step says.
+
+    :param problem: of one experiment, without a load.
+    :param state: its fit.
+    """
+    few = coarse(problem)
+    known = evaluate(few, state.theta)
+    basis, _ = np.linalg.qr(np.concatenate((known.columns, known.derivative)).T)
+    left = known.residual - basis @ (basis.T @ known.residual)
+    own, time = len(problem.structure.powers), problem.time
+    begin = float(problem.inputs[0].times[0])
+    instants = np.linspace(max(begin, float(time[0])), float(time[-1]), _INSTANTS + 2)[1:-1]
+    gained = []
+    for instant in instants:
+        at = replace(few, load=float(instant))
+        rows = at.seen(at.columns(state.theta)[0])[-2 * own - 1 - few.drift :][:own]
+        rows = rows - (rows @ basis) @ basis.T
+        gained.append(float(left @ left) - float(np.sum(left_of(left, rows) ** 2)))
+    load = float(instants[int(np.argmax(gained))])
+    theta = state.theta
+    for _ in range(_STEPS_IN_TIME):
+        loaded = replace(problem, load=load)
+        found = refine(loaded, theta, tolerance=TRIAL)
+        theta = found.theta
+        step, pulse = found.coefficients[[-2 * own - 1 - problem.drift, -own - 1 - problem.drift]]
+        shift = -float(pulse / step) * problem.shortest if step else 0.0
+        farthest = float(instants[1] - instants[0])
+        if abs(shift) < problem.shortest:
+            break
+        load += min(max(shift, -farthest), farthest)
+        load = min(max(load, float(time[0])), float(time[-1]))
+    return loaded, found
 
 
 def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | None:

@@ -347,6 +347,13 @@ def _warnings(
             found.append(
                 f"{which}{record.lost_samples} samples were lost on the way; check the network"
             )
+    if fit.problem.load is not None:
+        own = len(fit.problem.structure.powers)
+        size = fit.state.coefficients[-2 * own - 1 - fit.problem.drift] / fit.state.coefficients[0]
+        found.append(
+            f"a load step of {size:.3g} u at {fit.problem.load:.4g} s was estimated with the "
+            "model, since no model fits the record as well without one"
+        )
     if fit.problem.drift:
         found.append(
             "the measurement drifts, and the drift was fitted with the model; wait for rest"

@@ -109,8 +109,9 @@ def effects(problem: Problem, state: Trial) -> tuple[float, float]:
     if not problem.unequal:
         return 1.0, 1.0
     count = len(problem.structure.powers)
-    rest = state.coefficients.size - len(problem.bounds) * (1 + problem.drift)
-    share = float(state.coefficients[rest - count] / state.coefficients[0])
+    after = 2 * count * (problem.load is not None) + 1 + problem.drift
+    at = state.coefficients.size - len(problem.bounds) * after - count
+    share = float(state.coefficients[at] / state.coefficients[0])
     return 1.0 + share, 1.0 - share
 
 

@@ -64,6 +64,8 @@ class Problem:
     :param past: True: the command before each experiment is estimated: the process rested, or
         moved freely, under another level than its first one.
     :param unequal: True: commands above and below the first one have effects of their own.
+    :param load: when a step of the load came, in the first experiment [s]; its size and a small
+        shift of its time are estimated. None: none came.
     :param colour: of the noise; None: white.
     :param averaged: True: each sample is the mean of several.
     """
@@ -79,6 +81,7 @@ class Problem:
     weight: FloatArray | None = None
     past: bool = False
     unequal: bool = False
+    load: float | None = None
     colour: Colour | None = None
     averaged: bool = False
 
@@ -89,6 +92,12 @@ class Problem:
             not (u.times.size and u.times[0] <= self.time[part][0])
             for part, u in zip(self.experiments, self.inputs, strict=True)
         )
+
+    @property
+    def shortest(self) -> float:
+        """Typical time between samples [s]."""
+        gaps = np.diff(self.time)
+        return float(np.median(gaps[gaps > 0.0]))
 
     @property
     def acts_both_ways(self) -> bool:
@@ -169,6 +178,12 @@ class Problem:
             )
             own = np.concatenate((own, folded))
             own_by_theta = np.concatenate((own_by_theta, folded_by_theta), axis=1)
+        if self.load is not None:
+            for pulse in (math.inf, self.shortest):
+                step = _pulse(self.load, pulse)
+                felt, felt_by_theta = columns_of(self.structure, theta, time, step)
+                own = np.concatenate((own, felt))
+                own_by_theta = np.concatenate((own_by_theta, felt_by_theta), axis=1)
         rest = np.ones((1 + self.drift, time.size))
         if self.drift:
             rest[1] = (time - time.mean()) / np.ptp(time)
@@ -210,6 +225,13 @@ class Problem:
         for part, step in zip(parts, steps, strict=True):
             chosen[part][::step] = True
         return self.part(chosen)
+
+
+def _pulse(begin: float, length: float) -> PiecewiseConstant:
+    """Return a unit step, or a pulse that ends after a while."""
+    if math.isinf(length):
+        return PiecewiseConstant(np.array([begin]), np.ones(1), 0.0)
+    return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)
 
 
 def _folded(u: Input) -> PiecewiseConstant:
