@@ -30,6 +30,8 @@ from relay_autotune.verdict import Check, Measured
 _FREQUENCIES = 300
 # Ms over the asked one from which gains are bad on a model.
 _FAR_ABOVE = 1.25
+# The same for a half of a record, which tells less: it has to contradict the gains.
+_IN_HALF = 2.0
 
 
 def _fed_back(evidence: Evidence) -> Measured | None:
@@ -102,22 +104,24 @@ def _visible(evidence: Evidence) -> Measured | None:
 
 def _risk(evidence: Evidence) -> Measured | None:
     loop, draws = evidence.loop, evidence.found.draws
-    return Measured(_bad(loop, draws)) if loop is not None and draws else None
+    return Measured(_bad(loop, draws, _FAR_ABOVE)) if loop is not None and draws else None
 
 
-def _bad(loop: Loop, models: Sequence[TransferFunction]) -> float:
-    """Return the share of models on which gains are unstable, or Ms is far above what was asked.
+def _bad(loop: Loop, models: Sequence[TransferFunction], times: float) -> float:
+    """Return the share of models on which gains are unstable, or Ms is that many times the asked.
 
     A process of the other direction makes the loop unstable.
     """
-    return float(np.mean(loop.ms_of(models) > _FAR_ABOVE * loop.asked))
+    return float(np.mean(loop.ms_of(models) > times * loop.asked))
 
 
 def _halves(evidence: Evidence) -> Measured | None:
     loop, halves = evidence.loop, evidence.found.halves
     if loop is None or not halves:
         return None
-    share, part = max(((_bad(loop, part.models), part) for part in halves), key=lambda f: f[0])
+    share, part = max(
+        ((_bad(loop, part.models, _IN_HALF), part) for part in halves), key=lambda f: f[0]
+    )
     return Measured(share, part.span)
 
 
@@ -285,7 +289,8 @@ LOOP_CHECKS = (
     Check(
         name="halves",
         title="Halves",
-        what="the same share of the models that one half of the record allows",
+        what="share of the models that one half of the record allows on which the gains are "
+        "unstable or have an Ms of more than twice what was asked",
         unit="",
         doubtful=0.9,
         sentence="{detail} of the record alone shows another process: on {value} of its models "

@@ -82,8 +82,8 @@ _NO_PROMISE = 6.0
 _CLEAN = 1e-6
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "load")
-# Instants at which a load is tried, and steps towards the best one.
-_INSTANTS, _STEPS_IN_TIME = 60, 4
+# Steps of a fit with a further term; instants at which a load is tried, and steps to the best.
+_STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 # Structures that are fitted to the end, whatever residual they leave.
 _ALWAYS = (FOPDT.name, IPDT.name)
 
@@ -238,26 +238,26 @@ class FitContext:
         :param candidate: in white noise.
         """
         found = []
-        for term in self.terms:
-            if getattr(candidate.problem, term) not in (False, None):
+        for terms in self.terms:
+            if all(getattr(candidate.problem, term) not in (False, None) for term in terms):
                 continue
-            if term == "relaxation" and not candidate.structure.factors:
+            if "relaxation" in terms and not candidate.structure.factors:
                 # The free state of an integrator is the offset.
                 continue
-            if term == "load":
+            if terms == ("load",):
                 problem, state = with_load(candidate.problem, candidate.state)
             else:
-                changed: dict[str, Any] = {term: True}
+                changed: dict[str, Any] = dict.fromkeys(terms, True)
                 problem = replace(candidate.problem, **changed)
-                state = refine(problem, candidate.state.theta, tolerance=TRIAL)
+                state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=_STEPS)
             other = self.candidate(problem, state)
             if other is not None:
                 found.append(other)
         return found
 
     @cached_property
-    def terms(self) -> list[str]:
-        """Names of the terms beside the model that the record may need."""
+    def terms(self) -> list[tuple[str, ...]]:
+        """Names of the terms beside the model that the record may need, alone or together."""
         rested = needs_no_past(self.problem, self.sign)
         needed = {
             "drift": True,
@@ -267,7 +267,9 @@ class FitContext:
             # Between a few steps, a load cannot be told from a slow disturbance.
             "load": self.held and len(self.problem.bounds) == 1,
         }
-        return [term for term in TERMS if needed[term]]
+        alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
+        # Of a movement before the record, either part alone may explain nothing.
+        return [*alone, ("relaxation", "past")] if needed["past"] else alone
 
     def with_nuisances_of(self, candidate: Candidate) -> FitContext:
         """Return the context with the terms beside the model of a candidate.
@@ -401,7 +403,7 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     theta = state.theta
     for _ in range(_STEPS_IN_TIME):
         loaded = replace(problem, load=load)
-        found = refine(loaded, theta, tolerance=TRIAL)
+        found = refine(loaded, theta, tolerance=TRIAL, most=_STEPS)
         theta = found.theta
         step, pulse = found.coefficients[[-2 * own - 1 - problem.drift, -own - 1 - problem.drift]]
         shift = -float(pulse / step) * problem.shortest if step else 0.0

@@ -21,6 +21,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
     TERMS,
+    TRIAL,
     Candidate,
     FitContext,
     drop_first_dead_time,
@@ -100,12 +101,9 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     """
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known)
-    if found and found[0].problem.colour is None and few.problem.time.size < problem.time.size:
-        dense = problem.thinned(_MOST_WHITE)
-        if dense.time.size > few.problem.time.size:
-            again = _compared(FitContext.of(dense, sign, held=held), known)
-            if again and again[0].problem.colour is None:
-                found = again
+    dense = problem.thinned(_MOST_WHITE)
+    if found and found[0].problem.colour is None and dense.time.size > few.problem.time.size:
+        found = _on_more_samples(replace(few, problem=dense), found)
     for candidate in _by_rank(found):
         fit = _finished(candidate, found, problem, scale)
         if fit is not None and (known.structure or responds(fit.problem, fit.state)):
@@ -118,6 +116,24 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     raise IdentificationError(NO_RESPONSE)
 
 
+def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
+    """Return candidates fitted to more samples, unless these are correlated.
+
+    :param context: of all samples.
+    :param found: fitted to some of them in white noise, the best first.
+    """
+    again = []
+    for c in found:
+        if c.score <= found[0].score + _HOPELESS:
+            terms = {term: getattr(c.problem, term) for term in TERMS}
+            problem = replace(context.problem, structure=c.structure, **terms)
+            problem = drop_first_dead_time(problem, c.state)
+            state = refine(problem, c.state.theta, tolerance=TRIAL, most=_STEPS)
+            again.append(context.candidate(problem, state))
+    dense = sorted((c for c in again if c is not None), key=lambda c: c.score)
+    return dense if dense and _colour(dense[0].problem, dense[0].state) is None else found
+
+
 def responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
     """Return whether a fit explains more than its parameters cost, beside drift and the like.
 
@@ -126,7 +142,8 @@ def responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
     :param evidence: by how much more, in units of the score.
     """
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
-    nuisance = state.columns[len(problem.structure.powers) :]
+    beside = replace(problem, unequal=False)
+    nuisance = beside.seen(beside.columns(state.theta)[0][len(problem.structure.powers) :])
     left = left_of(problem.seen(problem.y), nuisance)
     without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
     return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
@@ -178,12 +195,15 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candida
     They are added one after the other, each time the one that improves the score most in the
     colour of its own residual.
     """
+    ranked = sorted(found, key=lambda c: c.score)
+    # A command off the balance of an integrator looks like a drift.
+    starts = ranked[:1] + [c for c in ranked[1:] if c.structure == IPDT]
     best = min((_in_own_colour(context, c) for c in found), key=lambda c: c.score)
-    for start in found:
+    for start in starts:
         now, score = start, _in_own_colour(context, start).score
         while more := context.with_one_more_term(now):
-            ranked = [(_in_own_colour(context, c), c) for c in more]
-            coloured, plain = min(ranked, key=lambda r: r[0].score)
+            pairs = [(_in_own_colour(context, c), c) for c in more]
+            coloured, plain = min(pairs, key=lambda r: r[0].score)
             if coloured.score >= score:
                 break
             now, score = plain, coloured.score

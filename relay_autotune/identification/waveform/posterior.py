@@ -40,7 +40,7 @@ _FEWEST = 24
 _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
 # Standard deviations of the prior: of logarithms of times, of a gain relative to its value, of a
 # dead time relative to all times together.
-_TIMES, _GAIN, _DEAD_TIME = 1.0, 2.0, 1.0
+_TIMES, _GAIN, _DEAD_TIME = 1.0, 0.5, 1.0
 DRAWS = 100
 _DRAWS_OF_HALF = 40
 _FARTHEST = 20.0
