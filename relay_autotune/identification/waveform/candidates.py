@@ -92,6 +92,8 @@ _ALWAYS = (FOPDT.name, IPDT.name)
 IMITATES_A_DRIFT = 10.0
 # Longest lag in lengths of the record: a longer one acts as an integrator.
 _LASTING = 2.0
+# Longest dead time in lengths of the record: a later response cannot be told from a drift.
+_LATE = 0.25
 
 # A structure, and the first trials of its fit.
 _Begun = tuple[Structure, list[Trial]]
@@ -229,7 +231,8 @@ class FitContext:
         if not self.held:
             # A relay bounds an integrator and what grows by itself, and shows both.
             lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
-            imitations += lasting or not model.is_stable
+            late = model.dead_time > _LATE * self.length
+            imitations += lasting or late or not model.is_stable
         return score + IMITATES_A_DRIFT * imitations
 
     def with_one_more_term(self, candidate: Candidate) -> list[Candidate]:
@@ -250,6 +253,10 @@ class FitContext:
                 changed: dict[str, Any] = dict.fromkeys(terms, True)
                 problem = replace(candidate.problem, **changed)
                 state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=_STEPS)
+                if candidate.structure == FOPDT and "past" in terms:
+                    # Without it, another dead time may have stood for what came before.
+                    anew = refine_best(problem, start_fopdt(problem, self.sign), tolerance=TRIAL)
+                    state = min(state, anew, key=lambda s: s.cost)
             other = self.candidate(problem, state)
             if other is not None:
                 found.append(other)

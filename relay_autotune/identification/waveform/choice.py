@@ -197,7 +197,7 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candida
     """
     ranked = sorted(found, key=lambda c: c.score)
     # A command off the balance of an integrator looks like a drift.
-    starts = ranked[:1] + [c for c in ranked[1:] if c.structure == IPDT]
+    starts = ranked[:1] + [c for c in ranked[1:] if c.structure in (FOPDT, IPDT)]
     best = min((_in_own_colour(context, c) for c in found), key=lambda c: c.score)
     for start in starts:
         now, score = start, _in_own_colour(context, start).score
