@@ -266,6 +266,8 @@ class Identification:
     # Models that the record allows, of either direction, each as likely as the others; empty: the
     # method knows the covariance alone. And those that each half of it allows by itself.
     draws: tuple[TransferFunction, ...] = ()
+    # How strongly commands above and below the first one act, relative to the model.
+    effects: tuple[float, float] = (1.0, 1.0)
     halves: tuple[Part, ...] = ()
 
     def __repr__(self) -> str:

@@ -67,7 +67,7 @@ def _fit_of(structure: Structure, theta: np.ndarray, noise: float) -> Identifica
     error = noise * np.random.default_rng(4).standard_normal(run.time.size)
     problem = problem_of([(run.time, run.measurement + error, run.command)], structure)
     state = evaluate(problem, theta)
-    estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise(True))
+    estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise())
     assert estimate is not None
     return identified("waveform", estimate)
 

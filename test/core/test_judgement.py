@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,15 +16,14 @@ from relay_autotune.analysis import analyse, analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import (
-    followed_changes,
-    followed_share,
     lost_effect,
+    read_backward,
 )
 from relay_autotune.identification.judgement.evidence import Evidence, Loop, visible_error
-from relay_autotune.identification.judgement.refits import Part, halves, plain_models
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
+from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.rational import theta_of
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
@@ -55,7 +53,7 @@ def other_model(found, model):
 
 def findings(record, model, gains, **more):
     found = other_model(identify(record, "waveform"), model)
-    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms, gains.ms_95)
+    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms)
     evidence = Evidence(record, found, loop=loop, **more)
     return {f.name: f for f in judge(CHECKS, evidence)}
 
@@ -112,18 +110,15 @@ def test_a_model_that_would_have_run_away_is_refused(record, gains):
     assert "growth" not in findings(record, PROCESS, gains)
 
 
-@pytest.mark.long
-def test_a_rival_on_which_the_loop_is_unstable_makes_gains_doubtful(record, gains):
-    own = identify(record, "waveform")
-    same = findings(record, own.model, gains, others=(own,))["rivals"]
-    assert same.value == pytest.approx(1.0, abs=0.1)
-    other = other_model(own, TransferFunction.fopdt(-2.0, 10.0, 3.0))
-    found = findings(record, own.model, gains, others=(other,))["rivals"]
-    assert found.value == np.inf
-    assert found.result is Result.DOUBTFUL
-    # What explains the record less well is no rival.
-    worse = replace(other, fit=replace(own.fit, residual_rms=2.0 * own.fit.residual_rms))
-    assert findings(record, own.model, gains, others=(worse,))["rivals"].result is Result.PASSED
+@pytest.mark.parametrize(
+    ("bad", "result"), [(0, Result.PASSED), (20, Result.DOUBTFUL), (60, Result.FAILED)]
+)
+def test_models_on_which_the_loop_is_unstable_are_the_risk(record, gains, bad, result):
+    found = identify(record, "waveform")
+    other = TransferFunction.fopdt(20.0, 10.0, 3.0)
+    found = replace(found, draws=(PROCESS,) * (100 - bad) + (other,) * bad)
+    risk = of_checks(record, found, gains)["risk"]
+    assert (risk.value, risk.result) == (bad / 100, result)
 
 
 @pytest.mark.long
@@ -188,92 +183,89 @@ def fitted_as(model, record):
 
 
 def of_checks(record, found, gains, **more):
-    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms, gains.ms_95)
+    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms)
     evidence = Evidence(record, found, loop=loop, **more)
     return {f.name: f for f in judge(CHECKS, evidence)}
 
 
+def in_halves(record):
+    return identify(record, "waveform", Known(structure="fopdt"))
+
+
 @pytest.mark.long
 def test_each_half_of_a_record_tells_its_own_process():
-    other = TransferFunction.fopdt(6.0, 10.0, 6.0)
-    record = joined(PROCESS, other)
-    early, late = halves(fitted_as(PROCESS, record), record)
+    other = TransferFunction.fopdt(5.0, 10.0, 5.0)
+    early, late = in_halves(joined(PROCESS, other)).halves
     for part, process in ((early, PROCESS), (late, other)):
         for value, truth in (
             ([m.gain for m in part.models], process.gain),
             ([m.dead_time for m in part.models], process.dead_time),
         ):
-            assert np.median(value) == pytest.approx(truth, rel=0.1)
+            assert np.median(value) == pytest.approx(truth, rel=0.2)
 
 
 @pytest.mark.long
-def test_gains_that_do_not_hold_on_one_half_are_doubtful(gains):
-    other = TransferFunction.fopdt(6.0, 10.0, 6.0)
-    assert ms_on(gains, other) == np.inf
-    record = joined(PROCESS, other)
-    found = of_checks(record, fitted_as(PROCESS, record), gains)["halves"]
-    assert found.result is Result.DOUBTFUL
-    same = joined(PROCESS, PROCESS)
-    found = of_checks(same, fitted_as(PROCESS, same), gains)["halves"]
-    assert found.value == pytest.approx(1.0, abs=0.1)
+def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
+    found = in_halves(joined(PROCESS, TransferFunction.fopdt(5.0, 10.0, 5.0)))
+    gains = [m.gain for m in found.draws]
+    assert min(gains) < 2.5
+    assert max(gains) > 4.0
+    assert any("two halves of the record" in text for text in found.warnings)
+    same = in_halves(joined(PROCESS, PROCESS))
+    assert not any("two halves of the record" in text for text in same.warnings)
+
+
+def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
+    found = identify(record, "waveform")
+    other = TransferFunction.fopdt(20.0, 10.0, 3.0)
+    halves = (Part(0.0, 100.0, (PROCESS,) * 40), Part(100.0, 200.0, (other,) * 40))
+    said = of_checks(record, replace(found, halves=halves), gains)["halves"]
+    assert said.result is Result.DOUBTFUL
+    assert "100 s to 200 s" in said.sentence
+    assert of_checks(record, replace(found, halves=halves[:1]), gains)["halves"].value == 0.0
+    assert "halves" not in of_checks(record, replace(found, halves=()), gains)
+
+
+@pytest.mark.parametrize(
+    ("turned", "result"), [(10, Result.PASSED), (30, Result.DOUBTFUL), (40, Result.FAILED)]
+)
+def test_a_half_that_works_in_the_other_direction_gives_no_gains(record, gains, turned, result):
+    other = TransferFunction.fopdt(-2.0, 10.0, 3.0)
+    half = Part(0.0, 100.0, (other,) * turned + (PROCESS,) * (40 - turned))
+    found = replace(identify(record, "waveform"), halves=(half,))
+    assert of_checks(record, found, gains)["direction"].result is result
 
 
 @pytest.mark.long
-def test_a_half_that_works_in_the_other_direction_gives_no_gains(gains):
-    record = joined(PROCESS, TransferFunction.fopdt(-4.0, 10.0, 3.0))
-    found = of_checks(record, fitted_as(PROCESS, record), gains)["halves_direction"]
-    assert found.value == 1.0
-    assert found.result is Result.FAILED
-    same = joined(PROCESS, PROCESS)
-    assert of_checks(same, fitted_as(PROCESS, same), gains)["halves_direction"].value == 0.0
-
-
-@pytest.mark.long
-def test_a_half_that_shows_nothing_objects_to_nothing(gains):
+def test_a_half_that_shows_nothing_objects_to_nothing():
     # The noise of the first half is two hundred times that of the other.
     record = joined(PROCESS, PROCESS)
     noise = np.random.default_rng(9).normal(0.0, 4.0, len(record))
     noisy = replace(record, measurement=record.measurement + np.where(record.time < 260, noise, 0))
-    found = of_checks(noisy, fitted_as(PROCESS, noisy), gains)
-    assert found["halves"].result is Result.PASSED
-    assert found["halves_direction"].result is Result.PASSED
+    findings_of = {f.name: f for f in analyse_alone(noisy).judgement.findings}
+    assert findings_of["halves"].result is Result.PASSED
+    assert findings_of["direction"].result is Result.PASSED
 
 
 @pytest.mark.long
-def test_a_plain_model_that_explains_as_much_speaks_against_gains_of_another(record, gains):
-    weak = TransferFunction.fopdt(0.4, 10.0, 3.0)
-    strong = analyse_alone(steps(weak)).best_gains
-    truth = ms_on(strong, PROCESS) / strong.ms
-    found = of_checks(record, fitted_as(weak, record), strong)["plain"]
-    assert truth > 2.5
-    assert (found.value, found.result) == (pytest.approx(truth, rel=0.1), Result.DOUBTFUL)
-    assert of_checks(record, fitted_as(PROCESS, record), gains)["plain"].value == pytest.approx(
-        1.0, abs=0.05
-    )
+def test_no_draw_goes_beyond_what_the_samples_allow():
+    """A zero of a hundredth of the lag, of which a first-order covariance says next to nothing."""
+    process = TransferFunction.sopdt(0.8, (2.0, 0.4), 0.0)
+    record = steps(process, noise=0.05)
+    found = identify(record, "waveform", Known(structure="sopdt_zero"))
+    w = 1j * np.geomspace(0.05, 5.0, 30)
+    assert len(found.draws) > 50
+    for model in found.draws:
+        assert np.abs(model(w) / process(w) - 1.0).max() < 0.5
 
 
 @pytest.mark.long
-def test_a_plain_model_that_explains_less_is_not_asked():
-    # Two equal lags and a zero in the right half plane: a lag with dead time leaves a tenth.
-    inverse = TransferFunction(2.0, (-6.0,), (6.0, 6.0), 0, 1.0)
-    record = steps(inverse, noise=0.005)
-    assert plain_models(identify(record, "waveform"), record) == ()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("times", "spread", "result"),
-    [(0.5, 1.0, Result.PASSED), (3.0, 1.0, Result.DOUBTFUL), (30.0, 1.0, Result.FAILED)],
-)
-def test_a_time_beyond_the_record_counts_where_k_u_is_not_known(
-    record, gains, times, spread, result
-):
-    slow = TransferFunction.fopdt(2.0 * times, times * record.duration, 3.0)
-    found = fitted_as(slow, record)
-    open_gain = replace(found, ultimate_gain_std=spread * abs(found.ultimate_gain))
-    assert of_checks(record, open_gain, gains)["beyond_record"].result is result
-    known = replace(found, ultimate_gain_std=0.05 * abs(found.ultimate_gain))
-    assert "beyond_record" not in of_checks(record, known, gains)
+def test_the_draws_have_the_spread_of_the_covariance(record):
+    found = in_halves(record)
+    for name, of in (("dead_time", "dead_time"), ("gain", "gain")):
+        at = found.parameters.index(name)
+        drawn = np.std([getattr(m, of) for m in found.draws])
+        assert drawn == pytest.approx(found.std[at], rel=0.25)
 
 
 LEVELS = PiecewiseConstant(
@@ -307,20 +299,6 @@ def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
     assert lost_effect(replace(plain, held_input=three), PROCESS) is None
 
 
-@pytest.mark.parametrize(("worse", "share"), [(1.2, 1.0), (5.0, 0.8)])
-def test_a_half_that_explains_the_whole_far_worse_makes_its_direction_no_more_than_doubtful(
-    worse, share
-):
-    other = TransferFunction.fopdt(-2.0, 10.0, 3.0)
-    part = Part(0.0, 60.0, (other,) * 5, worse)
-    evidence = SimpleNamespace(
-        found=SimpleNamespace(model=PROCESS), halves=(Part(0.0, 60.0, (PROCESS,) * 5), part)
-    )
-    (check,) = [c for c in CHECKS if c.name == "halves_direction"]
-    assert check.measure(evidence).value == share
-    assert (share >= check.failed) is (worse < 3.0)
-
-
 def fed_back(process, gain, *, steps=2000):
     """Record a proportional controller beside noise at the process's input."""
     plant = VirtualProcess(process)
@@ -337,18 +315,32 @@ def fed_back(process, gain, *, steps=2000):
 @pytest.mark.long
 def test_a_controller_that_is_read_backward_gives_no_gains():
     record = fed_back(TransferFunction.fopdt(2.0, 4.0, 1.0), 1.5)
-    assert followed_share(record, -1) == pytest.approx(1.0)
-    # With the process's own sign the loop could run.
-    assert followed_share(record, 1) is None
-    inverse = analyse_alone(record)
-    assert inverse.best_gains is None or inverse.model.model.process_sign == 1
+    assert read_backward(record, TransferFunction(-1.0 / 1.5)) == pytest.approx(1.0, abs=0.01)
+    assert read_backward(record, TransferFunction.fopdt(2.0, 4.0, 1.0)) < 0.3
+    assert analyse_alone(record).best_gains is None
 
 
-def test_a_slow_command_that_the_process_follows_is_not_fed_back():
-    time = np.arange(0.0, 400.0, 0.5)
-    record = Record(time=time, measurement=np.zeros(time.size), command=np.sin(time / 40.0))
-    y = response(TransferFunction.fopdt(2.0, 1.0, 0.5), time, record.input())
-    assert followed_share(replace(record, measurement=y), 1) is None
+def test_a_controller_with_all_three_terms_is_read_backward():
+    rng = np.random.default_rng(11)
+    y = np.cumsum(rng.normal(0.0, 1.0, 2000))
+    law = -0.5 * y - 0.02 * np.cumsum(y) - 6.0 * np.diff(y, prepend=0.0)
+    record = Record(time=np.arange(2000.0), measurement=y, command=law)
+    # 1/C of the PID law, where its command has most power.
+    inverse = TransferFunction(-1.0 / 0.5, (), (12.0,), 0, 0.0)
+    assert read_backward(record, inverse) > 0.5
+
+
+@pytest.mark.parametrize("command", ["slow", "random"])
+def test_a_command_from_outside_is_not_fed_back(command):
+    """Nor is it where the process follows at once, so that its inverse explains the command."""
+    time = np.arange(0.0, 1500.0, 0.5)
+    random = np.random.default_rng(12).normal(0.0, 1.0, time.size)
+    u = np.sin(time / 40.0) if command == "slow" else random
+    process = TransferFunction.fopdt(2.0, 1.0, 0.5)
+    record = Record(time=time, measurement=np.zeros(time.size), command=u)
+    y = response(process, time, record.input())
+    y = y + np.random.default_rng(13).normal(0.0, 0.01, time.size)
+    assert read_backward(replace(record, measurement=y), process) < 0.3
 
 
 @pytest.mark.long
@@ -405,33 +397,3 @@ def test_a_model_of_less_than_half_of_the_record_is_doubtful(record, gains, shar
     of_part = of_checks(record, replace(found, fitted=fitted), gains)["left_out"]
     assert of_part.result is result
     assert of_part.value == pytest.approx(share, abs=0.01)
-
-
-def test_a_command_that_follows_the_changes_at_once_is_a_controller_with_derivative():
-    rng = np.random.default_rng(11)
-    y = np.cumsum(rng.normal(0.0, 1.0, 2000))
-    law = 0.5 * y + 0.02 * np.cumsum(y) + 6.0 * np.diff(y, prepend=0.0)
-    record = Record(time=np.arange(2000.0), measurement=y, command=law)
-    assert followed_changes(record, 1) > 0.5
-    assert followed_changes(record, -1) is None
-
-
-def test_a_process_that_is_moved_at_random_does_not_lead_its_command():
-    rng = np.random.default_rng(12)
-    time, u = np.arange(3000.0), rng.normal(0.0, 1.0, 3000)
-    y = response(TransferFunction.fopdt(2.0, 3.0, 0.5), time, PiecewiseConstant(time, u, 0.0))
-    record = Record(time=time, measurement=y, command=u)
-    share = followed_changes(record, 1)
-    assert share is None or share < 0.05
-
-
-def test_a_rival_of_the_other_direction_leaves_no_gains():
-    (check,) = (check for check in CHECKS if check.name == "rival_direction")
-    up, down = (TransferFunction.fopdt(gain, 20.0, 5.0) for gain in (1.0, -1.0))
-    found = SimpleNamespace(model=up)
-    finding = check(SimpleNamespace(found=found, rivals=(up,), plain=(down,)))
-    assert finding.result is Result.FAILED
-    assert "moves the measurement the other way" in finding.sentence
-    alike = check(SimpleNamespace(found=found, rivals=(up,), plain=()))
-    assert alike.result is Result.PASSED
-    assert check(SimpleNamespace(found=found, rivals=(), plain=())) is None

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.waveform.candidates import support
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.rational import (
     columns_of,
@@ -20,7 +21,6 @@ from relay_autotune.identification.waveform.rational import (
     partial_fractions,
     responses,
 )
-from relay_autotune.identification.waveform.candidates import support
 from relay_autotune.identification.waveform.starts import is_unseen
 from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response

@@ -17,12 +17,10 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
-from relay_autotune.identification.waveform.separable import problem_of
+from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
-from relay_autotune.process.structures import TABLE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
@@ -280,17 +278,6 @@ def test_ljung_box_is_uniform_for_white_noise_and_small_for_coloured():
     coloured = np.convolve(rng.standard_normal(500), [1.0, 0.8, 0.5])
     assert ljung_box(coloured) < 1e-6
     assert math.isnan(ljung_box(np.array([1.0, 2.0])))
-
-
-def test_the_long_run_variance_of_coloured_noise():
-    # An AR(1) process of coefficient a has the long-run variance 1/(1 - a)^2.
-    rng = np.random.default_rng(4)
-    e = rng.standard_normal(200_000)
-    from scipy.signal import lfilter
-
-    x = lfilter([1.0], [1.0, -0.7], e)
-    meat = covariance_meat(x[None, :], x)[0, 0] / x.size
-    assert meat == pytest.approx(1.0 / 0.3**2, rel=0.25)
 
 
 def test_spikes_of_the_sensor_are_left_out_and_told():

@@ -40,50 +40,6 @@ _BUT_FEW, _OWN = (1.0, 99.0), 0.2
 _PAST, _MOST_CHANGES = 3, 20_000
 
 
-def unequal_gains(
-    record: Record, model: TransferFunction, fitted: FloatArray | None = None
-) -> str | None:
-    """Say whether the process answers commands above and below the baseline differently.
-
-    The response to the part of the command above the baseline and to the part below it get a
-    gain each, in the least-squares sense, beside an offset, a drift, and what was fitted beside
-    the response to the command, such as the way back to rest after a wrong baseline. A heater that
-    heats faster than the room cools has two gains that differ.
-
-    :param record: the record, with the relay's settings.
-    :param model: the model fitted to it, with a stable or integrating process.
-    :param fitted: the fitted measurement at the samples [y], shape (n,), NaN where there is none;
-        None: nothing was fitted beside the response.
-    :return: a sentence, or None where the two agree, or cannot be told apart.
-    """
-    settings = record.settings
-    if settings is None or model.grows:
-        return None
-    u = record.input()
-    if u.initial != settings.baseline:
-        # With two levels alone, each part is the other one scaled and shifted.
-        return None
-    parts = []
-    for keep in (np.maximum, np.minimum):
-        values = keep(u.values - settings.baseline, 0.0)
-        initial = float(keep(u.initial - settings.baseline, 0.0))
-        if not bool(np.any(values)):
-            return None
-        parts.append(response(model, record.time, PiecewiseConstant(u.times, values, initial)))
-    beside = () if fitted is None else (fitted - response(model, record.time, u),)
-    (above, below), covariance = _factors(record, parts, beside)
-    contrast = np.array((1.0, -1.0))
-    uncertainty = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
-    difference = abs(above - below)
-    if difference <= max(_SURE * uncertainty, _LEAST_ASYMMETRY):
-        return None
-    return (
-        f"commands above the baseline act {above:.2f} times as strongly as in the model, those "
-        f"below it {below:.2f} times: the process is not linear, and one set of gains is a "
-        "compromise; the weaker direction sets how fast the loop can be"
-    )
-
-
 def lost_effect(
     record: Record, model: TransferFunction, fitted: FloatArray | None = None
 ) -> tuple[float, float] | None:

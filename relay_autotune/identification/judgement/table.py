@@ -142,9 +142,13 @@ def _left_out(evidence: Evidence) -> Measured | None:
 
 
 def _clipped(evidence: Evidence) -> Measured | None:
-    model, fitted = evidence.found.model, evidence.found.fitted
-    found = lost_effect(evidence.record, model, fitted)
-    return None if found is None else Measured(found[0], f"{found[1]:.4g}")
+    found, record = evidence.found, evidence.record
+    weak, strong = sorted(found.effects)
+    if weak < strong:
+        # Estimated with the model, about the first level.
+        return Measured(1.0 - weak / strong, f"{record.input().initial:.4g}")
+    lost = lost_effect(record, found.model, found.fitted)
+    return None if lost is None else Measured(lost[0], f"{lost[1]:.4g}")
 
 
 MODEL_CHECKS = (

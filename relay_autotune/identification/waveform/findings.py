@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.checks import disagreeing_point, unequal_gains
+from relay_autotune.identification.judgement.checks import disagreeing_point
 from relay_autotune.identification.result import (
     NOT_AT_REST,
     FitReport,
@@ -37,7 +37,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
     noise_inflation,
     raw_residual,
 )
-from relay_autotune.identification.waveform.posterior import posterior
+from relay_autotune.identification.waveform.posterior import effects, posterior
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
@@ -173,15 +173,12 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         fitted=_fitted(records, fit, residual),
     )
     gain_std = found.ultimate_gain_std / abs(found.ultimate_gain)
-    curves = (found.fitted, *[None] * (len(records) - 1))
-    notes = [
-        note
-        for record, curve in zip(records, curves, strict=True)
-        for note in _checks(record, found, gain_std, curve)
-    ]
-    found = replace(found, warnings=(*found.warnings, *dict.fromkeys(notes)))
+    notes = [disagreeing_point(record, found.model, gain_std) for record in records]
+    found = replace(found, warnings=(*found.warnings, *dict.fromkeys(n for n in notes if n)))
     found = _beside_rivals(found, fit, shares, noise)
-    found = replace(found, draws=allowed.models, halves=allowed.halves)
+    found = replace(
+        found, draws=allowed.models, halves=allowed.halves, effects=effects(problem, state)
+    )
     if allowed.temper > 1.0:
         told = (
             f"two halves of the record give models that differ {math.sqrt(allowed.temper):.2g} "
@@ -221,16 +218,6 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
     used = problem.index[own]
     fitted[used] = record.measurement[used] - scale * residual[own]
     return fitted
-
-
-def _checks(
-    record: Record, found: Identification, gain_std: float, fitted: FloatArray | None
-) -> list[str]:
-    notes = (
-        unequal_gains(record, found.model, fitted),
-        disagreeing_point(record, found.model, gain_std),
-    )
-    return [note for note in notes if note]
 
 
 def _beside_rivals(
@@ -347,6 +334,13 @@ def _warnings(
             found.append(
                 f"{which}{record.lost_samples} samples were lost on the way; check the network"
             )
+    if fit.problem.unequal:
+        above, below = effects(fit.problem, fit.state)
+        found.append(
+            f"commands above the first one act {above:.2f} times as strongly as in the model, "
+            f"those below it {below:.2f} times: the process is not linear, and the gains hold on "
+            "both sides; the weaker direction sets how fast the loop can be"
+        )
     if fit.problem.load is not None:
         own = len(fit.problem.structure.powers)
         size = fit.state.coefficients[-2 * own - 1 - fit.problem.drift] / fit.state.coefficients[0]
