@@ -297,6 +297,7 @@ LOOP_CHECKS = (
         "unstable or have an Ms of more than twice what was asked",
         unit="",
         doubtful=0.9,
+        failed=0.95,
         sentence="{detail} of the record alone shows another process: on {value} of its models "
         "the loop is unstable or nearly so",
         remedy="see whether load, operating point or other inputs changed, and record again",

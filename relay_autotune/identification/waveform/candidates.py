@@ -26,6 +26,7 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     information_criterion,
+    left_beside,
     left_of,
     refine,
 )
@@ -94,6 +95,8 @@ IMITATES_A_DRIFT = 10.0
 _LASTING = 2.0
 # Longest dead time in lengths of the record: a later response cannot be told from a drift.
 _LATE = 0.25
+# Largest share that a FOPDT leaves unexplained which shows the direction of the process.
+_NEARLY_ALL = 0.1
 
 # A structure, and the first trials of its fit.
 _Begun = tuple[Structure, list[Trial]]
@@ -197,6 +200,18 @@ class FitContext:
         return latest_dead_times(self.problem, self.sign)
 
     @cached_property
+    def plain_sign(self) -> int:
+        """Direction of the FOPDT where it explains nearly all; 0: it does not.
+
+        A zero, and an integrator beside a drift, follow a slow disturbance with a gain of either
+        sign.
+        """
+        left, total = left_beside(self.problem, self.fopdt)
+        if float(left @ left) > _NEARLY_ALL * float(total @ total):
+            return 0
+        return 1 if self.fopdt.coefficients[0] > 0.0 else -1
+
+    @cached_property
     def pushed(self) -> float:
         """Longest time for which the command acted in one direction [s]; infinite for a relay."""
         if self.sign:
@@ -232,7 +247,8 @@ class FitContext:
             # A relay bounds an integrator and what grows by itself, and shows both.
             lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
             late = model.dead_time > _LATE * self.length
-            imitations += lasting or late or not model.is_stable
+            turned = model.process_sign * self.plain_sign < 0
+            imitations += lasting or late or turned or not model.is_stable
         return score + IMITATES_A_DRIFT * imitations
 
     def with_one_more_term(self, candidate: Candidate) -> list[Candidate]:

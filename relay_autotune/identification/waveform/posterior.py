@@ -49,10 +49,8 @@ _EXCLUDED, _TRIES = 1e-3, 4
 # Draws of each half that differs, and copies of each plain model: more than the share that no
 # promise of the design holds on.
 _SHARE = DRAWS // 10
-# Largest excess of a plain structure's residual over a richer one's, as a share of the spread.
+# Largest excess of another model's residual over the chosen one's, as a share of the spread.
 _AS_WELL = 0.02
-# Candidates of less support have no draw.
-_LEAST_SUPPORT = 0.5 / DRAWS
 # Mean square of two standardised deviations that 99 % of equal halves do not exceed.
 _BY_CHANCE = 4.6
 
@@ -84,6 +82,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     own = fit.candidates[0]
     halves = _halves(fit, inflation, rng)
     temper = max(_apart(halves, frequency) / _BY_CHANCE, 1.0)
+    most = _most_left(fit)
     models: list[TransferFunction] = []
     for candidate, share in zip(fit.candidates, shares, strict=True):
         # The chosen one was fitted to the end.
@@ -91,7 +90,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
             (fit.problem, fit.state) if candidate is own else (candidate.problem, candidate.state)
         )
         count = round(DRAWS * share)
-        if share >= _LEAST_SUPPORT and count:
+        if count and (candidate is own or _left(problem, state)[0] <= most):
             models += _draws(problem, state, fit.scale, inflation * temper, count, rng)
     if temper > 1.0:
         # The process changed from one half to the other: both are among the models.
@@ -122,18 +121,29 @@ def _plain(fit: Fit) -> list[TransferFunction]:
     """
     if fit.problem.colour is None:
         return []
-    left, total = left_beside(replace(fit.problem, colour=None), fit.state)
-    most = math.sqrt(float(left @ left)) + _AS_WELL * math.sqrt(float(total @ total))
-    found = []
+    most, found = _most_left(fit), []
     for candidate in fit.candidates:
         if candidate.structure.name not in PLAIN:
             continue
         problem = replace(candidate.problem, colour=None)
         state = refine(problem, candidate.state.theta, tolerance=TRIAL)
         model = problem.structure.model_at(state.theta, fit.scale * state.coefficients)
-        if model is not None and math.sqrt(state.cost) <= most:
+        if model is not None and math.sqrt(state.cost / state.residual.size) <= most:
             found.append(model)
     return found
+
+
+def _left(problem: Problem, state: Trial) -> tuple[float, float]:
+    """Return the rms that a model leaves in simulation, and that of what is to be explained."""
+    parts = left_beside(replace(problem, colour=None), state)
+    left, total = (math.sqrt(float(np.mean(part**2))) for part in parts)
+    return left, total
+
+
+def _most_left(fit: Fit) -> float:
+    """Return the largest rms of a model that simulates a record as well as the chosen one."""
+    left, total = _left(fit.problem, fit.state)
+    return left + _AS_WELL * total
 
 
 def _draws(
