@@ -249,6 +249,8 @@ class FitContext:
             late = model.dead_time > _LATE * self.length
             turned = model.process_sign * self.plain_sign < 0
             imitations += lasting or late or turned or not model.is_stable
+            # The free rate of an integrator is what a free state is to a lag: one imitation.
+            imitations -= problem.drift and model.integrators > 0
         return score + IMITATES_A_DRIFT * imitations
 
     def with_one_more_term(self, candidate: Candidate) -> list[Candidate]:

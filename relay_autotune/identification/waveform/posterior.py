@@ -247,22 +247,36 @@ def _allowed(
     deviation = np.concatenate((weak, np.full(theta.size - 1, _TIMES), [_DEAD_TIME * slow]))
     if not np.all(deviation > 0.0):
         return ()
-    precision = 1.0 / deviation**2
 
     def variance_of(left: FloatArray) -> float:
         return max(inflation * float(left @ left) / left.size, NEGLIGIBLE**2)
 
     def cost_at(point: FloatArray) -> float:
         left, _ = _linearised(problem, point, gain.size)
-        return float(left @ left) / variance + float(precision @ (point - known) ** 2)
+        return float(left @ left) / variance + float(np.sum(((point - known) / deviation) ** 2))
+
+    def axes_at() -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return singular values of the slopes in units of prior and noise, and their axes."""
+        scaled = jacobian * (deviation / math.sqrt(variance))[:, None]
+        axes, values, rows = np.linalg.svd(scaled, full_matrices=False)
+        return axes, values, rows
 
     at = known
     left, jacobian = _linearised(problem, at, gain.size)
     variance = variance_of(left)
-    cost = float(left @ left) / variance
+    cost = cost_at(at)
+    # The best fit without the prior may be nearer, but also run off where samples tell little.
+    own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
+    elsewhere = _bounded(np.concatenate((own.coefficients[: gain.size], own.theta)))
+    if cost_at(elsewhere) < cost:
+        at = elsewhere
+        left, jacobian = _linearised(problem, at, gain.size)
+        variance = variance_of(left)
+        cost = cost_at(at)
     for _ in range(_STEPS):
-        normal = jacobian @ jacobian.T / variance + np.diag(precision)
-        step = np.linalg.solve(normal, jacobian @ left / variance - precision * (at - known))
+        axes, values, rows = axes_at()
+        along = values * (rows @ left) / math.sqrt(variance) - axes.T @ ((at - known) / deviation)
+        step = deviation * (axes @ (along / (1.0 + values**2)))
         for _ in range(_HALVINGS):
             trial = _bounded(at + step)
             now = cost_at(trial)
@@ -277,15 +291,14 @@ def _allowed(
         cost = cost_at(at)
         if gained < _SETTLED * cost:
             break
-    normal = jacobian @ jacobian.T / variance + np.diag(precision)
-    # In units of the prior, so that the root has no small numbers.
-    root = np.linalg.cholesky(np.linalg.inv(normal * np.outer(deviation, deviation)))
+    axes, values, _ = axes_at()
+    root = axes / np.sqrt(1.0 + values**2)
     farthest = 2.0 * float(gammaincinv(0.5 * at.size, 1.0 - _EXCLUDED))
     models: list[TransferFunction] = []
     for _ in range(_TRIES * count):
         if len(models) == count:
             break
-        drawn = _bounded(at + deviation * (root @ rng.standard_normal(at.size)))
+        drawn = _bounded(at + deviation * (root @ rng.standard_normal(values.size)))
         if cost_at(drawn) - cost > farthest:
             continue
         try:
