@@ -216,7 +216,8 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
 def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
     found = identify(record, "waveform")
     other = TransferFunction.fopdt(20.0, 10.0, 3.0)
-    halves = (Part(0.0, 100.0, (PROCESS,) * 40), Part(100.0, 200.0, (other,) * 40))
+    late = (other,) * 37 + (PROCESS,) * 3
+    halves = (Part(0.0, 100.0, (PROCESS,) * 40), Part(100.0, 200.0, late))
     said = of_checks(record, replace(found, halves=halves), gains)["halves"]
     assert said.result is Result.DOUBTFUL
     assert "100 s to 200 s" in said.sentence

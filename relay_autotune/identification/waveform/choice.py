@@ -176,39 +176,47 @@ def _compared(context: FitContext, known: Known) -> list[Candidate]:
     simple = context.fit(names if known.structure else _SIMPLE, known.order)
     if not simple:
         return []
+    found: list[Candidate] = []
+    tried: set[tuple[bool, ...]] = set()
     decided = _with_best_terms(context, simple)
-    found = _of_all(context.with_nuisances_of(decided), names, known, simple)
-    if not found or known.structure:
-        return found
-    again = _with_best_terms(context, [context.refit(found[0], None, _STEPS) or found[0]])
-    if again.score < decided.score and nuisances_of(again.problem) != nuisances_of(
-        decided.problem
-    ):
-        other = _of_all(context.with_nuisances_of(again), names, known, simple)
-        return min(found, other, key=lambda f: f[0].score if f else math.inf)
+    while decided:
+        for each in decided:
+            if nuisances_of(each.problem) not in tried:
+                tried.add(nuisances_of(each.problem))
+                other = _of_all(context.with_nuisances_of(each), names, known, simple)
+                if not found or (other and other[0].score < found[0].score):
+                    found = other
+        if not found or known.structure:
+            break
+        # The best structure of all may need others than the simple ones.
+        again = _with_best_terms(context, [context.refit(found[0], None, _STEPS) or found[0]])
+        decided = [
+            c for c in again if c.score < found[0].score and nuisances_of(c.problem) not in tried
+        ]
     return found
 
 
-def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candidate:
-    """Return the candidate of the best score, with the terms beside the model that improve it.
+def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> list[Candidate]:
+    """Return candidates with the terms beside the model that improve their score, the best first.
 
     They are added one after the other, each time the one that improves the score most in the
-    colour of its own residual.
+    colour of its own residual. Those far worse than the best are left out.
     """
     ranked = sorted(found, key=lambda c: c.score)
     # A command off the balance of an integrator looks like a drift.
     starts = ranked[:1] + [c for c in ranked[1:] if c.structure in (FOPDT, IPDT)]
-    best = min((_in_own_colour(context, c) for c in found), key=lambda c: c.score)
-    for start in starts:
-        now, score = start, _in_own_colour(context, start).score
+    reached = []
+    for now in starts:
+        best = _in_own_colour(context, now)
         while more := context.with_one_more_term(now):
             pairs = [(_in_own_colour(context, c), c) for c in more]
             coloured, plain = min(pairs, key=lambda r: r[0].score)
-            if coloured.score >= score:
+            if coloured.score >= best.score:
                 break
-            now, score = plain, coloured.score
-            best = min(best, coloured, key=lambda c: c.score)
-    return best
+            now, best = plain, coloured
+        reached.append(best)
+    reached.sort(key=lambda c: c.score)
+    return [c for c in reached if c.score <= reached[0].score + _HOPELESS]
 
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:

@@ -265,18 +265,23 @@ def theta_of(structure: Structure, values: FloatArray) -> FloatArray:
     return np.array([*logs, given[DEAD_TIME]])
 
 
-def unit_steps(structure: Structure, theta: FloatArray) -> FloatArray:
+def unit_steps(structure: Structure, theta: FloatArray, least: float = 0.0) -> FloatArray:
     """Return the size of a unit step: 1 of a logarithm, and all times together of D [s].
 
     :param structure: the structure.
     :param theta: shape (m,).
+    :param least: of the dead time's step [s], such as the time between samples.
     """
     lags = sum(abs(c) for c in structure.denominator.constants(theta[:-1]))
-    return np.array([*[1.0] * (theta.size - 1), lags + float(theta[-1]) or 1.0])
+    return np.array([*[1.0] * (theta.size - 1), max(lags + float(theta[-1]), least) or 1.0])
 
 
 def stepped(
-    structure: Structure, theta: FloatArray, step: FloatArray, longest: float = math.inf
+    structure: Structure,
+    theta: FloatArray,
+    step: FloatArray,
+    longest: float = math.inf,
+    least: float = 0.0,
 ) -> FloatArray:
     """Return theta after a step in units of :func:`unit_steps`, within its bounds.
 
@@ -284,6 +289,7 @@ def stepped(
     :param theta: shape (m,).
     :param step: shape (m,).
     :param longest: time constant beyond which a lag is an integrator [s].
+    :param least: as for :func:`unit_steps`.
     """
     # For so few numbers plain floats are quicker than arrays.
     *logs, dead_time = theta.tolist()
@@ -299,7 +305,7 @@ def stepped(
             logs[first + 1] = _clip(logs[first + 1], *_LOG_DAMPING)
         first += len(factor.parameters)
     limited = _clip(by_dead_time, -_DEAD_TIME_STEP, _DEAD_TIME_STEP)
-    later = dead_time + limited * float(unit_steps(structure, theta)[-1])
+    later = dead_time + limited * float(unit_steps(structure, theta, least)[-1])
     return np.array([*logs, max(later, 0.0)])
 
 

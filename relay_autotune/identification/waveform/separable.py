@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +94,7 @@ class Problem:
             for part, u in zip(self.experiments, self.inputs, strict=True)
         )
 
-    @property
+    @cached_property
     def shortest(self) -> float:
         """Typical time between samples [s]."""
         gaps = np.diff(self.time)
@@ -380,7 +381,8 @@ def refine(
         predicted = float(step @ (2.0 * gradient - normal @ step))
         if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
             break
-        trial = evaluate(problem, stepped(problem.structure, state.theta, step, longest))
+        moved = stepped(problem.structure, state.theta, step, longest, problem.shortest)
+        trial = evaluate(problem, moved)
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         idle = 0 if state.cost - trial.cost > tolerance * state.cost else idle + 1
         if rough and idle == _PATIENCE:
@@ -419,7 +421,7 @@ def promised(problem: Problem, state: Trial) -> float:
 
 def _linearised(problem: Problem, state: Trial) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the units of steps, and the normal equations' matrix and right side in them."""
-    scale = unit_steps(problem.structure, state.theta)
+    scale = unit_steps(problem.structure, state.theta, problem.shortest)
     jacobian = state.derivative * scale[:, None]
     jacobian = jacobian - (jacobian @ state.basis) @ state.basis.T
     return scale, jacobian @ jacobian.T, jacobian @ state.residual
