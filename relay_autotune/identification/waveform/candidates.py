@@ -271,14 +271,26 @@ class FitContext:
                 changed: dict[str, Any] = dict.fromkeys(terms, True)
                 problem = replace(candidate.problem, **changed)
                 state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=_STEPS)
-                if candidate.structure == FOPDT and "past" in terms:
-                    # Without it, another dead time may have stood for what came before.
-                    anew = refine_best(problem, start_fopdt(problem, self.sign), tolerance=TRIAL)
-                    state = min(state, anew, key=lambda s: s.cost)
+                anew = self._anew(problem, terms)
+                if anew:
+                    again = refine_best(problem, anew, tolerance=TRIAL)
+                    state = min(state, again, key=lambda s: s.cost)
             other = self.candidate(problem, state)
             if other is not None:
                 found.append(other)
         return found
+
+    def _anew(self, problem: Problem, terms: tuple[str, ...]) -> list[FloatArray]:
+        """Return other starts with a further term: without it, a dead time may have stood for it.
+
+        :param problem: with the term.
+        :param terms: what was added.
+        """
+        if problem.structure == FOPDT and "past" in terms:
+            return start_fopdt(problem, self.sign)
+        if problem.structure == IPDT and "drift" in terms:
+            return [np.array((problem.shortest,))]
+        return []
 
     @cached_property
     def terms(self) -> list[tuple[str, ...]]:
