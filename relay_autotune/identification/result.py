@@ -165,7 +165,7 @@ class FitReport:
     noise_to_signal_power: float = told("", math.nan, lower=0.0).means("The same of mean squares.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rival:
     """Another structure that the data do not rule out.
 
@@ -181,7 +181,7 @@ class Rival:
         return self.estimate.model
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Identification:
     """A model identified by one method, with what is known of its accuracy.
 
@@ -240,13 +240,14 @@ class Identification:
     rivals: tuple[Rival, ...] = told("", (), message=None).means(
         "Other structures with some support, the best first."
     )
+    parts: tuple[TransferFunction, ...] = told("", (), message=None, optional=True).means(
+        "Models on which gains have to hold, too: of the halves of the record where they differ "
+        "by more than chance, and plain ones that simulate it nearly as well; left out: none."
+    )
     # The model's measurement at the record's samples, with all that was estimated beside the
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
     # record, and so in no document or message.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
-    # Models on which gains have to hold, too: of the halves of the record where they differ by
-    # more than chance, and plain ones that simulate it nearly as well.
-    parts: tuple[TransferFunction, ...] = ()
 
     def __repr__(self) -> str:
         """Return the model on one line; the fields have the rest."""

@@ -253,7 +253,7 @@ _AS_WELL = 1.1
 _WORTH_HEARING = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Loop:
     """The gains that are to be judged, as far as checks need them.
 
@@ -271,7 +271,7 @@ class Loop:
     added_delay: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """One experiment with its results.
 
