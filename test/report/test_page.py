@@ -16,6 +16,7 @@ import pytest
 from analysed import MODEL, completed
 from report_cases import aborted, fruitless, only
 
+from relay_autotune.analysis import analyse
 from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.models import model_fields
 from relay_autotune.identification.estimate import Estimate
@@ -284,12 +285,19 @@ def test_the_models_within_the_uncertainty_are_those_of_the_document(build, para
     found = replace(
         identified("waveform", Estimate.of_root(structure, values, root)),
         rivals=(Rival(Estimate.of(FOPDT, other), 0.1),),
+        parts=(FOPDT.build(other),),
     )
     analysis = replace(fruitless(), models=(found,), selected=0)
     direct = case_of(analysis, "bag").models_around
     assert len(set(direct)) > 80
     assert from_json(analysis).models_around == direct
     assert {e.value for e in from_json(analysis).model.estimates} == set(values)
+
+
+def test_the_band_shows_the_models_on_which_the_gains_were_judged() -> None:
+    analysis = analyse(completed().record, rng=np.random.default_rng(5))
+    assert case_of(analysis, "bag").models_around == analysis.shaping.task.models
+    assert analysis.shaping.task.models != case_of(completed(), "bag").models_around
 
 
 def test_without_a_covariance_a_document_gives_no_models_around() -> None:
