@@ -364,14 +364,14 @@ class _Designs:
     def document(self, *, every: bool) -> dict[str, Any]:
         """Return the gains as a document.
 
-        :param every: whether all rules were asked.
-        :raises TuningError: if the only gains do not have the form.
+        :param every: whether all rules were asked, of which some may have no such form.
+        :raises TuningError: if gains that were asked for by their rule do not have the form.
         """
         model = self.task.model
         inside = self.inside if every else []
         found: dict[str, Any] = {
-            "model": {"structure": model.structure, **model_fields(model)},
-            "gains": list(map(self._fields, self.gains)),
+            "model": model_fields(model),
+            "gains": [self._fields(each, every=every) for each in self.gains],
             "recommended": self.recommended if every else 0,
             "refused": self.refused,
         }
@@ -420,13 +420,13 @@ class _Designs:
             return "no", "series", "form"
         return tuple(digits(getattr(found, name)) for name in _NUMBERS[self.form])
 
-    def _fields(self, gains: Gains) -> dict[str, Any]:
+    def _fields(self, gains: Gains, *, every: bool) -> dict[str, Any]:
         fields = to_document(gains)
         if self.form == "series":
             try:
                 fields["series"] = dict(vars(series_form(gains)))
             except TuningError as error:
-                if len(self.gains) == 1:
+                if not every:
                     raise
                 fields["series"] = {"reason": str(error)}
         return fields
