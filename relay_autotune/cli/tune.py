@@ -333,7 +333,8 @@ class _Designs:
             told = "   ".join(
                 f"{n} {digits(getattr(series, n))} {unit}" for n, unit in _ISA.items()
             )
-            forms = [("series form", f"{told}   alpha {digits(series.alpha, 3)}")]
+            told += f"   alpha {digits(series.alpha, 3)}   b {gains.b:g}"
+            forms = [("series form", told)]
         return [*self._process(), *gains_lines(gains, width=width(), forms=forms)]
 
     def side_by_side(self) -> list[str]:
@@ -343,7 +344,8 @@ class _Designs:
             rows.append(("", *_NUMBERS[self.form], *_HEADINGS[3:]))
             for k, each in enumerate(self.gains):
                 mark = "* " if k == self.recommended else "  "
-                rows.append((mark + each.rule, *self._in_form(each), *_judged(each)))
+                bare = each.bare if self.form == "parallel" else None
+                rows.append((mark + each.rule, *self._in_form(each), *_judged(bare or each)))
             rows.append(("", *_NUMBERS[self.form].values(), *_UNITS_JUDGED))
         if self.inside:
             rows.append(("",) * 9)

@@ -112,7 +112,7 @@ def results(draw: Any, kind: Any) -> Any:
         elif inner:
             held = draw(st.none() | results(inner[0]))
             # A comparison without a number stands for no comparison.
-            held = None if repr(held) == repr(inner[0]()) else held
+            held = None if repr(held) == repr(Validation()) else held
         elif each.kind is float:
             held = draw(numbers(each))
         elif each.kind is str:
