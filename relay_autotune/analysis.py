@@ -102,6 +102,7 @@ def analyse(
     options: DesignOptions | None = None,
     rng: np.random.Generator | None = None,
     tell: Tell = _quiet,
+    alone: bool = False,
 ) -> Analysis:
     """Identify a record and, where the experiment was completed, tune: by all methods and rules.
 
@@ -127,6 +128,8 @@ def analyse(
     :param rng: draws the models within the uncertainty; default: a generator of fixed seed, so
         that equal records give equal numbers.
     :param tell: called with what begins, such as ``comparing structures``.
+    :param alone: True: the model of ``method`` and the gains of ``rule`` without the others, in
+        a fraction of the time; these two and the verdict are the same.
     :raises RelayAutotuneError: if method or rule are unknown, or it is not a record.
     """
     record = one_record(record, "analyse")
@@ -135,31 +138,24 @@ def analyse(
     chosen = _chosen(record, task)
     if isinstance(chosen, Analysis):
         return chosen
-    tell("comparing methods")
-    models = [chosen.model, *_others(chosen.record, task, chosen.model)]
+    if not alone:
+        tell("comparing methods")
+    models = [chosen.model, *([] if alone else _others(chosen.record, task, chosen.model))]
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
-    return _assessed(chosen, models, _Tuning(task, _first(rule), simple, rng, tell))
+    if alone:
+        simple = chosen.simple(task)
+    rules = (rule,) if alone else _first(rule)
+    return _assessed(chosen, models, _Tuning(task, rules, simple, rng, tell))
 
 
-def analyse_alone(
-    record: Record, task: Task | None = None, rng: np.random.Generator | None = None
-) -> Analysis:
+def analyse_alone(record: Record, task: Task | None = None) -> Analysis:
     """Identify a record by one method and, where the experiment was completed, tune by one rule.
-
-    Model and gains equal those of :func:`analyse`, without the other methods and rules; for many
-    records.
 
     :param record: the experiment.
     :param task: method, rule, what is known and asked; None: the defaults.
-    :param rng: as for :func:`analyse`.
     :raises RelayAutotuneError: if it is not a record.
     """
-    record, task = one_record(record, "analyse_alone"), task or Task()
-    chosen = _chosen(record, task)
-    if isinstance(chosen, Analysis):
-        return chosen
-    tuning = _Tuning(task, (task.rule,), chosen.simple(task), rng)
-    return _assessed(chosen, [chosen.model], tuning)
+    return analyse(record, **vars(task or Task()), alone=True)
 
 
 def model_so_far(record: Record, task: Task | None = None) -> Analysis:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import html
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
@@ -26,7 +26,7 @@ from relay_autotune.tuning.ensemble import PredictedMs, ensemble_peaks
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, judge
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shaping:
     """A model for which gains may be designed, and how these are judged.
 
@@ -68,7 +68,7 @@ class Shaping:
         return Judgement((*self.findings, *found))
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Analysis:
     """Result of the analysis of one record.
 
@@ -108,7 +108,7 @@ class Analysis:
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
     predicted: PredictedMs | None = None
-    shaping: Shaping | None = field(default=None, compare=False)
+    shaping: Shaping | None = None
 
     @property
     def model(self) -> Identification | None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from relay_autotune.identification.result import Identification, Validation
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.result import Analysis
-    from relay_autotune.tuning import Gains
+    from relay_autotune.tuning import Gains, Performance
 
 # Rivals beyond these are told in the JSON document alone.
 _RIVALS = 3
@@ -270,18 +270,22 @@ def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
         ),
     ]
     if math.isfinite(gains.overshoot):
-        lines.append(
-            (
-                "",
-                f"set-point step: overshoot {digits(100.0 * gains.overshoot, 3)} %   "
-                f"settled after {digits(gains.settling_time, 3)} s",
-            )
-        )
+        lines.append(("", f"set-point step: {_step(gains)}"))
+    if gains.bare is not None:
+        ms = digits(gains.bare.ms, 3)
+        lines.append(("", f"by p, i and d alone: {_step(gains.bare)}   Ms {ms}"))
     if gains.reason:
         lines.append(("  because", gains.reason))
     for warning in gains.warnings:
         lines.append(("  warning", warning))
     return lines
+
+
+def _step(does: Performance) -> str:
+    return (
+        f"overshoot {digits(100.0 * does.overshoot, 3)} %   "
+        f"settled after {digits(does.settling_time, 3)} s"
+    )
 
 
 def _row(label: str, value: float, unit: str, interval: str) -> _Entry:

@@ -333,7 +333,8 @@ class _Designs:
             told = "   ".join(
                 f"{n} {digits(getattr(series, n))} {unit}" for n, unit in _ISA.items()
             )
-            forms = [("series form", f"{told}   alpha {digits(series.alpha, 3)}")]
+            told += f"   alpha {digits(series.alpha, 3)}   b {gains.b:g}"
+            forms = [("series form", told)]
         return [*self._process(), *gains_lines(gains, width=width(), forms=forms)]
 
     def side_by_side(self) -> list[str]:
@@ -343,7 +344,8 @@ class _Designs:
             rows.append(("", *_NUMBERS[self.form], *_HEADINGS[3:]))
             for k, each in enumerate(self.gains):
                 mark = "* " if k == self.recommended else "  "
-                rows.append((mark + each.rule, *self._in_form(each), *_judged(each)))
+                bare = each.bare if self.form == "parallel" else None
+                rows.append((mark + each.rule, *self._in_form(each), *_judged(bare or each)))
             rows.append(("", *_NUMBERS[self.form].values(), *_UNITS_JUDGED))
         if self.inside:
             rows.append(("",) * 9)
@@ -364,14 +366,14 @@ class _Designs:
     def document(self, *, every: bool) -> dict[str, Any]:
         """Return the gains as a document.
 
-        :param every: whether all rules were asked.
-        :raises TuningError: if the only gains do not have the form.
+        :param every: whether all rules were asked, of which some may have no such form.
+        :raises TuningError: if gains that were asked for by their rule do not have the form.
         """
         model = self.task.model
         inside = self.inside if every else []
         found: dict[str, Any] = {
-            "model": {"structure": model.structure, **model_fields(model)},
-            "gains": list(map(self._fields, self.gains)),
+            "model": model_fields(model),
+            "gains": [self._fields(each, every=every) for each in self.gains],
             "recommended": self.recommended if every else 0,
             "refused": self.refused,
         }
@@ -420,13 +422,13 @@ class _Designs:
             return "no", "series", "form"
         return tuple(digits(getattr(found, name)) for name in _NUMBERS[self.form])
 
-    def _fields(self, gains: Gains) -> dict[str, Any]:
+    def _fields(self, gains: Gains, *, every: bool) -> dict[str, Any]:
         fields = to_document(gains)
         if self.form == "series":
             try:
                 fields["series"] = dict(vars(series_form(gains)))
             except TuningError as error:
-                if len(self.gains) == 1:
+                if not every:
                     raise
                 fields["series"] = {"reason": str(error)}
         return fields

@@ -41,6 +41,7 @@ COLUMNS = ("structure", "gain", "zeros", "time_constants", "dead_time")
 def model_fields(model: TransferFunction) -> dict[str, Any]:
     """Return a transfer function as it appears in documents."""
     return {
+        "structure": model.structure,
         "gain": json_number(model.gain),
         "zeros": json_numbers(model.zeros),
         "time_constants": json_numbers(model.time_constants),
@@ -76,7 +77,6 @@ def _complex(value: Any) -> complex:
 def _estimate_fields(estimate: Estimate) -> dict[str, Any]:
     names, finite = estimate.structure.names, bool(np.all(np.isfinite(estimate.covariance)))
     return {
-        "structure": estimate.model.structure,
         **model_fields(estimate.model),
         "values": named(names, estimate.values),
         "std": named(names, estimate.std),
@@ -97,11 +97,7 @@ def _estimate_of_fields(m: dict[str, Any]) -> Estimate:
 
 
 def _rival_fields(rival: Rival) -> dict[str, Any]:
-    return {
-        "structure": rival.model.structure,
-        "support": json_number(rival.support),
-        **model_fields(rival.model),
-    }
+    return {"support": json_number(rival.support), **model_fields(rival.model)}
 
 
 def _rival_of_fields(r: dict[str, Any]) -> Rival:
@@ -191,6 +187,7 @@ register(
     Special(_estimate_fields, _estimate_of_fields, _estimate_to_message, _estimate_of_message),
 )
 register(Rival, Special(_rival_fields, _rival_of_fields))
+register(TransferFunction, Special(model_fields, model_of_fields))
 
 
 def to_control(system: TransferFunction | Controller, *, pade_order: int = 5) -> Any:

@@ -98,7 +98,7 @@ class Uncertain:
     high: float = math.nan
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The parameters of a model and their covariance.
 

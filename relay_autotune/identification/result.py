@@ -184,7 +184,7 @@ class Part:
         return f"{self.begin:.4g} s to {self.end:.4g} s"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rival:
     """Another structure that the data do not rule out.
 
@@ -200,7 +200,7 @@ class Rival:
         return self.estimate.model
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Identification:
     """A model identified by one method, with what is known of its accuracy.
 
@@ -259,15 +259,17 @@ class Identification:
     rivals: tuple[Rival, ...] = told("", (), message=None).means(
         "Other structures with some support, the best first."
     )
+    draws: tuple[TransferFunction, ...] = told("", (), message=None, optional=True).means(
+        "Models that the record allows, of either direction, each as likely as the others; left "
+        "out: the method knows the covariance alone."
+    )
     # The model's measurement at the record's samples, with all that was estimated beside the
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
     # record, and so in no document or message.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
-    # Models that the record allows, of either direction, each as likely as the others; empty: the
-    # method knows the covariance alone. And those that each half of it allows by itself.
-    draws: tuple[TransferFunction, ...] = ()
     # How strongly commands above and below the first one act, relative to the model.
     effects: tuple[float, float] = (1.0, 1.0)
+    # Models that each half of the record allows by itself.
     halves: tuple[Part, ...] = ()
 
     def __repr__(self) -> str:

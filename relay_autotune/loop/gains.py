@@ -210,6 +210,10 @@ class Gains(Performance, Controller):
     law_period: float = told("s", 0.0, lower=0.0, optional=True).means(
         "Sampling period at which that law runs; left out: no law was named."
     )
+    bare: Performance | None = told("", None, message=None, optional=True).means(
+        "What p, i and d do alone, in a controller with neither filter nor set-point weight; left "
+        "out: the same, for another law, or an unstable loop."
+    )
     reason: str = told().means("Why this rule and these gains, a sentence for people.")
     warnings: tuple[str, ...] = told("", ()).means("What the user must know before using them.")
 

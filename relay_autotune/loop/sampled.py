@@ -186,7 +186,7 @@ class SampledPid:
         return self._law.command(self._gains, setpoint, self.period, self._limits)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """Deviations from the operating point in a closed loop.
 

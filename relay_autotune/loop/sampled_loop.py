@@ -29,7 +29,7 @@ from relay_autotune.loop.analysis import (
 )
 from relay_autotune.loop.gains import Controller, Performance, StepFigures
 from relay_autotune.loop.laws import SampledLaw
-from relay_autotune.loop.stability import LoopMargins, margins, peaks
+from relay_autotune.loop.stability import MOST_PIECES, LoopMargins, margins, peaks
 from relay_autotune.process.response import HeldProcess
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -233,7 +233,7 @@ class SampledLoop:
 def _turning(
     function: Callable[[FloatArray], ComplexArray], grid: FloatArray, values: ComplexArray
 ) -> float | None:
-    """Return the growth of a function's phase over a grid; None: it passes through zero.
+    """Return the growth of a function's phase over a grid; None: it is not certain.
 
     Cells in which it turns too far to be followed are divided.
 
@@ -251,6 +251,8 @@ def _turning(
         low, high, begins, ends = low[~clear], high[~clear], begins[~clear], ends[~clear]
         if not low.size:
             return total
+        if low.size > MOST_PIECES:
+            return None
         middle = 0.5 * (low + high)
         between = function(middle)
         low, high = np.concatenate((low, middle)), np.concatenate((middle, high))

@@ -221,7 +221,8 @@ class IdentifierNode(ServedNode):
             self._earlier = record
         if asked["method"] in ONLY_JOINT and earlier is not None:
             return partial(analyse_jointly, (record, earlier), **asked)
-        return partial(analyse, record, **asked, tell=self._signs.at)
+        # Those who wait for the gains need none of the other rules'.
+        return partial(analyse, record, **asked, tell=self._signs.at, alone=True)
 
     # Output.
 

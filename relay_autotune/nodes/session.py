@@ -498,7 +498,7 @@ RESULTS = ("transfer_function", "pi_gains")
 
 # How long a start waits for the recording's folder [s].
 OPEN_WITHIN = 0.3
-# With signs of life of the identifier, the wait may take this many times the timeout.
+# With signs of life of the identifier, one stage of its work may take this many times the timeout.
 LONGEST = 30.0
 # The identifier works as long as its last sign of life is not older than this [s].
 HEARD_WITHIN = 2.5
@@ -513,7 +513,7 @@ class _Recording(Recorder):
         super().__init__(*args, **facts)
         self.missing = list(RESULTS)
         self.timer: Timer | None = None
-        self.until = 0.0
+        self.until = self.patience = 0.0
         self.waits_since = self.heard_at = -math.inf
         self.reason = self.stage = ""
         self.closed: Callable[[str], None] | None = None
@@ -613,9 +613,19 @@ class Recordings:
             period = min(recording.timer.timer_period_ns, round(ON_THE_WAY * 1e9))
             recording.timer.timer_period_ns = period
             recording.timer.reset()
-        elif time.monotonic() < recording.until:
-            recording.heard_at, recording.stage = time.monotonic(), text
+            return
+        now = time.monotonic()
+        if text != recording.stage:
+            # It gets on.
+            recording.until = now + recording.patience
+        if now < recording.until:
+            recording.heard_at, recording.stage = now, text
             recording.timer.reset()
+        else:
+            recording.reason = (
+                f"identifier_node has not got on from {text or 'its first work'} for "
+                f"{duration(recording.patience)}"
+            )
 
     def awaited(self, experiment_id: str, timeout: float) -> str:
         """Say what a recording waits for after the end of its tune; "" if it waits for nothing.
@@ -659,7 +669,8 @@ class Recordings:
             self.close(experiment_id, f"without {missing}: {recording.reason}")
 
         recording.waits_since = time.monotonic()
-        recording.until = recording.waits_since + LONGEST * timeout
+        recording.patience = LONGEST * timeout
+        recording.until = recording.waits_since + recording.patience
         recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=STEADY)
 
     def close(self, experiment_id: str, why: str) -> None:

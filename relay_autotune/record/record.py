@@ -179,7 +179,7 @@ class Cycle(CycleFeatures):
     disturbed: bool = told("", False).means("True if it should be left out of averages.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PiecewiseConstant:
     """A signal that holds ``values[k]`` from ``times[k]`` on, and ``initial`` before ``times[0]``.
 
@@ -290,7 +290,7 @@ class Unthinned:
     remark: str
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Record:
     """The immutable record of one experiment.
 
@@ -345,9 +345,7 @@ class Record:
     held_input: PiecewiseConstant | None = None
     continuous_command: bool = False
     unthinned: Unthinned | None = None
-    answers: dict[Hashable, Any] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    answers: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         time = _as_column("time", self.time, None)

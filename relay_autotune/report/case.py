@@ -176,10 +176,17 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         record=record,
         settings=settings_of(record),
         cycles=analysis.cycles or _cycles(record),
-        models_around=around(analysis.model),
+        models_around=_judged_on(analysis),
         added_delay=analysis.added_delay,
         judgement=analysis.judgement,
     )
+
+
+def _judged_on(analysis: Analysis) -> tuple[TransferFunction, ...]:
+    """Return the models around the selected one, those of the design if there was one."""
+    if analysis.shaping is None:
+        return around(analysis.model)
+    return analysis.shaping.task.models
 
 
 def _cycles(record: Record) -> tuple[Cycle, ...]:

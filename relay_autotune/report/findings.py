@@ -140,6 +140,11 @@ def steps_of(case: Case) -> tuple[str, ...]:
             f": the measurement should overshoot by about {digits(100.0 * gains.overshoot, 2)} % "
             f"and settle within {digits(gains.settling_time, 2)} s"
         )
+        if gains.bare is not None:
+            watch += (
+                f" (p, i and d alone: {digits(100.0 * gains.bare.overshoot, 2)} % and "
+                f"{digits(gains.bare.settling_time, 2)} s)"
+            )
     steps = (
         "Write down the gains that the controller has now.",
         "Type in the new gains, in the form that your controller has.",

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from relay_autotune.errors import TuningError, look_up
+from relay_autotune.errors import ModelError, TuningError, look_up
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, Gains, Performance
@@ -28,6 +28,8 @@ from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
 DEFAULT_RULE = "robust"
+# The search comes to an end of its range within its last step.
+_ABOUT = 1.002
 
 __all__ = [
     "DEFAULT_RULE",
@@ -160,7 +162,7 @@ def designed(task: DesignTask, rule: str) -> Designed:
     :param rule: one of ``RULES``.
     :raises TuningError: if the rule does not apply.
     """
-    controller, reason = rule_named(rule)(task)
+    controller, reason = _of_a_period(*rule_named(rule)(task), task.options.sample_period)
     if task.options.law in ("", OWN_LAW):
         return Designed(rule, controller, reason)
     if rule != DEFAULT_RULE:
@@ -171,6 +173,22 @@ def designed(task: DesignTask, rule: str) -> Designed:
     except TuningError:
         return Designed(rule, controller, reason)
     return Designed(rule, controller, reason, own)
+
+
+def _of_a_period(controller: Controller, reason: str, period: float) -> tuple[Controller, str]:
+    """Return a controller whose integral time is at least a period, with its reason.
+
+    With a shorter one it is an integral controller: what it integrates in one sample is more than
+    its proportional part. The integral and the derivative gain remain.
+    """
+    if not 0.0 < controller.ti <= period * _ABOUT:
+        return controller, reason
+    kc = controller.i * period
+    reason += (
+        f"; in effect an integral controller, i = {controller.i:.4g} u/(y s): its ti is one "
+        "sampling period, the least that a sampled controller has"
+    )
+    return replace(controller, kc=kc, ti=period, td=controller.d / kc), reason
 
 
 def _with_own_law(task: DesignTask) -> DesignTask:
@@ -191,12 +209,13 @@ def judged(task: DesignTask, found: Designed) -> Gains:
     def weighted(controller: Controller) -> Controller:
         return controller if math.isnan(weight) else replace(controller, b=weight)
 
-    controller = weighted(found.controller)
+    controller, bare = weighted(found.controller), None
     law = task.runs(controller)
     if law is None:
         period = task.options.sample_period
         performance = analyse_loop(controller, task.in_loop(task.model), period)
-        warnings = cautions(performance, task)
+        bare, unstable = _bare(controller, task)
+        warnings = (*cautions(performance, task), *unstable)
     else:
         performance = analyse_sampled(law, task.held(task.model))
         reason += f"; for {law.law.name} every {law.period:g} s"
@@ -216,9 +235,23 @@ def judged(task: DesignTask, found: Designed) -> Gains:
         ms_95=ms_95,
         law="" if law is None else law.law.name,
         law_period=0.0 if law is None else law.period,
+        bare=bare,
         reason=reason,
         warnings=warnings,
     )
+
+
+def _bare(controller: Controller, task: DesignTask) -> tuple[Performance | None, tuple[str, ...]]:
+    """Return what p, i and d do without filter and set-point weight, and a warning if unstable."""
+    alone = replace(controller, tf=0.0, b=1.0)
+    if alone == controller:
+        return None, ()
+    try:
+        model = task.in_loop(task.model)
+        return analyse_loop(alone, model, task.options.sample_period), ()
+    except (ModelError, TuningError):
+        told = f"the loop needs the filter, tf = {controller.tf:.4g} s: without it, it is unstable"
+        return None, (told,) if controller.tf > 0.0 else ()
 
 
 def _on_own_law(task: DesignTask, controller: Controller) -> Performance | None:

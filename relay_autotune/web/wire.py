@@ -228,6 +228,9 @@ def _effects(shaped: Shaped) -> list[list[str]]:
         ["overshoot", f"{digits(100.0 * gains.overshoot, 2)} %", "after a step of the set-point"],
         ["settles in", f"{digits(gains.settling_time, 3)} s", "to within 2 %"],
     ]
+    if gains.bare is not None:
+        alone = f"{digits(100.0 * gains.bare.overshoot, 2)} %"
+        rows.insert(-1, ["", alone, "by p, i and d alone, without tf and b"])
     noise = gains.noise_gain * shaped.options.noise_std
     if math.isfinite(noise):
         rows.append(["noise", f"{digits(noise, 2)} u", "standard deviation in the command"])

@@ -169,7 +169,7 @@ def test_models_by_flags(flags, model):
 @pytest.mark.parametrize("how", ["replay", "identify", "tune", "stdin"])
 def test_models_by_document(model, how, tmp_path, monkeypatch):
     """A model comes back exactly, many equal lags included."""
-    fields = {"structure": model.structure, **model_fields(model)}
+    fields = model_fields(model)
     found = {
         "replay": {"bag": "b", "experiments": [{"models": [{}, fields], "selected": 1}]},
         "identify": {"method": "chang", **fields},
@@ -215,6 +215,15 @@ def test_forms(capsys):
     for form in ("parallel", "series"):
         status, out, _ = run(capsys, FOPDT, "--table --form", form)
         assert status == 0
+
+
+def test_of_all_rules_one_without_the_form_is_told_as_such(capsys, tmp_path):
+    # (1 + 0.5 s)/((1 - s)(1 + 0.1 s)) with a dead time of 0.1 s
+    path = tmp_path / "model.json"
+    path.write_text('{"numerator": [0.5, 1], "denominator": [-0.1, -0.9, 1], "dead_time": 0.1}')
+    (found,) = document(capsys, f"{path} --pid --ms 3.5", "--table --form series")["gains"]
+    assert found["rule"] == "robust"
+    assert "complex zeros" in found["series"]["reason"]
 
 
 def test_exports(capsys, tmp_path):
@@ -304,10 +313,7 @@ def test_documents_that_hold_no_model(text, said, tmp_path, capsys):
 
 
 def test_of_several_experiments_one_is_chosen(tmp_path, capsys):
-    fields = [
-        model_fields(TransferFunction.fopdt(k, 20.0, 10.0)) | {"structure": "fopdt"}
-        for k in (1, 2)
-    ]
+    fields = [model_fields(TransferFunction.fopdt(k, 20.0, 10.0)) for k in (1, 2)]
     path = tmp_path / "two.json"
     path.write_text(
         json.dumps({"experiments": [{"models": [each], "selected": 0} for each in fields]})

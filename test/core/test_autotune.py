@@ -100,6 +100,14 @@ def test_alone_they_are_what_they_are_beside_others(method, rule):
     assert alone.added_delay == beside.added_delay
 
 
+def test_who_waits_for_the_gains_gets_the_same_ones():
+    beside = _analysed("waveform", "robust")
+    first = analyse(_record(), alone=True)
+    assert first.gains == (beside.best_gains,)
+    assert first.judgement == beside.judgement
+    assert len(first.models) == 1 < len(beside.models)
+
+
 def test_data_that_tell_nothing_are_a_reason():
     record = _record()
     constant = replace(record, measurement=np.full(len(record), 5.0))

@@ -11,7 +11,6 @@ from virtual_tune import tuned
 
 from relay_autotune.analysis import analyse_alone
 from relay_autotune.experiment.experiment import ExperimentParameters
-from relay_autotune.identification.judgement.evidence import other_direction
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
@@ -84,7 +83,6 @@ def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting
     model = TransferFunction.fopdt(1.0, 1.0, 0.7)
     tune = run(model, sign=1, period=0.03, **acting)
     assert tune.outcome is Outcome.COMPLETED
-    record = tune.record()
-    other = other_direction(identify(record, "waveform"), record)
-    assert other is None or other.lead < -6.0
-    assert analyse_alone(record).best_gains is not None
+    found = analyse_alone(tune.record())
+    assert all(m.process_sign == 1 for m in found.model.draws)
+    assert found.best_gains is not None

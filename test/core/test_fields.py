@@ -33,6 +33,7 @@ from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.process.model_parameters import Quadratic
 from relay_autotune.process.structures import TABLE, Structure
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import Told, told_fields
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Cycle, RelaySettings
@@ -44,7 +45,7 @@ RESULTS = (
     *(Gains, Performance, Finding, RelaySettings, LimitCycle, Cycle, FitProgress),
 )
 # As long as the record, and what is told by other fields of the document.
-UNTOLD = {(Identification, "fitted"), (Identification, "parts"), (LimitCycle, "std")}
+UNTOLD = {(Identification, "fitted"), (LimitCycle, "std")}
 POSITIVE = st.floats(1e-3, 1e3)
 TEXTS = st.text(max_size=5)
 WORDS = st.text(string.ascii_lowercase, min_size=1, max_size=5)
@@ -86,6 +87,8 @@ def estimates(draw: Any) -> Estimate:
 def results(draw: Any, kind: Any) -> Any:
     if kind is Estimate:
         return draw(estimates())
+    if kind is TransferFunction:
+        return draw(estimates()).model
     if kind is Rival:
         # Documents have the model of a rival alone.
         alone = Estimate.of_model(draw(estimates()).model)
@@ -109,7 +112,7 @@ def results(draw: Any, kind: Any) -> Any:
         elif inner:
             held = draw(st.none() | results(inner[0]))
             # A comparison without a number stands for no comparison.
-            held = None if repr(held) == repr(inner[0]()) else held
+            held = None if repr(held) == repr(Validation()) else held
         elif each.kind is float:
             held = draw(numbers(each))
         elif each.kind is str:

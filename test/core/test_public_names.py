@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import is_dataclass
+from typing import Any, get_args, get_origin, get_type_hints
 
+import numpy as np
 import pytest
 
 import relay_autotune
+from relay_autotune.loop.sampled import ClosedLoop
 
 
 def loaded_by(code: str) -> set[str]:
@@ -38,6 +42,29 @@ def test_the_package_alone_loads_nothing() -> None:
 def test_what_draws_is_loaded_when_it_draws() -> None:
     loaded = loaded_by("from relay_autotune import analyse, draw, write_report")
     assert not loaded & {"matplotlib", "jinja2", "mcap"}
+
+
+def _classes_in(hint: Any) -> set[Any]:
+    """Return the classes that a type hint names."""
+    inside = [_classes_in(each) for each in get_args(hint) if not isinstance(each, list)]
+    return {get_origin(hint) or hint}.union(*inside)
+
+
+def test_what_holds_arrays_is_equal_to_itself_alone() -> None:
+    """Arrays are compared number by number, so that neither == nor hash has an answer."""
+    public = [getattr(relay_autotune, name) for name in relay_autotune.__all__]
+    waiting = {kind for kind in public if isinstance(kind, type)} | {ClosedLoop}
+    inside: dict[Any, set[Any]] = {}
+    while waiting:
+        kind = waiting.pop()
+        if is_dataclass(kind) and kind not in inside:
+            inside[kind] = set().union(*map(_classes_in, get_type_hints(kind).values()))
+            waiting |= inside[kind]
+    compared = {kind for kind in inside if kind.__eq__ is not object.__eq__}
+    assert relay_autotune.Controller in compared
+    alone = inside.keys() - compared | {np.ndarray}
+    assert {relay_autotune.Record, relay_autotune.Analysis} <= alone
+    assert {kind.__name__ for kind in compared if inside[kind] & alone} == set()
 
 
 def test_an_unknown_name_is_an_ordinary_error() -> None:

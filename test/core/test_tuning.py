@@ -14,10 +14,18 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
-from relay_autotune.tuning import Controller, analyse_loop, ensemble, is_stable, tune
+from relay_autotune.tuning import (
+    Controller,
+    DesignOptions,
+    analyse_loop,
+    ensemble,
+    is_stable,
+    tune,
+)
 
 
 def _controller(name: str, inputs: dict[str, float]) -> Controller:
@@ -96,6 +104,37 @@ def test_gains_carry_the_robustness_of_the_uncertain_model():
 
 
 @pytest.mark.long
+def test_the_parallel_form_has_a_prediction_of_its_own():
+    oven = TransferFunction.fopdt(0.62, 110.2, 15.9)
+    gains = tune(oven, options=DesignOptions(controller="pid"))
+    alone = Controller(gains.kc, gains.ti, gains.td)
+    # A derivative by differences acts half a period late, which 0.02 s makes nothing of.
+    run = simulate_closed_loop(alone, oven, period=0.02, duration=300.0, setpoint=1.0)
+    assert gains.bare.overshoot == pytest.approx(float(run.measurement.max()) - 1.0, abs=0.005)
+    assert gains.bare.overshoot > 2.0 * gains.overshoot
+    pi = tune(oven, rule="simc")
+    assert (pi.b, pi.tf, pi.bare) == (1.0, 0.0, None)
+
+
+@pytest.mark.parametrize("law", ["", "pid_controller"])
+def test_no_integral_time_is_shorter_than_a_sampling_period(law):
+    # It answers within a sample: an integral controller is all that it needs.
+    swift, asked = (
+        TransferFunction.fopdt(2.0, 1e-7, 0.05),
+        DesignOptions(sample_period=0.1, law=law),
+    )
+    found = []
+    for rule in ("robust", "imc", "simc", "amigo"):
+        gains = tune(swift, rule=rule, options=asked)
+        assert gains.ti >= 0.1
+        assert "an integral controller" in gains.reason
+        found.append(gains)
+    assert found[0].ms <= 1.41
+    # The integral gain is that of the rule, which was made for continuous controllers.
+    own = tune(swift, rule="simc", options=DesignOptions(loop_delay=0.05))
+    assert found[2].i == pytest.approx(own.i, rel=1e-6)
+
+
 def test_gains_for_a_model_that_is_hardly_known_are_refused():
     found = _identified(0.05)
     wild = tuple(TransferFunction.fopdt(1.65, 20.0, d) for d in np.linspace(5.0, 60.0, 50))

@@ -19,6 +19,7 @@ from std_msgs.msg import Float64
 
 from relay_autotune import nodes
 from relay_autotune.cli.own_nodes import free_domain
+from relay_autotune.nodes import session
 from relay_autotune.nodes.results import SignsOfLife, said_by
 from relay_autotune.nodes.session import RESULTS, Recordings
 from relay_autotune_msgs.msg import PidGains, TransferFunction
@@ -86,6 +87,29 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
     told = capfd.readouterr().err
     assert "[INFO]" in told and "whole is closed with model and gains" in told
     assert "[WARN]" in told and "lacking is closed without" in told
+
+
+def test_it_waits_as_long_as_the_identifier_gets_on(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(session, "time", SimpleNamespace(monotonic=lambda: now[0], time_ns=int))
+    topics = ("measurement", "command", *RESULTS)
+    ends = {name: node.create_publisher(Float64, name, 10) for name in topics}
+    recordings = Recordings(node, lambda: ends)
+    recordings.begin("slow", str(tmp_path))
+    closed: list[str] = []
+    recordings.close_with_results("slow", 10.0, closed.append)
+    for stage in (*(f"stage {k}" for k in range(20)), *["the last one"] * 5):
+        now[0] += 100.0
+        recordings.told("slow", True, stage)
+    assert now[0] == 2500.0
+    waits_for = recordings.awaited("slow", 10.0)
+    assert waits_for.startswith("waiting for identifier_node")
+    recordings.close("slow", "")
+    (reason,) = closed
+    assert "has not got on from the last one for" in reason
+    recordings.close_all("", 10.0)
 
 
 def test_each_line_that_logs_has_one_severity() -> None:

@@ -292,6 +292,12 @@ def test_the_models_within_the_uncertainty_are_those_of_the_document(build, para
     assert {e.value for e in from_json(analysis).model.estimates} == set(values)
 
 
+def test_the_band_shows_the_models_on_which_the_gains_were_judged() -> None:
+    analysis = completed()
+    assert case_of(analysis, "bag").models_around == analysis.shaping.task.models
+    assert from_json(analysis).models_around == analysis.shaping.task.models
+
+
 def test_without_a_covariance_a_document_gives_no_models_around() -> None:
     known = identified("atv", Estimate.of(FOPDT, np.array((2.0, 3.0, 0.2))))
     # A method may tie the dead time to the lags, and only the method knows how.

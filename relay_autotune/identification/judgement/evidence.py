@@ -126,7 +126,7 @@ def _integral(u: PiecewiseConstant, at: FloatArray) -> FloatArray:
 MOST_GROWTH = 7.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Loop:
     """The gains that are to be judged, as far as checks need them.
 
@@ -142,7 +142,7 @@ class Loop:
     added_delay: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """One experiment with its results.
 

@@ -126,11 +126,26 @@ def _halves(evidence: Evidence) -> Measured | None:
 
 
 def _direction(evidence: Evidence) -> Measured | None:
-    found = evidence.found
-    models = [("the record", found.draws), *((part.span, part.models) for part in found.halves)]
+    found, relay = evidence.found, evidence.record.settings is not None
+    sign = -found.model.process_sign
+    raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
+    said = "the record also fits a process of the other direction"
+    if relay:
+        said = (
+            f"the relay assumed that a higher command {lowers} the measurement; a process where "
+            f"it first {lowers} and then {raises} it fits the record as well: test with "
+            f"process_gain_sign {sign} (0: it is found)"
+        )
+    models = [
+        (said, found.draws),
+        *(
+            (f"{p.span} also fits a process of the other direction", p.models)
+            for p in found.halves
+        ),
+    ]
     shares = [
-        (float(np.mean([m.process_sign != found.model.process_sign for m in draws])), span)
-        for span, draws in models
+        (float(np.mean([m.process_sign == sign for m in draws])), words)
+        for words, draws in models
         if draws
     ]
     return Measured(*max(shares)) if shares else None
@@ -160,7 +175,7 @@ MODEL_CHECKS = (
         unit="",
         doubtful=0.5,
         failed=0.9,
-        sentence="{detail} also fits a process of the other direction",
+        sentence="{detail}",
         remedy="test again when nothing drifts, with larger moves of the command",
         measure=_direction,
     ),

@@ -44,6 +44,7 @@ from relay_autotune.identification.waveform.starts import (
     refine_best,
     start_fopdt,
     time_scales,
+    two_lags,
 )
 from relay_autotune.process.structures import (
     FOPDT,
@@ -95,6 +96,10 @@ IMITATES_A_DRIFT = 10.0
 _LASTING = 2.0
 # Longest dead time in lengths of the record: a later response cannot be told from a drift.
 _LATE = 0.25
+# Latest turn of an inverse response, in lengths of the test: a later one is a drift.
+_HORIZON = 2.0
+# Slow lags of an inverse response at the start, relative to the fast one.
+_SLOWER = (2.0, 6.0, 20.0)
 # Largest share that a FOPDT leaves unexplained which shows the direction of the process.
 _NEARLY_ALL = 0.1
 
@@ -230,7 +235,13 @@ class FitContext:
         if model is None and structure == THREE_LAGS:
             problem = replace(problem, structure=LAG_COMPLEX)
             model = LAG_COMPLEX.model_at(state.theta, state.coefficients)
-        if model is None or model.dead_time > self.latest[model.process_sign > 0]:
+        if model is None:
+            return None
+        if self.sign * model.process_sign < 0:
+            # A relay of the wrong direction oscillates on the first answer of an inverse response.
+            if not any(-_HORIZON * self.length < z.real < 0.0 for z in model.zeros):
+                return None
+        elif model.dead_time > self.latest[model.process_sign > 0]:
             return None
         shortest, _ = time_scales(self.problem)
         if is_unseen(model, shortest, self.length, self.pushed):
@@ -351,6 +362,24 @@ class FitContext:
                     least = min(least, max(state.cost, self.floor) / problem.time.size)
                     found.append(self.candidate(problem, state))
         return [c for c in found if c is not None]
+
+    def turned(self) -> list[Candidate]:
+        """Return models of the direction opposite to the relay's, with an inverse response.
+
+        With others no oscillation lasts. In the direction of the relay, a FOPDT shows the fast
+        part of an inverse response.
+        """
+        fast, dead_time = self.starts.tau, self.starts.dead_time
+        tried = (
+            (SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
+            (INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
+        )
+        found = []
+        for structure, thetas in tried:
+            problem = replace(self.problem, structure=structure)
+            state = refine_best(problem, thetas, tolerance=TRIAL)
+            found.append(self.candidate(problem, state))
+        return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
 
     def refit(self, candidate: Candidate, colour: Colour | None, most: int) -> Candidate | None:
         """Fit a candidate in another colour, from where it is.

@@ -104,7 +104,10 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     dense = problem.thinned(_MOST_WHITE)
     if found and found[0].problem.colour is None and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
-    for candidate in _by_rank(found):
+    own = [c for c in found if sign * c.model.process_sign >= 0]
+    if sign and not known.structure:
+        found = [*found, *(_in_own_colour(few, c) for c in few.turned())]
+    for candidate in _by_rank(own):
         fit = _finished(candidate, found, problem, scale)
         if fit is not None and (known.structure or responds(fit.problem, fit.state)):
             return fit
