@@ -146,7 +146,10 @@ class Oscillation:
             # limit of the next stay.
             was_shifted = self._shifts > 0
             self._answers = self._turns.add(
-                t, relay.last_stay, self._balance, counts=relay.switches > 1 and not was_shifted
+                t,
+                relay.last_stay,
+                self._levels.balance,
+                counts=relay.switches > 1 and not was_shifted,
             )
             self._learn(0.0 if was_shifted else relay.last_stay)
             self._shifts = 0
@@ -219,7 +222,7 @@ class Oscillation:
         self._answered.clear()
         self._long_stays = 0
         self._switches_before = self._run.switches
-        self._patience = Patience(self._levels.amplitude, self._levels.bias)
+        self._patience = Patience(self._levels.balance)
         self._turns = Turns(t, self._run.response_time)
         self._answers = self._is_lost = False
         # The shortest cycle before a cycle was lost [s]; 0: no cycle was lost.
@@ -250,12 +253,6 @@ class Oscillation:
             limit = max(_PATIENCE_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
         self._longest_limit = max(self._longest_limit, self._limit)
-
-    @property
-    def _balance(self) -> float:
-        """Ratio of the shorter to the longer stay of a relay with this bias."""
-        amplitude, bias = self._levels.amplitude, abs(self._levels.bias)
-        return max(amplitude - bias, 0.0) / (amplitude + bias)
 
     def _learn_anew(self) -> None:
         """Learn the length of a stay again from the relay's present switching, or fail."""

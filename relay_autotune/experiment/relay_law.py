@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.parameters import FIRST_SHARE, ExperimentParameters
 
 
 class Relay:
@@ -71,16 +71,15 @@ class Patience:
     limit is at least :data:`LEAST_SAMPLES` samples: without noise, the response of a high-order
     process is seen at the first sample, and takes hundreds of samples to turn.
 
-    :param amplitude: half the distance of the levels [u].
-    :param bias: offset of their middle from the baseline [u], smaller than the amplitude.
+    :param balance: ratio of the smaller to the larger step of the relay, > 0.
     """
 
     RATIO = 10.0
     LEAST_SAMPLES = 200
 
-    def __init__(self, amplitude: float, bias: float) -> None:
+    def __init__(self, balance: float) -> None:
         self._longest = 0.0
-        self._ratio = self.RATIO * (amplitude + abs(bias)) / (amplitude - abs(bias))
+        self._ratio = self.RATIO / balance
         self.limit = math.inf
         """Limit of the present stay [s]."""
 
@@ -188,8 +187,6 @@ class Turns:
         return True
 
 
-# An amplitude that is not given starts at this part of the command's range.
-FIRST_SHARE = 0.01
 # Half swing that is clear of noise (in standard deviations), of the hysteresis (in half widths),
 # and of the sensor's resolution (in steps).
 CLEAR_OF_NOISE = 10.0
@@ -237,10 +234,7 @@ class Levels:
         if self.from_small:
             self.begin_small()
         elif parameters.finds_amplitude:
-            span = parameters.command_max - parameters.command_min
-            self._wanted = FIRST_SHARE * span
-            if abs(parameters.bias) >= self._wanted:
-                self._wanted = 1.5 * abs(parameters.bias)
+            self._wanted = parameters.first_amplitude
         # Amplitude, half swing and levels of the first cycle that was clear of the noise.
         self._first_clear: tuple[float, float, float, float] | None = None
         self._set()
@@ -276,6 +270,15 @@ class Levels:
         if self._as_given:
             return self._parameters.relay_bias
         return 0.5 * (self.high + self.low) - self._baseline
+
+    @property
+    def balance(self) -> float:
+        """Ratio of the smaller to the larger step, at least that with which a search may begin.
+
+        Levels that a load has shifted may both lie on one side of the baseline.
+        """
+        amplitude, bias = self.amplitude, abs(self.bias)
+        return max((amplitude - bias) / (amplitude + bias), FIRST_SHARE)
 
     @property
     def can_grow(self) -> bool:

@@ -231,6 +231,8 @@ class Readiness:
         else:
             baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
             _require_known_range(parameters, values["baseline"])
+            if why := parameters.why_one_way(baseline):
+                raise NotReadyError(why, typed="baseline COMMAND")
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the

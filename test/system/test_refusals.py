@@ -186,6 +186,11 @@ def test_an_unknown_baseline(idle: Rig) -> None:
     assert set_parameter(idle, "baseline", math.nan).successful
     with Ends(idle):
         refused(idle, "the baseline is not known")
+        assert set_parameter(idle, "baseline", -2.0).successful
+        reason = refused(idle, "is at the actuator's end, command_min -2", amplitude=0.5)
+        assert "at which command does the process rest at its working point?" in reason
+        told = idle.ask_for_tune(dry_run=True).checks[0]
+        assert "type: ros2 param set /relay_node baseline COMMAND" in told
     assert set_parameter(idle, "baseline", 0.0).successful
 
 
