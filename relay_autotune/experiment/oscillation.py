@@ -470,8 +470,8 @@ class Oscillation:
         if self._levels.from_small and not self._levels.grew_enough:
             untold = (
                 "whether the actuator goes as far as the levels could not be told, since no "
-                "oscillation at a quarter of the amplitude stood clear of the noise: give "
-                "command_min and command_max"
+                "oscillation at a quarter of the amplitude stood clear of the noise: look whether "
+                f"it goes from {self._levels.low:g} to {self._levels.high:g}"
             )
             if not self._run.cycles[-1].converged or self._should_have_told():
                 self._end(State.FAILED, f"{untold}; {reason}")
@@ -492,13 +492,7 @@ class Oscillation:
     def _noise_alone(self, first: int, last: int) -> str:
         """Return why the samples first to last - 1 are no oscillation, "" if they may be one."""
         measurement = self._samples.columns(first, last)[1]
-        noise = why_noise_alone(measurement, self._run.noise_std, self._run.counted)
-        if noise and self._levels.from_small:
-            noise += (
-                "; give command_min and command_max, so that it need not begin at a quarter of "
-                "the amplitude"
-            )
-        return noise
+        return why_noise_alone(measurement, self._run.noise_std, self._run.counted)
 
     def _end(self, state: State, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self._run.cycles)

@@ -199,7 +199,7 @@ _MOST_GROWTH = 4.0
 # Reserve on a target, since the swing is not exactly proportional to the amplitude.
 _TO_SPARE = 1.2
 
-# First share of a given amplitude, if its levels may lie beyond the actuator's ends.
+# First share of a given amplitude, since its levels may lie beyond the actuator's ends.
 _SMALL = 0.25
 
 # Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
@@ -231,6 +231,7 @@ class Levels:
         """True while the amplitude may still grow."""
         self._wanted = parameters.amplitude
         self._shift = 0.0
+        self._small = _SMALL
         if self.from_small:
             self.begin_small()
         elif parameters.finds_amplitude:
@@ -297,8 +298,13 @@ class Levels:
 
     def begin_small(self) -> None:
         """Apply the first share of a given amplitude, whatever the kick needed."""
-        self._wanted = _SMALL * self._parameters.amplitude
+        self._wanted = self._small * self._parameters.amplitude
         self._set()
+
+    def begin_larger(self) -> None:
+        """Double the first share of a given amplitude, which noise seemed to answer."""
+        self._small = min(2.0 * self._small, 1.0)
+        self.begin_small()
 
     def shift(self, by: float) -> None:
         """Move both levels, to compensate a load [u]."""
