@@ -21,7 +21,7 @@ from relay_autotune.experiment.faults import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.relay_law import Patience, Relay, Turns, clear_swing
+from relay_autotune.experiment.relay_law import Patience, Relay, Turns, ample_swing, clear_swing
 from relay_autotune.experiment.samples import Run, State
 from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle
@@ -379,11 +379,10 @@ class Oscillation:
             return False
         first, last = self._run.cycle_start[-2:]
         y = self._samples.columns(first, last + 1)[1]
-        least = clear_swing(
-            self._parameters.target_amplitude, self._run.noise_std, self._run.hysteresis, y
-        )
         half_swing = 0.5 * float(y.max() - y.min())
-        clear = clear_swing(0.0, self._run.noise_std, self._run.hysteresis, y)
+        noise = self._run.noise_std
+        clear = clear_swing(noise, self._run.hysteresis, y)
+        least = self._parameters.target_amplitude or ample_swing(clear, noise, self._room, y)
         clipped = (
             "" if self._levels.from_small else self._levels.why_clipped(half_swing, settled=False)
         )
@@ -405,6 +404,13 @@ class Oscillation:
         self._run.cycle_start = (last,)
         return True
 
+    @property
+    def _room(self) -> float:
+        """Distance of the set-point to the nearest limit of the measurement [y]."""
+        p, middle = self._parameters, self._run.setpoint
+        room = min(middle - p.measurement_min, p.measurement_max - middle)
+        return min(room, p.max_deviation) if p.max_deviation > 0.0 else room
+
     def _clipped(self) -> str:
         """Return why the actuator is at its ends, once the swing grows no more; empty: nothing."""
         if not (self._levels.from_small and self._run.is_tried):
@@ -416,7 +422,7 @@ class Oscillation:
         """Return True if a quarter of the last swing would have stood clear of the noise."""
         first, last = self._run.cycle_start[-2:]
         y = self._samples.columns(first, last + 1)[1]
-        clear = clear_swing(0.0, self._run.noise_std, self._run.hysteresis, y)
+        clear = clear_swing(self._run.noise_std, self._run.hysteresis, y)
         return 0.5 * float(y.max() - y.min()) > _CLEARLY * clear
 
     def _cycle_that_ended(self) -> Cycle:

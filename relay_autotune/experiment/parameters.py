@@ -29,8 +29,8 @@ class ExperimentParameters:
         "and command_max, from small to large."
     )
     target_amplitude: float = quantity(0.0, "y", lower=0.0).means(
-        "For amplitude 0: half the swing of the measurement that is large enough; 0: when the "
-        "oscillation stands clear of noise, hysteresis and resolution."
+        "For amplitude 0: half the swing of the measurement that is large enough; 0: twenty times "
+        "noise or resolution, within a third of the way to a limit of the measurement."
     )
     bias: float = quantity(0.0, "u").means(
         "Offset of the middle of the two levels from the baseline; 0: bias_ratio decides."

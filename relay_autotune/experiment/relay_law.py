@@ -192,6 +192,10 @@ class Turns:
 CLEAR_OF_NOISE = 10.0
 CLEAR_OF_HYSTERESIS = 3.0
 CLEAR_OF_STEPS = 5.0
+# Half swing that a search aims at, in standard deviations of the noise and in steps of the sensor,
+# as far as it takes a share of the way to a limit of the measurement. From an oscillation that is
+# only just clear, the verdict varies with the noise.
+_AMPLE, _OF_ROOM = 20.0, 1.0 / 3.0
 
 # Least and largest growth of a too small amplitude at a time.
 _LEAST_GROWTH = 1.5
@@ -363,22 +367,34 @@ class Levels:
         return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)
 
 
-def clear_swing(
-    target: float, noise_std: float, hysteresis: float, measurement: FloatArray
-) -> float:
-    """Return the half swing at which the amplitude is large enough [y].
+def clear_swing(noise_std: float, hysteresis: float, measurement: FloatArray) -> float:
+    """Return the half swing that is clear of noise, hysteresis and resolution [y].
 
-    :param target: the user's target [y]; 0: clear of noise, hysteresis and resolution.
     :param noise_std: standard deviation of the noise [y].
     :param hysteresis: half width of the relay's band [y].
-    :param measurement: samples of the oscillation [y], shape (n,); the smallest difference
-        between two that follow each other is taken for the sensor's resolution.
+    :param measurement: samples of the oscillation [y], shape (n,).
     """
-    if target > 0.0:
-        return target
+    return max(
+        CLEAR_OF_NOISE * noise_std,
+        CLEAR_OF_HYSTERESIS * hysteresis,
+        CLEAR_OF_STEPS * _resolution(measurement),
+    )
+
+
+def ample_swing(clear: float, noise_std: float, room: float, measurement: FloatArray) -> float:
+    """Return the half swing at which the amplitude is large enough where no target is given [y].
+
+    :param clear: half swing that is clear of noise, hysteresis and resolution [y].
+    :param noise_std: standard deviation of the noise [y].
+    :param room: distance of the set-point to the nearest limit of the measurement [y].
+    :param measurement: samples of the oscillation [y], shape (n,).
+    """
+    ample = _AMPLE * max(noise_std, _resolution(measurement))
+    return max(clear, min(ample, _OF_ROOM * room))
+
+
+def _resolution(measurement: FloatArray) -> float:
+    """Return the smallest difference between two samples that follow each other [y]."""
     steps = abs(measurement[1:] - measurement[:-1])
     steps = steps[steps > 0.0]
-    resolution = float(steps.min()) if steps.size else 0.0
-    return max(
-        CLEAR_OF_NOISE * noise_std, CLEAR_OF_HYSTERESIS * hysteresis, CLEAR_OF_STEPS * resolution
-    )
+    return float(steps.min()) if steps.size else 0.0

@@ -199,6 +199,23 @@ def test_a_coarse_sensor_needs_several_steps():
     assert 0.5 * (cycle.peak_max - cycle.peak_min) >= 4.9 * step
 
 
+@pytest.mark.parametrize(
+    ("limits", "low", "high"),
+    [({}, 1.9, 4.0), ({"max_deviation": 3.0}, 0.95, 2.0), ({"measurement_max": 3.0}, 0.95, 2.0)],
+)
+def test_a_swing_of_twenty_steps_is_aimed_at_where_the_limits_allow_it(limits, low, high):
+    plant, step, noise = FopdtPlant(2.0, 2.0, 1.0), 0.1, gaussian(0.03)
+    tune, command = searching(**limits), 0.0
+    for k in range(40_000):
+        y = round((plant.advance(0.05 * k, command) + noise()) / step) * step
+        command = tune.step(0.05 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    cycle = limit_cycle(tune.record())
+    assert low <= 0.5 * (cycle.peak_max - cycle.peak_min) < high
+
+
 # Delay and rate.
 
 
