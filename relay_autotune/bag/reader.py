@@ -42,11 +42,13 @@ class Recording:
     :param path: as it was given.
     :param experiments: the records, at least one.
     :param notes: what to know about it, each a sentence.
+    :param of_one_process: whether they are parts of one measurement and one command.
     """
 
     path: Path
     experiments: tuple[Record, ...]
     notes: tuple[str, ...] = ()
+    of_one_process: bool = False
 
 
 def read_experiments(
@@ -99,7 +101,9 @@ def read_experiments(
                     raise
                 raise type(error)("; ".join((str(error), *amiss))) from error
     parts = tuple(window(record, wanted.start, wanted.end) for record in records)
-    return Recording(path, parts, tuple(notes))
+    # Those of relay_node may be of several loops, and tell of themselves how they ended.
+    of_one = all(record.outcome is Outcome.UNKNOWN for record in records)
+    return Recording(path, parts, tuple(notes), of_one)
 
 
 def may_be_recording(path: Path) -> bool:

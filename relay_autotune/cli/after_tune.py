@@ -71,6 +71,7 @@ from relay_autotune.experiment.settling import NO_REST_AT
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
+from relay_autotune.nodes.lifetime import NODE_FAILED
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law, rate_from
 from relay_autotune.nodes.tune_client import TuneClient
@@ -239,6 +240,11 @@ class AfterTune:
             return [("prove the gains", f"{again} --verify")] if new and proven is None else []
         if result.outcome == result.COMPLETED:
             return []
+        if result.reason.startswith(NODE_FAILED):
+            # The same command again would meet the same defect.
+            return [
+                ("report it", "this is a defect: send its reason, and the recording if you can")
+            ]
         if new and result.reason.startswith(NO_REST_AT):
             # The same command again would drive the process away again.
             return [("once it rests", "start again with --at and the command at which it rests")]

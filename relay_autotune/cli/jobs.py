@@ -37,6 +37,7 @@ from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exporte
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
+from relay_autotune.parts import agreed
 from relay_autotune.quantities import declared
 from relay_autotune.record.record import Record
 from relay_autotune.result import Analysis
@@ -165,7 +166,8 @@ def analysed(
         return (analyse_jointly(records, **vars(job.task)),)
     recording = read_experiments(job.paths, job.selection, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
-    return tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
+    found = tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
+    return agreed(found) if recording.of_one_process else found
 
 
 def _exported(

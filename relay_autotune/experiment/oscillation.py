@@ -21,7 +21,7 @@ from relay_autotune.experiment.faults import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.relay_law import Patience, Relay, Turns, clear_swing
+from relay_autotune.experiment.relay_law import Patience, Relay, Turns, ample_swing, clear_swing
 from relay_autotune.experiment.samples import Run, State
 from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle
@@ -146,7 +146,10 @@ class Oscillation:
             # limit of the next stay.
             was_shifted = self._shifts > 0
             self._answers = self._turns.add(
-                t, relay.last_stay, self._balance, counts=relay.switches > 1 and not was_shifted
+                t,
+                relay.last_stay,
+                self._levels.balance,
+                counts=relay.switches > 1 and not was_shifted,
             )
             self._learn(0.0 if was_shifted else relay.last_stay)
             self._shifts = 0
@@ -219,7 +222,7 @@ class Oscillation:
         self._answered.clear()
         self._long_stays = 0
         self._switches_before = self._run.switches
-        self._patience = Patience(self._levels.amplitude, self._levels.bias)
+        self._patience = Patience(self._levels.balance)
         self._turns = Turns(t, self._run.response_time)
         self._answers = self._is_lost = False
         # The shortest cycle before a cycle was lost [s]; 0: no cycle was lost.
@@ -250,12 +253,6 @@ class Oscillation:
             limit = max(_PATIENCE_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
         self._longest_limit = max(self._longest_limit, self._limit)
-
-    @property
-    def _balance(self) -> float:
-        """Ratio of the shorter to the longer stay of a relay with this bias."""
-        amplitude, bias = self._levels.amplitude, abs(self._levels.bias)
-        return max(amplitude - bias, 0.0) / (amplitude + bias)
 
     def _learn_anew(self) -> None:
         """Learn the length of a stay again from the relay's present switching, or fail."""
@@ -382,11 +379,10 @@ class Oscillation:
             return False
         first, last = self._run.cycle_start[-2:]
         y = self._samples.columns(first, last + 1)[1]
-        least = clear_swing(
-            self._parameters.target_amplitude, self._run.noise_std, self._run.hysteresis, y
-        )
         half_swing = 0.5 * float(y.max() - y.min())
-        clear = clear_swing(0.0, self._run.noise_std, self._run.hysteresis, y)
+        noise = self._run.noise_std
+        clear = clear_swing(noise, self._run.hysteresis, y)
+        least = self._parameters.target_amplitude or ample_swing(clear, noise, self._room, y)
         clipped = (
             "" if self._levels.from_small else self._levels.why_clipped(half_swing, settled=False)
         )
@@ -408,6 +404,13 @@ class Oscillation:
         self._run.cycle_start = (last,)
         return True
 
+    @property
+    def _room(self) -> float:
+        """Distance of the set-point to the nearest limit of the measurement [y]."""
+        p, middle = self._parameters, self._run.setpoint
+        room = min(middle - p.measurement_min, p.measurement_max - middle)
+        return min(room, p.max_deviation) if p.max_deviation > 0.0 else room
+
     def _clipped(self) -> str:
         """Return why the actuator is at its ends, once the swing grows no more; empty: nothing."""
         if not (self._levels.from_small and self._run.is_tried):
@@ -419,7 +422,7 @@ class Oscillation:
         """Return True if a quarter of the last swing would have stood clear of the noise."""
         first, last = self._run.cycle_start[-2:]
         y = self._samples.columns(first, last + 1)[1]
-        clear = clear_swing(0.0, self._run.noise_std, self._run.hysteresis, y)
+        clear = clear_swing(self._run.noise_std, self._run.hysteresis, y)
         return 0.5 * float(y.max() - y.min()) > _CLEARLY * clear
 
     def _cycle_that_ended(self) -> Cycle:
@@ -473,8 +476,8 @@ class Oscillation:
         if self._levels.from_small and not self._levels.grew_enough:
             untold = (
                 "whether the actuator goes as far as the levels could not be told, since no "
-                "oscillation at a quarter of the amplitude stood clear of the noise: give "
-                "command_min and command_max"
+                "oscillation at a quarter of the amplitude stood clear of the noise: look whether "
+                f"it goes from {self._levels.low:g} to {self._levels.high:g}"
             )
             if not self._run.cycles[-1].converged or self._should_have_told():
                 self._end(State.FAILED, f"{untold}; {reason}")
@@ -495,13 +498,7 @@ class Oscillation:
     def _noise_alone(self, first: int, last: int) -> str:
         """Return why the samples first to last - 1 are no oscillation, "" if they may be one."""
         measurement = self._samples.columns(first, last)[1]
-        noise = why_noise_alone(measurement, self._run.noise_std, self._run.counted)
-        if noise and self._levels.from_small:
-            noise += (
-                "; give command_min and command_max, so that it need not begin at a quarter of "
-                "the amplitude"
-            )
-        return noise
+        return why_noise_alone(measurement, self._run.noise_std, self._run.counted)
 
     def _end(self, state: State, reason: str) -> None:
         disturbed = sum(cycle.disturbed for cycle in self._run.cycles)

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from relay_autotune.errors import ParameterError
 from relay_autotune.quantities import check, declared, quantity
 
+# An amplitude that is not given starts at this part of the command's range.
+FIRST_SHARE = 0.01
+
 
 @dataclass(frozen=True)
 class ExperimentParameters:
@@ -26,8 +29,8 @@ class ExperimentParameters:
         "and command_max, from small to large."
     )
     target_amplitude: float = quantity(0.0, "y", lower=0.0).means(
-        "For amplitude 0: half the swing of the measurement that is large enough; 0: when the "
-        "oscillation stands clear of noise, hysteresis and resolution."
+        "For amplitude 0: half the swing of the measurement that is large enough; 0: twenty times "
+        "noise or resolution, within a third of the way to a limit of the measurement."
     )
     bias: float = quantity(0.0, "u").means(
         "Offset of the middle of the two levels from the baseline; 0: bias_ratio decides."
@@ -101,6 +104,36 @@ class ExperimentParameters:
         """True if the amplitude is not given, and the experiment finds it by itself."""
         return self.amplitude == 0.0
 
+    @property
+    def first_amplitude(self) -> float:
+        """The amplitude with which the relay begins where it finds its own [u]."""
+        first = FIRST_SHARE * (self.command_max - self.command_min)
+        return first if abs(self.bias) < first else 1.5 * abs(self.bias)
+
+    def why_one_way(self, baseline: float) -> str:
+        """Return why a baseline leaves the relay one way only, and what to do; empty: both.
+
+        No relay oscillates about an end of the actuator: with one level the process already is
+        where it goes with the other.
+
+        :param baseline: command of the operating point [u].
+        """
+        first = self.first_amplitude if self.finds_amplitude else 0.0
+        bias = self.bias or self.bias_ratio * first
+        for name, limit, room, step in (
+            ("command_min", self.command_min, baseline - self.command_min, first - bias),
+            ("command_max", self.command_max, self.command_max - baseline, first + bias),
+        ):
+            if room == 0.0 or (self.finds_amplitude and 0.0 < room < step):
+                where = "too near to" if room else "at"
+                return (
+                    f"the baseline, {baseline:g}, is {where} the actuator's end, {name} "
+                    f"{limit:g}: from there the command can go one way only; at which command "
+                    f"does the process rest at its working point? Send that, wait until it rests, "
+                    f"and give it as the baseline"
+                )
+        return ""
+
     def validate(self, baseline: float | None = None) -> None:
         """Refuse values out of range and values that contradict each other.
 
@@ -155,6 +188,8 @@ class ExperimentParameters:
     def _validate_levels(self, baseline: float) -> None:
         if not math.isfinite(baseline):
             raise ParameterError(f"the baseline is {baseline:g}, expected a finite command")
+        if why := self.why_one_way(baseline):
+            raise ParameterError(why)
         if self.finds_amplitude:
             if not self.command_min <= baseline <= self.command_max:
                 raise ParameterError(

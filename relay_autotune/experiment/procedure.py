@@ -66,6 +66,8 @@ _PATIENT = 10.0
 
 # Cycles that a tune usually takes beyond those that must agree.
 _USUAL_EXTRA = 2
+SMALL_CYCLES = 2
+"""Oscillations that a given amplitude takes longer where it begins small: one, and the way on."""
 
 
 class Procedure(Run):
@@ -297,6 +299,8 @@ class Procedure(Run):
             return self.levels.high if t < pulse_end else self.baseline
         if watch.remains < self.noise_std:
             # The pulse left no deviation: noise had looked like a response.
+            if self.levels.from_small:
+                self.levels.begin_larger()
             return self._kick()
         self.process_gain_sign = sign
         return self._relay(doubtful=True)
@@ -315,12 +319,15 @@ class Procedure(Run):
         return self._oscillation.command
 
 
-def how_long(parameters: ExperimentParameters, interval: float, limit: float) -> str:
+def how_long(
+    parameters: ExperimentParameters, interval: float, limit: float, *, from_small: bool = False
+) -> str:
     """Say how long a tune may take, before it begins.
 
     :param parameters: the experiment's parameters.
     :param interval: mean interval of the samples [s]; 0: not known.
     :param limit: longest settling [s].
+    :param from_small: whether a given amplitude begins at a quarter of that.
     """
     if parameters.settle_time > 0.0:
         settles = f"{duration(parameters.settle_time)} at rest"
@@ -328,7 +335,7 @@ def how_long(parameters: ExperimentParameters, interval: float, limit: float) ->
         least = NOISE_SAMPLES * interval
         settles = f"{duration(least)} or more" if least > 0.0 else "some time"
         settles += f" until the measurement is steady, {duration(limit)} at most"
-    usual = parameters.min_cycles + _USUAL_EXTRA
+    usual = parameters.min_cycles + _USUAL_EXTRA + from_small * SMALL_CYCLES
     told = f"it takes {settles}, then one step and about {usual} oscillations of the loop"
     if parameters.max_duration > 0.0:
         return f"{told}, {duration(parameters.max_duration)} at most in all"

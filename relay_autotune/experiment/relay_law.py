@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.parameters import FIRST_SHARE, ExperimentParameters
 
 
 class Relay:
@@ -71,16 +71,15 @@ class Patience:
     limit is at least :data:`LEAST_SAMPLES` samples: without noise, the response of a high-order
     process is seen at the first sample, and takes hundreds of samples to turn.
 
-    :param amplitude: half the distance of the levels [u].
-    :param bias: offset of their middle from the baseline [u], smaller than the amplitude.
+    :param balance: ratio of the smaller to the larger step of the relay, > 0.
     """
 
     RATIO = 10.0
     LEAST_SAMPLES = 200
 
-    def __init__(self, amplitude: float, bias: float) -> None:
+    def __init__(self, balance: float) -> None:
         self._longest = 0.0
-        self._ratio = self.RATIO * (amplitude + abs(bias)) / (amplitude - abs(bias))
+        self._ratio = self.RATIO / balance
         self.limit = math.inf
         """Limit of the present stay [s]."""
 
@@ -188,13 +187,15 @@ class Turns:
         return True
 
 
-# An amplitude that is not given starts at this part of the command's range.
-FIRST_SHARE = 0.01
 # Half swing that is clear of noise (in standard deviations), of the hysteresis (in half widths),
 # and of the sensor's resolution (in steps).
 CLEAR_OF_NOISE = 10.0
 CLEAR_OF_HYSTERESIS = 3.0
 CLEAR_OF_STEPS = 5.0
+# Half swing that a search aims at, in standard deviations of the noise and in steps of the sensor,
+# as far as it takes a share of the way to a limit of the measurement. From an oscillation that is
+# only just clear, the verdict varies with the noise.
+_AMPLE, _OF_ROOM = 20.0, 1.0 / 3.0
 
 # Least and largest growth of a too small amplitude at a time.
 _LEAST_GROWTH = 1.5
@@ -202,7 +203,7 @@ _MOST_GROWTH = 4.0
 # Reserve on a target, since the swing is not exactly proportional to the amplitude.
 _TO_SPARE = 1.2
 
-# First share of a given amplitude, if its levels may lie beyond the actuator's ends.
+# First share of a given amplitude, since its levels may lie beyond the actuator's ends.
 _SMALL = 0.25
 
 # Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
@@ -234,13 +235,11 @@ class Levels:
         """True while the amplitude may still grow."""
         self._wanted = parameters.amplitude
         self._shift = 0.0
+        self._small = _SMALL
         if self.from_small:
             self.begin_small()
         elif parameters.finds_amplitude:
-            span = parameters.command_max - parameters.command_min
-            self._wanted = FIRST_SHARE * span
-            if abs(parameters.bias) >= self._wanted:
-                self._wanted = 1.5 * abs(parameters.bias)
+            self._wanted = parameters.first_amplitude
         # Amplitude, half swing and levels of the first cycle that was clear of the noise.
         self._first_clear: tuple[float, float, float, float] | None = None
         self._set()
@@ -278,6 +277,15 @@ class Levels:
         return 0.5 * (self.high + self.low) - self._baseline
 
     @property
+    def balance(self) -> float:
+        """Ratio of the smaller to the larger step, at least that with which a search may begin.
+
+        Levels that a load has shifted may both lie on one side of the baseline.
+        """
+        amplitude, bias = self.amplitude, abs(self.bias)
+        return max((amplitude - bias) / (amplitude + bias), FIRST_SHARE)
+
+    @property
     def can_grow(self) -> bool:
         """True if the amplitude may be made larger."""
         p = self._parameters
@@ -294,8 +302,13 @@ class Levels:
 
     def begin_small(self) -> None:
         """Apply the first share of a given amplitude, whatever the kick needed."""
-        self._wanted = _SMALL * self._parameters.amplitude
+        self._wanted = self._small * self._parameters.amplitude
         self._set()
+
+    def begin_larger(self) -> None:
+        """Double the first share of a given amplitude, which noise seemed to answer."""
+        self._small = min(2.0 * self._small, 1.0)
+        self.begin_small()
 
     def shift(self, by: float) -> None:
         """Move both levels, to compensate a load [u]."""
@@ -354,22 +367,34 @@ class Levels:
         return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)
 
 
-def clear_swing(
-    target: float, noise_std: float, hysteresis: float, measurement: FloatArray
-) -> float:
-    """Return the half swing at which the amplitude is large enough [y].
+def clear_swing(noise_std: float, hysteresis: float, measurement: FloatArray) -> float:
+    """Return the half swing that is clear of noise, hysteresis and resolution [y].
 
-    :param target: the user's target [y]; 0: clear of noise, hysteresis and resolution.
     :param noise_std: standard deviation of the noise [y].
     :param hysteresis: half width of the relay's band [y].
-    :param measurement: samples of the oscillation [y], shape (n,); the smallest difference
-        between two that follow each other is taken for the sensor's resolution.
+    :param measurement: samples of the oscillation [y], shape (n,).
     """
-    if target > 0.0:
-        return target
+    return max(
+        CLEAR_OF_NOISE * noise_std,
+        CLEAR_OF_HYSTERESIS * hysteresis,
+        CLEAR_OF_STEPS * _resolution(measurement),
+    )
+
+
+def ample_swing(clear: float, noise_std: float, room: float, measurement: FloatArray) -> float:
+    """Return the half swing at which the amplitude is large enough where no target is given [y].
+
+    :param clear: half swing that is clear of noise, hysteresis and resolution [y].
+    :param noise_std: standard deviation of the noise [y].
+    :param room: distance of the set-point to the nearest limit of the measurement [y].
+    :param measurement: samples of the oscillation [y], shape (n,).
+    """
+    ample = _AMPLE * max(noise_std, _resolution(measurement))
+    return max(clear, min(ample, _OF_ROOM * room))
+
+
+def _resolution(measurement: FloatArray) -> float:
+    """Return the smallest difference between two samples that follow each other [y]."""
     steps = abs(measurement[1:] - measurement[:-1])
     steps = steps[steps > 0.0]
-    resolution = float(steps.min()) if steps.size else 0.0
-    return max(
-        CLEAR_OF_NOISE * noise_std, CLEAR_OF_HYSTERESIS * hysteresis, CLEAR_OF_STEPS * resolution
-    )
+    return float(steps.min()) if steps.size else 0.0

@@ -59,6 +59,9 @@ LOOK_AROUND = 0.005
 # After this time without a callback all work is done; it also lets the last message leave [s].
 _NOTHING_MORE = 0.02
 
+NODE_FAILED = "the node failed"
+"""How the reason of an end begins if the cause is a defect of the node."""
+
 
 class Executor(SingleThreadedExecutor):
     """rclpy's single-threaded executor, one callback at a time, with a favoured subscription."""
@@ -372,7 +375,7 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
             more = node.work(idle=not busy)
         reason = f"the node was stopped by {signal_name(signals.came[0])}"
     except Exception as error:
-        status, reason = 1, f"the node failed: {_where(error)}"
+        status, reason = 1, f"{NODE_FAILED}: {_where(error)}"
     # The safe command goes out before the reason is logged.
     for end in (partial(node.end, reason), partial(executor.finish, _FINISH_WITHIN)):
         try:

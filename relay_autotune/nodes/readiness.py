@@ -22,7 +22,7 @@ from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.experiment.experiment import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
+from relay_autotune.experiment.procedure import SETTLING_LIMIT, SMALL_CYCLES, how_long
 from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.nodes.loop_ends import Ends, LoopEnds
 from relay_autotune.nodes.parameters import merged, values_of
@@ -34,8 +34,6 @@ from relay_autotune.text import duration
 
 _T = TypeVar("_T")
 
-# Levels this many times the baseline may be beyond the ends of the actuator.
-_FAR = 10.0
 # Free space below which a recording is said to be at risk [bytes].
 _LITTLE = 100_000_000
 _NAME_WIDTH = 12
@@ -130,12 +128,14 @@ class Ready:
     :param baseline: command of the operating point [u].
     :param policy: how the process will be left.
     :param from_small: True if a given amplitude is not put on at once.
+    :param period: of the oscillation in the last tune [s]; NaN: not known.
     """
 
     parameters: ExperimentParameters
     baseline: float
     policy: SafePolicy
     from_small: bool
+    period: float
 
     @property
     def plan(self) -> str:
@@ -155,9 +155,12 @@ class Ready:
             if self.from_small:
                 small = Levels(parameters, baseline, from_small=True)
                 plan += (
-                    f", for the first cycle between {small.low:g} and {small.high:g}, since no "
-                    f"command_min and command_max say that the actuator goes as far"
+                    f"; for the first cycle between {small.low:g} and {small.high:g}: the swing "
+                    f"has to grow with the levels if the actuator goes as far; that takes about "
+                    f"{SMALL_CYCLES} oscillations"
                 )
+                if self.period > 0.0:
+                    plan += f", {duration(SMALL_CYCLES * self.period)} by the last tune"
         if self.policy.give_back:
             return f"{plan}, then back to controller_command"
         return f"{plan}, then proportional control holds the process" if self.policy.hold else plan
@@ -195,7 +198,7 @@ class Readiness:
         if amplitude != 0.0:
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
-        planned = partial(self._planned, values, parameters, held)
+        planned = partial(self._planned, values, parameters, held, last)
         ready = checks.do("levels", planned, lambda found: found.plan)
         measures = partial(self._require_measurement, values["measurement_timeout"])
         checks.do("measurement", measures, lambda _: self._heard())
@@ -217,11 +220,25 @@ class Readiness:
         checks.tell("recording", *_recording_in(values["record_directory"]))
         checks.tell("model", *_identifier_of(self._node, self._ends.gains.topic_name))
         checks.tell("expected", _expected(parameters, last))
-        checks.tell("time", how_long(parameters, self._sensor.samples.interval, SETTLING_LIMIT))
+        checks.tell("time", self.time_of(ready, parameters))
         return ready if checks.refusal is None else None
 
+    def time_of(self, ready: Ready | None, parameters: ExperimentParameters) -> str:
+        """Say how long a tune takes.
+
+        :param ready: what it will do; None: it cannot start.
+        :param parameters: the experiment's parameters.
+        """
+        small = ready is not None and ready.from_small
+        interval = self._sensor.samples.interval
+        return how_long(parameters, interval, SETTLING_LIMIT, from_small=small)
+
     def _planned(
-        self, values: Mapping[str, Any], parameters: ExperimentParameters, held: float | None
+        self,
+        values: Mapping[str, Any],
+        parameters: ExperimentParameters,
+        held: float | None,
+        last: tuple[float, Cycle] | None,
     ) -> Ready:
         """Return what a tune would do; raise the reason where that is not possible."""
         parameters.validate()
@@ -230,14 +247,16 @@ class Readiness:
             parameters, baseline = _on_setpoint(parameters)
         else:
             baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
-            _require_known_range(parameters, values["baseline"])
+            if why := parameters.why_one_way(baseline):
+                raise NotReadyError(why, typed="baseline COMMAND")
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the
         # actuator ends.
         told = moves_setpoint or self._node.count_publishers("command_feedback") > 0
-        from_small = not told and _is_beyond_known(parameters, baseline)
-        return Ready(parameters, baseline, policy, from_small)
+        from_small = not (told or parameters.finds_amplitude)
+        period = last[1].period if last is not None else math.nan
+        return Ready(parameters, baseline, policy, from_small, period)
 
     def _require_measurement(self, timeout: float) -> None:
         """Refuse a start without measurements, with the reason as far as the graph shows it."""
@@ -372,52 +391,6 @@ def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
             f"start_without_hold to true"
         )
     return SafePolicy(command=safe, hold=True, gain=gain)
-
-
-def _require_known_range(parameters: ExperimentParameters, baseline: float) -> None:
-    """Refuse levels far beyond the baseline if no command limit confirms such a range.
-
-    A saturated actuator moves less than its command, and a record of two levels need not show it.
-    The model's gain is then too small, and the controller gains are too large by the same factor.
-
-    :param parameters: the experiment's parameters, valid.
-    :param baseline: command of the operating point, as the user gave it [u]; with 0 there is no
-        scale to compare with, and no refusal.
-    :raises NotReadyError: with the limit to give.
-    """
-    if parameters.finds_amplitude or baseline == 0.0 or math.isnan(baseline):
-        return
-    middle, most = baseline + parameters.relay_bias, _FAR * abs(baseline)
-    for level, limit, name in (
-        (middle + parameters.amplitude, parameters.command_max, "command_max"),
-        (middle - parameters.amplitude, parameters.command_min, "command_min"),
-    ):
-        if abs(level) > most and math.isinf(limit):
-            raise NotReadyError(
-                f"a level of the relay is {level:g}, more than {_FAR:g} times the baseline "
-                f"{baseline:g}, and {name} is not given: if the actuator does not go so far, the "
-                f"gains become too large; give command_min and command_max, the ends of the "
-                f"actuator, or a smaller amplitude",
-                typed=f"{name} LIMIT",
-            )
-
-
-def _is_beyond_known(parameters: ExperimentParameters, baseline: float) -> bool:
-    """Return True if nothing says that the actuator goes as far as the levels.
-
-    That is a level on the other side of zero than the baseline, or more than twice as far from it,
-    without a command limit on that side.
-
-    :param parameters: the experiment's parameters, valid.
-    :param baseline: command of the operating point [u].
-    """
-    if parameters.finds_amplitude:
-        return False
-    middle = baseline + parameters.relay_bias
-    least, most = sorted((0.0, 2.0 * baseline))
-    too_high = middle + parameters.amplitude > most and math.isinf(parameters.command_max)
-    too_low = middle - parameters.amplitude < least and math.isinf(parameters.command_min)
-    return too_high or too_low
 
 
 def require_settable(node: Node, changes: Sequence[RosParameter], running: str) -> None:

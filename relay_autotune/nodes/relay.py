@@ -20,7 +20,6 @@ from relay_autotune.errors import FieldError, NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
-from relay_autotune.experiment.procedure import SETTLING_LIMIT, how_long
 from relay_autotune.nodes.goals import Narrator, TuneAction, serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
@@ -190,7 +189,7 @@ class RelayNode(ServedNode):
         lines = checks.lines if dry_run else []
         if ready is None:
             return StartTune.Response(reason=str(checks.refusal), checks=lines)
-        takes = how_long(ready.parameters, self._sensor.samples.interval, SETTLING_LIMIT)
+        takes = self._readiness.time_of(ready, ready.parameters)
         if dry_run:
             reason = f"a tune could start: {ready.plan}; {takes}"
             return StartTune.Response(accepted=True, reason=reason, checks=lines)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,14 +19,19 @@ from relay_autotune.record.record import Record, roughness
 _FEWEST_SWITCHES = 4
 # A stay this many times the usual one ends a relay phase.
 _LONG_STAY = 4.0
+# A relay switches when the measurement comes to its level, so that this part of a stay at most is
+# left then. A process that comes to rest, within 5 %, is there after three time constants, and a
+# timer lets it be for a fourth or more.
+_LEFT = 0.25
 
-# Steps form one experiment unless the process rests between them this many times as long as it
+# Changes form one experiment unless the process rests between them this many times as long as it
 # moved.
 _REST = 10.0
 
-# A command that changes at more than this share of the samples comes from a controller.
+# A command that changes at more than this share of the samples, and takes this many values, comes
+# from a controller.
 _CONTINUOUS = 0.2
-_FEWEST_CHANGES = 20
+_FEWEST_VALUES = 20
 
 # A break in the record: no sample for this time, and for a multiple of the usual interval.
 _BREAK_S = 60.0
@@ -43,9 +49,6 @@ _MOST_FOR_SPEED = 2000
 _NOISE = 4.0
 _SHARE = 0.05
 
-# Number of parts of a record under a controller, to separate movement from rest.
-_BLOCKS = 400
-
 
 @dataclass(frozen=True)
 class Stretch:
@@ -53,7 +56,7 @@ class Stretch:
 
     :param first: index of its first sample.
     :param last: index of its last sample.
-    :param kind: ``relay``, ``steps``, ``pulses`` or ``closed loop``.
+    :param kind: ``relay``, ``steps``, ``pulses``, ``sequence`` (of two levels) or ``closed loop``.
     :param reason: description for the user.
     """
 
@@ -140,20 +143,34 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
     times, values = held.times[inside], held.values[inside]
     # Rows that share a time stamp are one instant, at which the command changes once.
     instants = np.count_nonzero(np.diff(record.time[first : last + 1]))
-    varies = times.size >= max(_FEWEST_CHANGES, _CONTINUOUS * instants)
-    if times.size and not varies and times[-1] == record.time[last]:
+    often = times.size >= _CONTINUOUS * instants
+    if times.size and not often and times[-1] == record.time[last]:
         # A change at the last sample, as when all is switched off, has no response behind it.
         times, values, last = times[:-1], values[:-1], last - 1
     if times.size == 0:
         return []
     earlier = held.values[: int(np.argmax(inside))]
     before = float(earlier[-1]) if earlier.size else held.initial
-    if varies:
-        found = _moving_parts(record, first, last)
-    else:
-        changes = _Changes(times, np.concatenate(([before], values)))
-        found = _switching_parts(record, last, changes)
-    return _with_rest(record, first, last, found)
+    noise = roughness(record.measurement[first : last + 1])
+    if often and np.unique(values).size >= _FEWEST_VALUES:
+        return _with_rest(record, first, last, noise, _moving(record, first, last, noise))
+    noise = min(noise, _noise_between(record, first, last, times))
+    changes = _Changes(times, np.concatenate(([before], values)))
+    return _with_rest(record, first, last, noise, _switching_parts(record, last, changes, noise))
+
+
+def _noise_between(record: Record, first: int, last: int, changes: FloatArray) -> float:
+    """Return the noise in the later halves of the command's stays [y]; inf: they are too short.
+
+    A process that answers fast moves at each change, which is no noise.
+
+    :param changes: of the command [s], shape (m,).
+    """
+    time, y = record.time[first : last + 1], record.measurement[first : last + 1]
+    bounds = np.concatenate(([time[0]], changes, [time[-1]]))
+    k = np.clip(np.searchsorted(bounds, time[:-2], side="right"), 1, bounds.size - 1)
+    quiet = (time[:-2] >= 0.5 * (bounds[k - 1] + bounds[k])) & (time[2:] <= bounds[k])
+    return roughness(y, quiet) if np.any(quiet) else math.inf
 
 
 @dataclass(frozen=True)
@@ -172,57 +189,33 @@ class _Changes:
 
 
 def _switching_parts(
-    record: Record, last: int, changes: _Changes
+    record: Record, last: int, changes: _Changes, noise: float
 ) -> list[tuple[float, float, str, str]]:
     """Return begin, end, kind and reason of each experiment, without the rest around it."""
-    relay = _relay_runs(changes)
-    around = [_with_kick(changes, run, relay) for run in relay]
-    found = [_relay(record, changes, *runs) for runs in zip(relay, around, strict=True)]
-    follows = sum(b - a for (a, b), part in zip(relay, found, strict=True) if part[2] == "relay")
-    if 2 * follows < changes.times.size:
-        # Parts of a timed sequence look like a relay by chance.
-        found = [(begin, end, "pulses", reason) for begin, end, _, reason in found]
+    runs = _two_level_runs(changes)
+    relays = [run for run in runs if _follows(record, changes, run)]
+    if 2 * sum(stop - begin for begin, stop in relays) < changes.times.size:
+        # A controller at its limits switches now and then as a relay would.
+        relays = []
+    around = [_with_kick(changes, run, relays) for run in relays]
+    found = [_relay(changes, *each) for each in zip(relays, around, strict=True)]
+    # Switches of one run belong together, however long the process rests between them.
+    within = {k for begin, stop in runs for k in range(begin + 1, stop)}
     taken = {k for run in around for k in range(*run)}
-    settled = _settled(record, last, changes)
+    settled = _settled(record, last, changes, noise)
     group: list[int] = []
     for k in range(changes.times.size):
-        if k in taken:
+        apart = group and k not in within and _rests(changes, settled, group, k)
+        if k in taken or apart:
             found += _steps(changes, settled, group)
             group = []
-            continue
-        if group and _rests(changes, settled, group, k):
-            found += _steps(changes, settled, group)
-            group = []
-        group.append(k)
+        if k not in taken:
+            group.append(k)
     found += _steps(changes, settled, group)
-    return _merged(changes, sorted(found))
+    return sorted(found)
 
 
-def _merged(
-    changes: _Changes, found: Sequence[tuple[float, float, str, str]]
-) -> list[tuple[float, float, str, str]]:
-    """Join parts without a relay if the process does not rest for long between them."""
-    merged: list[tuple[float, float, str, str]] = []
-    for part in found:
-        last = merged[-1] if merged else None
-        if (
-            last is None
-            or "relay" in (last[2], part[2])
-            or part[0] - last[1] > _REST * (last[1] - last[0])
-        ):
-            merged.append(part)
-            continue
-        inside = (changes.times >= last[0]) & (changes.times <= part[1])
-        levels = changes.levels[1:][inside]
-        reason = (
-            f"{levels.size} changes of the command between {levels.min():g} and "
-            f"{levels.max():g} whatever the measurement does"
-        )
-        merged[-1] = (last[0], max(last[1], part[1]), "pulses", reason)
-    return merged
-
-
-def _relay_runs(changes: _Changes) -> list[tuple[int, int]]:
+def _two_level_runs(changes: _Changes) -> list[tuple[int, int]]:
     """Return first change and the one after the last of each run between the same two levels."""
     levels, times = changes.levels, changes.times
     spread = float(np.ptp(levels))
@@ -263,37 +256,71 @@ def _with_kick(
 
 
 def _relay(
-    record: Record, changes: _Changes, run: tuple[int, int], around: tuple[int, int]
+    changes: _Changes, run: tuple[int, int], around: tuple[int, int]
 ) -> tuple[float, float, str, str]:
     begin, stop = run
-    times, levels = changes.times[begin:stop], changes.levels[begin + 1 : stop + 1]
-    usual = float(np.median(np.diff(times)))
-    low, high = float(np.min(levels)), float(np.max(levels))
-    end = float(changes.times[around[1] - 1]) + usual
-    at = np.clip(np.searchsorted(record.time, times), 0, len(record) - 1)
-    kind = "relay" if _follows(record, at, levels > 0.5 * (low + high)) else "pulses"
-    who = "that follow the measurement" if kind == "relay" else "whatever the measurement does"
-    reason = f"{stop - begin} switches of the command between {low:g} and {high:g} {who}"
-    return float(changes.times[around[0]]), end, kind, reason
+    low, high = _levels(changes, run)
+    end = float(changes.times[around[1] - 1] + np.median(np.diff(changes.times[begin:stop])))
+    reason = (
+        f"{stop - begin} switches of the command between {low:g} and {high:g} that follow the "
+        f"measurement"
+    )
+    return float(changes.times[around[0]]), end, "relay", reason
 
 
-def _follows(record: Record, at: IntArray, up: np.ndarray) -> bool:
-    """Distinguish a relay from timed pulses: a relay switches at the same measurements."""
-    inside = record.measurement[at[0] : at[-1] + 1]
-    swing = float(np.ptp(inside))
-    if swing == 0.0 or np.count_nonzero(up) < 2 or np.count_nonzero(~up) < 2:
-        return False
-    y = record.measurement[at]
-    scatter = max(float(np.std(y[up])), float(np.std(y[~up])))
-    middle = 0.5 * (float(np.max(inside)) + float(np.min(inside)))
-    off = max(abs(float(np.median(y[up])) - middle), abs(float(np.median(y[~up])) - middle))
-    return scatter < 0.15 * swing and off < 0.35 * swing
+def _levels(changes: _Changes, run: tuple[int, int]) -> tuple[float, float]:
+    levels = changes.levels[run[0] + 1 : run[1] + 1]
+    return float(np.min(levels)), float(np.max(levels))
 
 
-def _settled(record: Record, last: int, changes: _Changes) -> FloatArray:
+def _follows(record: Record, changes: _Changes, run: tuple[int, int]) -> bool:
+    """Return whether the switches of a run follow the measurement, as those of a relay do.
+
+    A relay switches when the measurement comes to a level, which is the same each time. So the
+    switch comes soon after the first sample of its stay that is there. A timer lets the process
+    be there for long, or switches before.
+    """
+    begin, stop = run
+    at = np.clip(np.searchsorted(record.time, changes.times[begin:stop]), 0, len(record) - 1)
+    y = record.measurement
+    margin = _SHARE * float(np.ptp(y[at[0] : at[-1] + 1]))
+    rises = changes.levels[begin + 1 : stop + 1] > np.mean(_levels(changes, run))
+    # The command of a relay rises where the measurement has fallen, or where it has risen.
+    return (
+        margin > 0.0
+        and at[-1] > at[0]
+        and any(_left(record.time, side * y, at, rises, margin) < _LEFT for side in (-1.0, 1.0))
+    )
+
+
+def _left(
+    time: FloatArray, y: FloatArray, at: IntArray, rises: np.ndarray, margin: float
+) -> float:
+    """Return the share of the time for which the measurement is at its level before a switch.
+
+    Where it never comes there, the whole stay counts.
+
+    :param time: of the samples [s], shape (n,).
+    :param y: measurement, which has risen where the command rises, shape (n,).
+    :param at: sample of each switch, shape (m,).
+    :param rises: whether the command rises there, shape (m,).
+    :param margin: distance within which the measurement is there [y].
+    """
+    late = 0.0
+    for up in (True, False):
+        ends = 1 + np.flatnonzero(rises[1:] == up)
+        there = y if up else -y
+        level = np.median(there[at[ends]]) - margin
+        for begin, end in zip(at[ends - 1], at[ends], strict=True):
+            # It may have come right after the sample before.
+            come = begin + np.flatnonzero(there[begin + 1 : end + 1] >= level)
+            late += time[end] - time[come[0] if come.size else begin]
+    return float(late / (time[at[-1]] - time[at[0]]))
+
+
+def _settled(record: Record, last: int, changes: _Changes, noise: float) -> FloatArray:
     """Return when the measurement has come to rest after each change [s], shape (m,)."""
     ends = np.append(changes.times[1:], record.time[last])
-    noise = roughness(record.measurement)
     settled = np.empty(changes.times.size)
     for k, (begin, end) in enumerate(zip(changes.times, ends, strict=True)):
         low, high = np.searchsorted(record.time, (begin, end), side="right")
@@ -304,9 +331,10 @@ def _settled(record: Record, last: int, changes: _Changes) -> FloatArray:
         final = float(np.median(part[-max(part.size // 5, 3) :]))
         band = max(_NOISE * noise, _SHARE * float(np.max(np.abs(part - final))))
         # One of many samples may lie far out by chance; the mean of five does not.
-        smooth = np.convolve(part, np.full(5, 0.2), mode="valid")
+        smooth = _smooth(part)
         moving = np.flatnonzero(np.abs(smooth - final) > band)
-        settled[k] = begin if moving.size == 0 else record.time[low + moving[-1]]
+        # A response below the noise may last until the next change.
+        settled[k] = end if moving.size == 0 else record.time[low + moving[-1]]
     return settled
 
 
@@ -323,6 +351,12 @@ def _steps(
         return []
     begin, stop = group[0], group[-1] + 1
     levels = changes.levels[begin : stop + 1]
+    part = float(changes.times[begin]), float(settled[stop - 1])
+    switches = np.unique(levels)
+    if switches.size == 2 and stop - begin >= _FEWEST_SWITCHES:
+        low, high = switches
+        what = f"{stop - begin} switches of the command between {low:g} and {high:g}"
+        return [(*part, "sequence", f"{what} whatever the measurement does")]
     listed = " to ".join(f"{level:g}" for level in levels[:6]) + (
         " ..." if stop - begin > 5 else ""
     )
@@ -330,8 +364,7 @@ def _steps(
     kind = "pulses" if returns else "steps"
     what = ("pulse" if returns else "step") if levels.size <= 3 else kind
     what = "step" if levels.size == 2 else what
-    reason = f"{what} of the command from {listed}"
-    return [(float(changes.times[begin]), float(settled[stop - 1]), kind, reason)]
+    return [(*part, kind, f"{what} of the command from {listed}")]
 
 
 # --- a command that a controller changes all the time
@@ -345,63 +378,46 @@ def _without_outliers(y: FloatArray) -> FloatArray:
     return np.concatenate((inner[:1], inner, inner[-1:]))
 
 
-def _moving_parts(record: Record, first: int, last: int) -> list[tuple[float, float, str, str]]:
-    """Return the parts in which the set-point or a load moved the measurement."""
-    time, y = record.time[first : last + 1], record.measurement[first : last + 1]
-    edges = np.unique(np.linspace(0, y.size, min(_BLOCKS, max(y.size // 5, 1)) + 1).astype(int))
-    noise = roughness(y)
-    y = _without_outliers(y)
-    means = np.add.reduceat(y, edges[:-1]) / np.diff(edges)
-    span = float(np.ptp(y))
-    reach = max(_NOISE * noise, _SHARE * span)
-    if span < 2.5 * reach:
+def _smooth(y: FloatArray) -> FloatArray:
+    """Return means of five samples, since one of many may lie far out by chance."""
+    return np.convolve(y, np.full(5, 0.2), mode="valid")
+
+
+def _moving(
+    record: Record, first: int, last: int, noise: float
+) -> list[tuple[float, float, str, str]]:
+    """Return the part from where the measurement leaves its first rest to its last rest.
+
+    A controller moves it by all that happens in between, however slowly.
+    """
+    y = _without_outliers(record.measurement[first : last + 1])
+    if y.size < 5:
         return []
-    window = 5
-    padded = np.pad(means, window // 2, mode="edge")
-    views = np.lib.stride_tricks.sliding_window_view(padded, window)
-    moving = np.ptp(views, axis=1) > reach
-    bounds = np.flatnonzero(np.diff(np.concatenate(([0], moving.astype(np.int8), [0]))))
-    runs = [
-        (float(time[edges[a]]), float(time[min(edges[b], y.size - 1)]))
-        for a, b in zip(bounds[::2], bounds[1::2], strict=True)
-    ]
-    if not runs:
-        # It moves evenly, as on a ramp, or so fast that no window is like the others.
-        why = "the command varies all the time, and so does the measurement"
-        return [(float(time[0]), float(time[-1]), "closed loop", why)]
-    merged: list[list[float]] = []
-    moves: list[int] = []
-    for begin, end in runs:
-        if merged and begin - merged[-1][1] <= _REST * (merged[-1][1] - merged[-1][0]):
-            merged[-1][1] = end
-            moves[-1] += 1
-        else:
-            merged.append([begin, end])
-            moves.append(1)
-    return [
-        (
-            begin,
-            end,
-            "closed loop",
-            f"the command varies all the time, and the measurement moves {count} "
-            f"{'time' if count == 1 else 'times'}",
-        )
-        for (begin, end), count in zip(merged, moves, strict=True)
-    ]
+    smooth = _smooth(y)
+    reach = max(_NOISE * noise, _SHARE * float(np.ptp(y)))
+    leaves = np.flatnonzero(np.abs(smooth - smooth[0]) > reach)
+    comes = np.flatnonzero(np.abs(smooth - smooth[-1]) > reach)
+    if not (leaves.size and comes.size):
+        return []
+    begin, end = record.time[first + leaves[0]], record.time[first + comes[-1] + 4]
+    return [(float(begin), float(end), "closed loop", "the command varies all the time")]
 
 
 # --- both
 
 
 def _with_rest(
-    record: Record, first: int, last: int, found: Sequence[tuple[float, float, str, str]]
+    record: Record,
+    first: int,
+    last: int,
+    noise: float,
+    found: Sequence[tuple[float, float, str, str]],
 ) -> list[Stretch]:
     """Add the rest before and after each experiment, and drop those without a response."""
     stretches = []
-    noise = roughness(record.measurement[first : last + 1])
     for k, (begin, end, kind, reason) in enumerate(found):
         # Rest shows noise and offset. It is short under a controller, which follows the noise.
-        length = max(end - begin, 0.0) * (_REST if kind in ("steps", "pulses") else 1.0)
+        length = max(end - begin, 0.0) * (1.0 if kind in ("relay", "closed loop") else _REST)
         earliest = found[k - 1][1] if k else float(record.time[first])
         latest = found[k + 1][0] if k + 1 < len(found) else float(record.time[last])
         low = int(np.searchsorted(record.time, max(begin - length, earliest), side="left"))
@@ -409,7 +425,9 @@ def _with_rest(
         low, high = max(low, first), min(high, last)
         part = record.measurement[low : high + 1]
         lasting = record.time[high] > record.time[low]
-        if part.size < 10 or not lasting or float(np.ptp(part)) < 3.0 * _NOISE * noise:
+        # Many switches by the clock show a response below the noise, too.
+        least = 0.0 if kind == "sequence" else 3.0 * _NOISE * noise
+        if part.size < 10 or not lasting or float(np.ptp(part)) <= least:
             continue
         stretches.append(Stretch(low, high, kind, reason))
     return stretches

@@ -68,12 +68,15 @@ def asked_once(
     return ask
 
 
-def roughness(y: FloatArray) -> float:
+def roughness(y: FloatArray, used: np.ndarray | None = None) -> float:
     """Estimate white noise from second differences, which are small in a smooth signal [y].
 
     :param y: samples, shape (n,).
+    :param used: which of the second differences are used, shape (n - 2,); None: all.
     """
     second = np.diff(y, 2)
+    if used is not None:
+        second = second[used]
     return (
         0.0 if second.size == 0 else float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))
     )

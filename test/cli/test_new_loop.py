@@ -369,10 +369,11 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
             "once it rests",
         ),
         ("the measurement 9.1 at 3 s is too high", True, "look whether", "once it rests"),
+        ("the node failed: KeyError: 1 (a.py:1)", False, "the plant is left at", "report it"),
         ("cancelled", False, "the plant is left at the safe command 1040 u", "run it again"),
     ],
 )
-def test_after_the_process_was_driven_away_the_same_command_is_not_offered_again(
+def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_again(
     reason, outside, left_at, next_step
 ):
     words = ["--measurement", "/y", "--command", "/u", "--at", "1040", "--within", "3", "9"]

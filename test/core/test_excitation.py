@@ -88,7 +88,7 @@ def test_relay_phases_apart_are_two_experiments_and_rest_is_none():
 def test_pulses_by_the_clock_are_no_relay():
     times = 500.0 + 200.0 * np.arange(8)
     (found,) = find_experiments(commanded(times, [0, 1] * 4 + [0]))
-    assert found.kind == "pulses"
+    assert found.kind == "sequence"
     assert "whatever the measurement does" in found.reason
 
 
@@ -211,8 +211,67 @@ def test_a_pseudo_random_sequence_is_one_experiment_and_no_relay():
         (found,) = find_experiments(
             commanded(times[times < 2900.0], [k % 2 for k in range(1 + (times < 2900.0).sum())])
         )
-        assert found.kind == "pulses"
+        assert found.kind == "sequence"
         assert "whatever the measurement does" in found.reason
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("stay", [80.0, 200.0, 800.0])
+def test_a_square_wave_whose_process_rests_before_each_switch_is_by_a_timer(stay, noise):
+    """It switches at the same measurements each time, as a relay does, but long after it came."""
+    lag = TransferFunction(1.65, (), (20.0,), 0, 0.0)
+    times = 100.0 + stay * np.arange(8)
+    u = PiecewiseConstant(times, np.arange(1.0, 9.0) % 2.0, 0.0)
+    time = np.arange(0.0, times[-1] + stay, 0.25)
+    y = response(lag, time, u) + np.random.default_rng(3).normal(0.0, noise, time.size)
+    record = Record(time=time, measurement=y, command=u(time), held_input=u)
+    (found,) = find_experiments(record)
+    assert found.kind == "sequence"
+    assert (
+        found.reason == "8 switches of the command between 0 and 1 whatever the measurement does"
+    )
+
+
+@pytest.mark.parametrize("late", [0, 1, 10])
+def test_a_relay_is_known_by_its_switches_also_where_its_command_is_late(late):
+    part = relay()
+    u = np.concatenate((np.full(late, 30.0), part.command[: len(part) - late]))
+    (found,) = find_experiments(Record(time=part.time, measurement=part.measurement, command=u))
+    assert found.kind == "relay"
+
+
+def test_a_sequence_of_two_levels_that_changes_at_half_of_the_samples_is_an_experiment():
+    """Its process answers within a sample or two, which is no noise."""
+    rng = np.random.default_rng(8)
+    time = 0.05 * np.arange(200)
+    u = PiecewiseConstant(time, rng.choice([-2.5, 0.5], time.size), 0.5)
+    fast = TransferFunction(3.0, (), (0.04,), 0, 0.0)
+    y = response(fast, time, u) + rng.normal(0.0, 0.05, time.size)
+    for part in (slice(None), slice(None, 60)):
+        record = Record(time=time[part], measurement=y[part], command=u(time)[part])
+        (found,) = find_experiments(record)
+        assert (found.kind, found.first) == ("sequence", 0)
+        assert found.last >= len(record) - 2
+
+
+def test_a_slow_profile_under_a_controller_is_one_experiment_to_its_end():
+    """An oven follows a solder profile: it moves slowly, and fastest where the heater is off."""
+    rng = np.random.default_rng(9)
+    profile = np.array([[0, 25], [30, 25], [150, 150], [270, 180], [330, 235], [370, 235]])
+    y = integral = 0.0
+    rows = []
+    for t in np.arange(0.0, 720.0, 1.0):
+        seen = 25.0 + y + rng.normal(0.0, 0.1)
+        error = float(np.interp(t, *profile.T)) - seen if t < 370.0 else -200.0
+        integral = min(max(integral + error / 40.0, 0.0), 50.0)
+        duty = min(max(2.0 * error + integral, 0.0), 100.0)
+        y += (4.0 * duty - y) / (100.0 if t < 600.0 else 15.0)
+        rows.append((t, seen, duty))
+    time, measurement, command = np.array(rows).T
+    (found,) = find_experiments(Record(time=time, measurement=measurement, command=command))
+    assert found.kind == "closed loop"
+    assert time[found.first] <= 30.0
+    assert time[found.last] >= 650.0
 
 
 def test_a_change_at_the_last_sample_is_left_out():

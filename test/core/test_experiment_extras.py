@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
+from relay_autotune.analysis import analyse_alone
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, SafePolicy
 from relay_autotune.experiment.faults import (
@@ -24,6 +25,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome
+from relay_autotune.verdict import Verdict
 
 
 def experiment(baseline=0.0, policy=None, until_converged=True, **parameters):
@@ -124,6 +126,35 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
     assert command == baseline
 
 
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.4, 0.6])
+@pytest.mark.parametrize("std", [0.002, 0.02])
+def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(share, std):
+    """True Ms of its gains: 1.9 at six tenths of the amplitude, unstable at two tenths."""
+    limits = {"command_min": -5.0, "command_max": 5.0}
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0, **limits), 0.0, from_small=True)
+    plant, command, noise = FopdtPlant(1.65, 20.0, 10.0), 0.0, gaussian(std)
+    for k in range(40_000):
+        y = plant.advance(0.2 * k, min(max(command, -0.7 * share), 1.3 * share)) + noise()
+        command = tune.step(0.2 * k, y)
+        if tune.finished:
+            break
+    if tune.outcome is Outcome.COMPLETED:
+        assert analyse_alone(tune.record()).verdict is not Verdict.TRUSTED
+
+
+def test_a_kick_that_noise_seemed_to_answer_is_made_larger():
+    """At a quarter of the amplitude the response is smaller than the noise."""
+    limits = {"command_min": -5.0, "command_max": 5.0}
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0, **limits), 0.0, from_small=True)
+    model = TransferFunction(1.0, (), (4.0, 1.0), 0, 0.5)
+    plant, noise, command = Plant(model), gaussian(0.2, seed=0), 0.0
+    for k in range(20_000):
+        command = tune.step(0.1 * k, plant.advance(0.1 * k, command) + noise())
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("bias", [{}, {"bias": -0.3}, {"bias_ratio": 0.0}])
 @pytest.mark.parametrize("dead_time", [0.1, 1.0, 10.0])
@@ -166,6 +197,23 @@ def test_a_coarse_sensor_needs_several_steps():
     cycle = limit_cycle(tune.record())
     assert tune.outcome is Outcome.COMPLETED, tune.reason
     assert 0.5 * (cycle.peak_max - cycle.peak_min) >= 4.9 * step
+
+
+@pytest.mark.parametrize(
+    ("limits", "low", "high"),
+    [({}, 1.9, 4.0), ({"max_deviation": 3.0}, 0.95, 2.0), ({"measurement_max": 3.0}, 0.95, 2.0)],
+)
+def test_a_swing_of_twenty_steps_is_aimed_at_where_the_limits_allow_it(limits, low, high):
+    plant, step, noise = FopdtPlant(2.0, 2.0, 1.0), 0.1, gaussian(0.03)
+    tune, command = searching(**limits), 0.0
+    for k in range(40_000):
+        y = round((plant.advance(0.05 * k, command) + noise()) / step) * step
+        command = tune.step(0.05 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    cycle = limit_cycle(tune.record())
+    assert low <= 0.5 * (cycle.peak_max - cycle.peak_min) < high
 
 
 # Delay and rate.

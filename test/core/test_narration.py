@@ -121,6 +121,7 @@ def test_how_long_a_tune_takes_is_told_before_it():
         "it takes 1.0 s or more until the measurement is steady, 10 min at most, then one step "
         "and about 6 oscillations of the loop"
     )
+    assert "about 8 oscillations" in how_long(given, 0.02, 600.0, from_small=True)
     limited = ExperimentParameters(amplitude=1.0, settle_time=5.0, max_duration=100.0)
     assert how_long(limited, 0.0, 600.0).startswith("it takes 5.0 s at rest, then")
     assert how_long(limited, 0.0, 600.0).endswith(", 1 min 40 s at most in all")

@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from dataclasses import fields
 
+import numpy as np
 import pytest
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.parameters import PARAMETERS, ExperimentParameters
+from relay_autotune.experiment.relay_law import Levels, Patience
 
 
 def test_the_table_describes_every_field():
@@ -69,6 +71,37 @@ def test_refused_with_a_sentence(values, sentence):
 
 def test_without_a_baseline_the_levels_are_not_checked():
     ExperimentParameters(amplitude=1.0, command_max=0.5).validate()
+
+
+@pytest.mark.parametrize(
+    ("given", "baseline", "said"),
+    [
+        ({}, 0.0, "is at the actuator's end, command_min 0: "),
+        ({}, 1.0, "is at the actuator's end, command_max 1: "),
+        ({}, 0.005, "is too near to the actuator's end, command_min 0: "),
+        ({}, 0.99, "is too near to the actuator's end, command_max 1: "),
+        ({"bias": 0.2}, 0.05, "is too near to the actuator's end, command_min 0: "),
+        ({"amplitude": 0.1}, 0.0, "is at the actuator's end, command_min 0: "),
+    ],
+)
+def test_an_end_of_the_actuator_is_no_working_point(given, baseline, said):
+    parameters = ExperimentParameters(**given, command_min=0.0, command_max=1.0)
+    with pytest.raises(ParameterError, match=f"{said}.* at which command does the process rest"):
+        parameters.validate(baseline)
+
+
+def test_the_smallest_relay_fits_where_a_baseline_is_accepted():
+    parameters = ExperimentParameters(command_min=0.0, command_max=1.0)
+    for baseline in np.linspace(0.0, 1.0, 201):
+        uncut = Levels(parameters, float(baseline)).amplitude == pytest.approx(0.01)
+        assert uncut == (parameters.why_one_way(float(baseline)) == "")
+
+
+def test_levels_that_a_load_has_shifted_to_one_side_still_have_a_patience():
+    levels = Levels(ExperimentParameters(command_min=0.0, command_max=1.0), 0.01)
+    levels.shift(0.1)
+    assert levels.low > 0.01
+    assert 0.0 < Patience(levels.balance)._ratio < math.inf
 
 
 @pytest.mark.parametrize("baseline", [math.nan, math.inf])

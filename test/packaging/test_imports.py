@@ -23,7 +23,7 @@ FLOORS = (
     {"loop"},
     {"control", "tuning"},
     {"result"},
-    {"analysis"},
+    {"analysis", "parts"},
     {"exchange"},
     {"bag"},
     {"report"},
@@ -34,7 +34,7 @@ FLOORS = (
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in sorted(names)}
 # What brings ROS in; all else runs without it.
 NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "loop",
-           "control", "tuning", "result", "analysis", "exchange")  # fmt: skip
+           "control", "tuning", "result", "analysis", "parts", "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

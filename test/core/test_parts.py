@@ -1,0 +1,61 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Parts of one recording that contradict each other, or do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sampled_relay import simulate_sampled_relay
+
+from relay_autotune.analysis import analyse_alone
+from relay_autotune.parts import agreed
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
+from relay_autotune.result import Analysis
+from relay_autotune.verdict import Verdict
+
+
+def part(gain: float, seed: int) -> Analysis:
+    """Analyse a relay test of gain e^(-10 s)/(20 s + 1)."""
+    settings = RelaySettings(
+        setpoint=0.0,
+        baseline=0.0,
+        amplitude=1.0,
+        bias=0.3,
+        hysteresis=0.1,
+        reverse_acting=gain < 0,
+    )
+    noise = np.random.default_rng(seed).normal(0.0, 0.01, 900)
+    model = TransferFunction.fopdt(gain, 20.0, 10.0)
+    return analyse_alone(simulate_sampled_relay(model, settings, period=0.25, noise=noise))
+
+
+@pytest.fixture(scope="module")
+def first() -> Analysis:
+    return part(1.65, 1)
+
+
+def test_parts_that_agree_stay_as_they_are(first):
+    both = (first, part(1.65, 2))
+    assert agreed(both) == both
+    assert {each.verdict for each in both} == {Verdict.TRUSTED}
+    assert agreed(()) == ()
+
+
+@pytest.mark.parametrize("gain", [2.5, -1.65])
+def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain):
+    other = part(gain, 2)
+    assert other.verdict is Verdict.TRUSTED
+    found = agreed((first, other, first))
+    assert {each.verdict for each in found} == {Verdict.DOUBTFUL}
+    assert "contradict each other: the ultimate gain is" in found[0].judgement.reason
+    assert "in part 1 and" in found[0].judgement.reason
+
+
+def test_a_part_without_gains_contradicts_none(first):
+    refused = replace(part(-1.65, 2), gains=(), recommended=None)
+    assert agreed((first, refused)) == (first, refused)
