@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from rclpy.task import Future
 
+from relay_autotune.control.controller import LONGEST_TIME
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
@@ -229,13 +230,17 @@ class Verifier:
             )
 
     def _accept(self, goal: Any) -> None:
+        patience, reason = goal.request.patience, ""
         if self._action.running is not None:
             reason = "a verification is running"
+        elif not 0.0 <= patience <= LONGEST_TIME:
+            reason = f"patience is {patience:g} s, expected 0 to {LONGEST_TIME:g} s"
+        if reason:
             conclude(goal, Verify.Result(passed=False, reason=reason), succeeded=False)
             return
         self._action.running, self._phase, self._found = goal, _Phase.PREPARING, []
         self._outcome, self._waits_for = Future(), ""
-        self._until = time.monotonic() + _PREPARED_WITHIN + max(goal.request.patience, 0.0)
+        self._until = time.monotonic() + _PREPARED_WITHIN + patience
         self._watch.reset()
         self._node.defer(self._narrator.now)
         self._node.executor.create_task(self._prove, goal)
@@ -261,13 +266,13 @@ class Verifier:
     async def _begin(self, request: Any) -> None:
         """Put the gains on trial and begin the first step, unless the proof has ended before."""
         tried = await self._verifiable(request)
-        until = time.monotonic() + max(request.patience, 0.0)
+        until = time.monotonic() + request.patience
         if tried.new is not None and self._is_preparing():
             await self._on_trial(tried)
             if self._is_preparing():
                 shown = self._recent[-1][0] - self._recent[0][0]
                 await self._settled(tried.settles if math.isfinite(tried.settles) else shown)
-                until = time.monotonic() + max(request.patience, 0.0)
+                until = time.monotonic() + request.patience
         rest, period = await self._rested(tried.steps, until)
         if not self._is_preparing():
             return
@@ -383,6 +388,7 @@ class Verifier:
         self._recent.append(sample)
         self._arrivals.append(now)
         if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
+            self._beyond = 0
             return
         wanted = self._plans[self._number]
         hole = max(_SILENT_INTERVALS * self._period, _LARGEST_HOLE * wanted.duration)
@@ -413,7 +419,8 @@ class Verifier:
     def out_of_range(self, measurement: float) -> None:
         """Take a measurement outside its range [y], which the controller did not answer."""
         self._beyond += 1
-        if self._phase is _Phase.STEPPING and self._beyond >= _IN_A_ROW:
+        tried = self._phase in (_Phase.SETTLING, _Phase.STEPPING)
+        if tried and self._beyond >= _IN_A_ROW:
             self._end(False, f"the measurement left its range, to {measurement:.6g}")
 
     def _return(self) -> None:
