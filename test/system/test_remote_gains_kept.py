@@ -171,5 +171,5 @@ def test_a_loop_that_falls_silent_in_a_verification_gets_its_gains_back(rig: Rig
     rig.until(lambda: loop.values() == BEFORE, "the gains of before")
     rig.until(lambda: loop.setpoints[-1].data == 5.0, "the set-point")
     # They wait to be tried again.
-    assert loop.trigger("apply").success
+    rig.until(lambda: loop.trigger("apply").success, "the gains that wait")
     plant.signal(signal.SIGCONT)
