@@ -487,6 +487,7 @@ class JointTune:
             doubtful=bool(doubt),
             yes=self._options.yes,
             patience=START_WITHIN,
+            alive=nodes.require_alive,
         )
 
     def _set(self) -> int:
