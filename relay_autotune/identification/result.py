@@ -172,11 +172,13 @@ class Part:
     :param begin: its first time [s].
     :param end: its last time [s].
     :param models: drawn from their posterior, each as likely as the others.
+    :param contradicts: True: the part excludes the model of the whole record.
     """
 
     begin: float
     end: float
     models: tuple[TransferFunction, ...]
+    contradicts: bool = True
 
     @property
     def span(self) -> str:

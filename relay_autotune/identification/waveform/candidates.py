@@ -243,6 +243,9 @@ class FitContext:
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
             return None
+        if min(problem.effects(state.coefficients)) < 0.0:
+            # Commands may lose their effect on one side, but not act the other way there.
+            return None
         shortest, _ = time_scales(self.problem)
         if is_unseen(model, shortest, self.length, self.pushed):
             return None

@@ -37,7 +37,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
     noise_inflation,
     raw_residual,
 )
-from relay_autotune.identification.waveform.posterior import effects, posterior
+from relay_autotune.identification.waveform.posterior import posterior
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
@@ -122,6 +122,8 @@ def _within_reach(rival: Estimate, root: FloatArray, frequency: float) -> Estima
 
 
 _UNEXPLAINED = 1.5
+# Least difference of the effects of commands to either side that is worth a sentence.
+_UNEQUAL = 0.05
 _WORTH_TELLING = 1e-3
 # Rivals with more support than this have a share in the uncertainty of K_u and w_u.
 _WORTH_COUNTING = 1e-2
@@ -177,7 +179,10 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(n for n in notes if n)))
     found = _beside_rivals(found, fit, shares, noise)
     found = replace(
-        found, draws=allowed.models, halves=allowed.halves, effects=effects(problem, state)
+        found,
+        draws=allowed.models,
+        halves=allowed.halves,
+        effects=problem.effects(state.coefficients),
     )
     if allowed.temper > 1.0:
         told = (
@@ -334,8 +339,8 @@ def _warnings(
             found.append(
                 f"{which}{record.lost_samples} samples were lost on the way; check the network"
             )
-    if fit.problem.unequal:
-        above, below = effects(fit.problem, fit.state)
+    above, below = fit.problem.effects(fit.state.coefficients)
+    if abs(above - below) > _UNEQUAL:
         found.append(
             f"commands above the first one act {above:.2f} times as strongly as in the model, "
             f"those below it {below:.2f} times: the process is not linear, and the gains hold on "

@@ -99,21 +99,6 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     return Posterior(tuple(models), halves, temper)
 
 
-def effects(problem: Problem, state: Trial) -> tuple[float, float]:
-    """Return how strongly commands above and below the first one act, relative to the model.
-
-    :param problem: what was fitted.
-    :param state: its fit.
-    """
-    if not problem.unequal:
-        return 1.0, 1.0
-    count = len(problem.structure.powers)
-    after = 2 * count * (problem.load is not None) + 1 + problem.drift
-    at = state.coefficients.size - len(problem.bounds) * after - count
-    share = float(state.coefficients[at] / state.coefficients[0])
-    return 1.0 + share, 1.0 - share
-
-
 def _plain(fit: Fit) -> list[TransferFunction]:
     """Return the plain models that simulate the record nearly as well as a fit in colour.
 
@@ -159,8 +144,8 @@ def _draws(
     # Fewer samples tell as much as all of them together did.
     inflation *= few.time.size / problem.time.size
     gain = state.coefficients[: len(problem.structure.powers)]
-    models = _allowed(few, gain, state.theta, scale, inflation, count, rng)
-    above, below = effects(problem, state)
+    models, _ = _allowed(few, gain, state.theta, scale, inflation, count, rng)
+    above, below = problem.effects(state.coefficients)
     # Gains have to hold on both sides.
     return tuple(
         replace(m, gain=m.gain * (above, below)[i % 2]) if min(above, below) > 0.0 else m
@@ -193,9 +178,9 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     second = replace(second, relaxation=bool(problem.structure.factors))
     parts = []
     for part in (problem.part(slice(None, middle)), second):
-        models = _allowed(part, gain, state.theta, fit.scale, inflation, _DRAWS_OF_HALF, rng)
-        if models:
-            parts.append(Part(float(part.time[0]), float(part.time[-1]), models))
+        found = _allowed(part, gain, state.theta, fit.scale, inflation, _DRAWS_OF_HALF, rng)
+        if found[0]:
+            parts.append(Part(float(part.time[0]), float(part.time[-1]), *found))
     return tuple(parts)
 
 
@@ -229,8 +214,8 @@ def _allowed(
     inflation: float,
     count: int,
     rng: np.random.Generator,
-) -> tuple[TransferFunction, ...]:
-    """Return models drawn from the posterior that some samples give.
+) -> tuple[tuple[TransferFunction, ...], bool]:
+    """Return models drawn from the posterior that some samples give, and if it excludes the known.
 
     :param problem: the samples.
     :param gain: coefficients of the estimate's numerator, shape (k,).
@@ -246,10 +231,12 @@ def _allowed(
     weak = _GAIN * np.abs(gain[0]) * slow ** np.arange(gain.size)
     deviation = np.concatenate((weak, np.full(theta.size - 1, _TIMES), [_DEAD_TIME * slow]))
     if not np.all(deviation > 0.0):
-        return ()
+        return (), False
+    own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
+    degrees = max(problem.time.size - own.parameters, 1)
 
     def variance_of(left: FloatArray) -> float:
-        return max(inflation * float(left @ left) / left.size, NEGLIGIBLE**2)
+        return max(inflation * float(left @ left) / degrees, NEGLIGIBLE**2)
 
     def cost_at(point: FloatArray) -> float:
         left, _ = _linearised(problem, point, gain.size)
@@ -266,7 +253,6 @@ def _allowed(
     variance = variance_of(left)
     cost = cost_at(at)
     # The best fit without the prior may be nearer, but also run off where samples tell little.
-    own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
     elsewhere = _bounded(np.concatenate((own.coefficients[: gain.size], own.theta)))
     if cost_at(elsewhere) < cost:
         at = elsewhere
@@ -307,7 +293,7 @@ def _allowed(
             continue
         if model is not None:
             models.append(model)
-    return tuple(models)
+    return tuple(models), cost_at(known) - cost > farthest
 
 
 def _bounded(point: FloatArray) -> FloatArray:

@@ -102,13 +102,30 @@ class Problem:
 
     @property
     def acts_both_ways(self) -> bool:
-        """True if each command moves to both sides of its first level."""
+        """True if each command moves to both sides of its first level, and stays there, too.
+
+        Of two levels alone, the distance from a third one is the command itself.
+        """
         return all(
             isinstance(u, PiecewiseConstant)
             and bool(u.values.size)
             and float(u.values.min()) < u.initial < float(u.values.max())
-            for u in self.inputs
+            and np.unique(u(self.time[part])).size > 2
+            for u, part in zip(self.inputs, self.experiments, strict=True)
         )
+
+    def effects(self, coefficients: FloatArray) -> tuple[float, float]:
+        """Return how strongly commands above and below the first one act, relative to the model.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        if not self.unequal:
+            return 1.0, 1.0
+        count = len(self.structure.powers)
+        after = 2 * count * (self.load is not None) + 1 + self.drift
+        at = coefficients.size - len(self.bounds) * after - count
+        share = float(coefficients[at] / coefficients[0])
+        return 1.0 + share, 1.0 - share
 
     @property
     def experiments(self) -> list[slice]:
