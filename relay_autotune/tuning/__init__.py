@@ -28,8 +28,6 @@ from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
 DEFAULT_RULE = "robust"
-# The search comes to an end of its range within its last step.
-_ABOUT = 1.002
 
 __all__ = [
     "DEFAULT_RULE",
@@ -162,7 +160,7 @@ def designed(task: DesignTask, rule: str) -> Designed:
     :param rule: one of ``RULES``.
     :raises TuningError: if the rule does not apply.
     """
-    controller, reason = _of_a_period(*rule_named(rule)(task), task.options.sample_period)
+    controller, reason = rule_named(rule)(task)
     if task.options.law in ("", OWN_LAW):
         return Designed(rule, controller, reason)
     if rule != DEFAULT_RULE:
@@ -173,22 +171,6 @@ def designed(task: DesignTask, rule: str) -> Designed:
     except TuningError:
         return Designed(rule, controller, reason)
     return Designed(rule, controller, reason, own)
-
-
-def _of_a_period(controller: Controller, reason: str, period: float) -> tuple[Controller, str]:
-    """Return a controller whose integral time is at least a period, with its reason.
-
-    With a shorter one it is an integral controller: what it integrates in one sample is more than
-    its proportional part. The integral and the derivative gain remain.
-    """
-    if not 0.0 < controller.ti <= period * _ABOUT:
-        return controller, reason
-    kc = controller.i * period
-    reason += (
-        f"; in effect an integral controller, i = {controller.i:.4g} u/(y s): its ti is one "
-        "sampling period, the least that a sampled controller has"
-    )
-    return replace(controller, kc=kc, ti=period, td=controller.d / kc), reason
 
 
 def _with_own_law(task: DesignTask) -> DesignTask:
@@ -223,6 +205,12 @@ def judged(task: DesignTask, found: Designed) -> Gains:
         cost = cost_of(law, performance, own)
         warnings = (*cautions(performance, task), *cost)
         controller = law.gains
+    if 0.0 < controller.ti < task.options.sample_period:
+        # What it integrates in one sample is more than its proportional part.
+        reason += (
+            f"; in effect an integral controller, i = {controller.i:.4g} u/(y s): its ti is less "
+            "than a sampling period, so that a program that takes kc and ti cannot hold it"
+        )
     if not task.models:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
         ms_95 = performance.ms

@@ -82,16 +82,16 @@ def _search(task: DesignTask) -> Search:
     options, model = task.options, task.in_loop(task.model)
     others = [m for m in task.models if m.process_sign == model.process_sign]
     around = tuple(task.in_loop(m) for m in others)
-    law, noise, period = options.runs, _noise_limit(options), options.sample_period
+    law, noise = options.runs, _noise_limit(options)
     if law is None:
-        return Search(model, around, options.filter_ratio, noise, period)
+        return Search(model, around, options.filter_ratio, noise)
     return SampledSearch(
         model,
         around,
         options.filter_ratio,
         noise,
-        period,
         law=law,
+        period=options.sample_period,
         held=task.held(task.model),
         held_models=tuple(task.held(m) for m in others),
     )

@@ -39,6 +39,8 @@ from relay_autotune.tuning.search import Search
 _ALL = slice(None)
 # The range of gains of the continuous loop is left by this factor.
 _WIDER = 1.6
+# An integral that is advanced before the output takes at most this part of kp' from kp.
+_SHARE = 0.95
 # Samples of a load response, and samples in an ultimate period above which the loop is as good as
 # continuous.
 _SAMPLES, _CONTINUOUS = 2048, 100.0
@@ -168,11 +170,13 @@ class SampledSearch(Search):
     """A search with the exact loop of a law; the model has a dead time for hold and delay.
 
     :param law: the law.
+    :param period: of the samples [s].
     :param held: the process without the dead time for hold and delay.
     :param held_models: the same of each model within its uncertainty.
     """
 
     law: Law
+    period: float
     held: TransferFunction
     held_models: tuple[TransferFunction, ...] = ()
 
@@ -221,8 +225,9 @@ class SampledSearch(Search):
         return peaks(loop, loop.grid)
 
     def _ceiling(self, kp: FloatArray) -> FloatArray | float:
-        # Of kp a part belongs to the integral, and ti is of the rest.
-        return kp / ((1.0 + 0.5 * self.law.integral.value) * self.period)
+        # kp has to remain positive.
+        lead = self.law.integral.value
+        return _SHARE * 2.0 * kp / (lead * self.period) if lead > 0.0 else math.inf
 
     def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
         smoothing, h = self.law.smoothing, self.period

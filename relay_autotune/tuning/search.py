@@ -176,14 +176,12 @@ class Search:
     :param models: models within its uncertainty; the bounds also hold on all but 5 % of them.
     :param filter_ratio: largest td/tf.
     :param noise: the limit of the noise in the command; None: no limit.
-    :param period: of the samples [s], the least integral time; 0: there is none.
     """
 
     model: TransferFunction
     models: tuple[TransferFunction, ...] = ()
     filter_ratio: float = 10.0
     noise: NoiseLimit | None = None
-    period: float = 0.0
 
     @property
     def differentiates(self) -> bool:
@@ -235,12 +233,9 @@ class Search:
         return peaks(exact, frequencies(exact))
 
     def _ceiling(self, kp: FloatArray) -> FloatArray | float:
-        """Return the integral gains that each proportional gain allows by itself, shape (k,).
-
-        An integral time below a period would integrate more of an error in one sample than the
-        proportional part answers to it.
-        """
-        return kp / self.period if self.period > 0.0 else math.inf
+        """Return the integral gains that each proportional gain allows by itself, shape (k,)."""
+        del kp
+        return math.inf
 
     def _span(self, td: float) -> tuple[float, float] | None:
         """Return the range of proportional gains to look at for a derivative time [s]."""

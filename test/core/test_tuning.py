@@ -116,27 +116,19 @@ def test_the_parallel_form_has_a_prediction_of_its_own():
     assert (pi.b, pi.tf, pi.bare) == (1.0, 0.0, None)
 
 
-@pytest.mark.parametrize("law", ["", "pid_controller"])
-def test_no_integral_time_is_shorter_than_a_sampling_period(law):
-    # It answers within a sample: an integral controller is all that it needs.
-    swift, asked = (
-        TransferFunction.fopdt(2.0, 1e-7, 0.05),
-        DesignOptions(sample_period=0.1, law=law),
-    )
-    found = []
-    for rule in ("robust", "imc", "simc", "amigo"):
-        gains = tune(swift, rule=rule, options=asked)
-        assert gains.ti >= 0.1
-        assert "an integral controller" in gains.reason
-        found.append(gains)
-    assert found[0].ms <= 1.41
-    # The integral gain is that of the rule, which was made for continuous controllers.
-    own = tune(swift, rule="simc", options=DesignOptions(loop_delay=0.05))
-    assert found[2].i == pytest.approx(own.i, rel=1e-6)
-
-
 def test_gains_for_a_model_that_is_hardly_known_are_refused():
     found = _identified(0.05)
     wild = tuple(TransferFunction.fopdt(1.65, 20.0, d) for d in np.linspace(5.0, 60.0, 50))
     with pytest.raises(TuningError, match="too uncertain"):
         tune(found, "thyagarajan", wild)
+
+
+def test_gains_of_less_than_a_sample_are_told_as_an_integral_controller():
+    fast = TransferFunction.fopdt(2.0, 0.001, 0.0)
+    gains = design(DesignTask(model=fast, options=DesignOptions(sample_period=0.1)), "robust")
+    assert gains.ti < 0.1
+    assert f"an integral controller, i = {gains.i:.4g} u/(y s)" in gains.reason
+    slow = design(
+        DesignTask(model=replace(fast, time_constants=(5.0,)), options=DesignOptions()), "robust"
+    )
+    assert "integral controller" not in slow.reason
