@@ -119,10 +119,9 @@ def _halves(evidence: Evidence) -> Measured | None:
     loop, halves = evidence.loop, evidence.found.halves
     if loop is None or not halves:
         return None
-    share, part = max(
-        ((_bad(loop, part.models, _IN_HALF), part) for part in halves), key=lambda f: f[0]
-    )
-    return Measured(share, part.span)
+    # A half that tells little has models all around that of the whole, and excludes nothing.
+    found = [(_bad(loop, p.models, _IN_HALF) * p.contradicts, p.span) for p in halves]
+    return Measured(*max(found))
 
 
 def _direction(evidence: Evidence) -> Measured | None:
@@ -141,6 +140,7 @@ def _direction(evidence: Evidence) -> Measured | None:
         *(
             (f"{p.span} also fits a process of the other direction", p.models)
             for p in found.halves
+            if p.contradicts
         ),
     ]
     shares = [
@@ -312,7 +312,6 @@ LOOP_CHECKS = (
         "unstable or have an Ms of more than twice what was asked",
         unit="",
         doubtful=0.9,
-        failed=0.95,
         sentence="{detail} of the record alone shows another process: on {value} of its models "
         "the loop is unstable or nearly so",
         remedy="see whether load, operating point or other inputs changed, and record again",
