@@ -45,7 +45,10 @@ RESULTS = (
     *(Gains, Performance, Finding, RelaySettings, LimitCycle, Cycle, FitProgress),
 )
 # As long as the record, and what is told by other fields of the document.
-UNTOLD = {(Identification, "fitted"), (LimitCycle, "std")}
+UNTOLD = {
+    *((Identification, name) for name in ("fitted", "effects", "halves")),
+    (LimitCycle, "std"),
+}
 POSITIVE = st.floats(1e-3, 1e3)
 TEXTS = st.text(max_size=5)
 WORDS = st.text(string.ascii_lowercase, min_size=1, max_size=5)

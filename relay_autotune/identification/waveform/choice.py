@@ -82,6 +82,8 @@ _HOPELESS = 30.0
 _SLOWEST = 10.0
 _ALIKE = 0.01
 _STEPS = 15
+# Gain in the score that the best of all dead times and structures reaches on noise alone.
+_SEARCHED = 10.0
 # Scores that differ by less do not tell two structures apart.
 _INDIFFERENT = 2.0
 # Share of the sum of squares that a model in colour may always leave, and how many times that of
@@ -107,11 +109,15 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     own = [c for c in found if sign * c.model.process_sign >= 0]
     if sign and not known.structure:
         found = [*found, *(_in_own_colour(few, c) for c in few.turned())]
-    for candidate in _by_rank(own):
+    # Where a disturbance that no term describes made a colour that explains the response, too,
+    # the simulation shows it.
+    white = (few.refit(c, None, _STEPS) for c in own if c.problem.colour is not None)
+    simulated = sorted((c for c in white if c is not None), key=lambda c: c.score)
+    for candidate in (*_by_rank(own), *_by_rank(simulated)):
         fit = _finished(candidate, found, problem, scale)
-        if fit is not None and (known.structure or responds(fit.problem, fit.state)):
+        if fit is not None and responds(fit.problem, fit.state, _SEARCHED):
             return fit
-    if known.structure:
+    if known.structure and not own:
         raise IdentificationError(
             f"no {known.structure} model explains the record; leave the structure open to have "
             "it chosen"

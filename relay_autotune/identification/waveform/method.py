@@ -25,7 +25,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.choice import NO_RESPONSE, chosen_fit, responds
+from relay_autotune.identification.waveform.choice import chosen_fit
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.rational import unit_steps
@@ -51,8 +51,6 @@ _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
 # Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2
-# Gain in the criterion that the best of all dead times and structures reaches on noise alone.
-_SEARCHED = 10.0
 _MOST_ROUNDS = 20
 _SETTLED = 1e-6
 _STEADY = 0.02
@@ -102,7 +100,6 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     fit = _explained(
         problem, known, sign, scale, held=any(r.settings is not None for r in records)
     )
-    _require_response(fit.problem, fit.state)
     if problem.time.size < samples:
         told = (
             f"of {samples} samples {problem.time.size} were fitted, evenly spread: more would "
@@ -262,8 +259,3 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
             "command does: check that the two are not the wrong way round, or raise the amplitude "
             "above the sensor's step"
         )
-
-
-def _require_response(problem: Problem, state: Trial) -> None:
-    if not responds(problem, state, _SEARCHED):
-        raise IdentificationError(NO_RESPONSE)

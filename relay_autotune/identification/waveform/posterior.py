@@ -13,7 +13,7 @@ of squares the data exclude is drawn again, so that none goes beyond what the pr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -141,10 +141,12 @@ def _draws(
 ) -> tuple[TransferFunction, ...]:
     """Return models drawn from the posterior of some samples about their best fit."""
     few = problem.thinned(_MOST_SAMPLES) if problem.colour is None else problem
-    # Fewer samples tell as much as all of them together did.
-    inflation *= few.time.size / problem.time.size
+    degrees = max(problem.time.size - state.parameters, 1)
+    # As much as all samples tell, of fewer of them, without the noise of just these.
+    variance = inflation * state.cost / degrees * few.time.size / problem.time.size
+    exact = replace(few, y=state.coefficients @ few.columns(state.theta)[0])
     gain = state.coefficients[: len(problem.structure.powers)]
-    models, _ = _allowed(few, gain, state.theta, scale, inflation, count, rng)
+    models, _ = _allowed(exact, gain, state.theta, scale, lambda _: variance, count, rng)
     above, below = problem.effects(state.coefficients)
     # Gains have to hold on both sides.
     return tuple(
@@ -164,7 +166,6 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
         return ()
     if problem.colour is None:
         problem = problem.thinned(2 * _MOST_SAMPLES)
-        inflation *= problem.time.size / fit.problem.time.size
     gain = state.coefficients[: len(problem.structure.powers)]
     _, jacobian = _linearised(problem, np.concatenate((gain, state.theta)), gain.size)
     size = np.einsum("pn,pn->p", jacobian, jacobian)
@@ -178,7 +179,13 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     second = replace(second, relaxation=bool(problem.structure.factors))
     parts = []
     for part in (problem.part(slice(None, middle)), second):
-        found = _allowed(part, gain, state.theta, fit.scale, inflation, _DRAWS_OF_HALF, rng)
+        own = refine(part, state.theta, tolerance=TRIAL, most=_STEPS)
+        degrees = max(part.time.size - own.parameters, 1)
+
+        def variance_of(left: FloatArray, degrees: int = degrees) -> float:
+            return inflation * float(left @ left) / degrees
+
+        found = _allowed(part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_HALF, rng)
         if found[0]:
             parts.append(Part(float(part.time[0]), float(part.time[-1]), *found))
     return tuple(parts)
@@ -211,7 +218,7 @@ def _allowed(
     gain: FloatArray,
     theta: FloatArray,
     scale: float,
-    inflation: float,
+    noise: Callable[[FloatArray], float],
     count: int,
     rng: np.random.Generator,
 ) -> tuple[tuple[TransferFunction, ...], bool]:
@@ -221,7 +228,7 @@ def _allowed(
     :param gain: coefficients of the estimate's numerator, shape (k,).
     :param theta: of the estimate, shape (m,).
     :param scale: of the measurement in the problem [y].
-    :param inflation: ratio of the variances to those of the noise that is left.
+    :param noise: variance of the noise that a residual shows.
     :param count: models to draw.
     :param rng: the source.
     """
@@ -233,10 +240,9 @@ def _allowed(
     if not np.all(deviation > 0.0):
         return (), False
     own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
-    degrees = max(problem.time.size - own.parameters, 1)
 
     def variance_of(left: FloatArray) -> float:
-        return max(inflation * float(left @ left) / degrees, NEGLIGIBLE**2)
+        return max(noise(left), NEGLIGIBLE**2)
 
     def cost_at(point: FloatArray) -> float:
         left, _ = _linearised(problem, point, gain.size)
