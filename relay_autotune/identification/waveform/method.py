@@ -72,6 +72,10 @@ _MOST_ROUNDS = 20
 _SETTLED = 1e-6
 _STEADY = 0.02
 _LEAST_NOISE = 1e-3
+_NO_RESPONSE = (
+    "the measurement shows no response to the command beyond its noise: raise the amplitude, or "
+    "check that both topics belong to one loop"
+)
 _SEEN = "a response that the samples show (it is over between two of them)"
 
 
@@ -194,9 +198,11 @@ def _fit(problem: Problem, known: Known, sign: int, scale: float) -> Fit:
         ):
             return Fit(whole, state, (chosen,) if known.structure else tuple(rest), scale)
         rest = [c for c in rest if c is not picked]
-    raise IdentificationError(
+    raise _without_a_model(
+        ground,
+        candidates,
         "no structure fits the record with a process that the samples can show: record longer, or "
-        "check that command and measurement belong to one loop"
+        "check that command and measurement belong to one loop",
     )
 
 
@@ -299,19 +305,41 @@ def _candidates(ground: Ground, known: Known) -> list[Candidate]:
     if not known.structure:
         candidates = fit_all(ground)
         if not candidates:
-            raise IdentificationError(
+            raise _without_a_model(
+                ground,
+                (),
                 "no structure explains the record with "
                 + ("a gain in the direction of the relay" if ground.sign else _SEEN)
-                + ": check that command and measurement belong to one loop"
+                + ": check that command and measurement belong to one loop",
             )
         return candidates
     found = fit_one(ground, known.structure, known.order)
     if found is None:
-        raise IdentificationError(
+        raise _without_a_model(
+            ground,
+            (),
             f"no {known.structure} model explains the record; leave the structure open to have "
-            "it chosen"
+            "it chosen",
         )
     return [found]
+
+
+def _without_a_model(
+    ground: Ground, candidates: Sequence[Candidate], why: str
+) -> IdentificationError:
+    """Return the reason why a record gives no model.
+
+    Which fits to noise run off, and so whether one is left to be asked for its response, turns on
+    the last digit. So all fits are asked.
+
+    :param ground: what was fitted.
+    :param candidates: the structures that could be read as a process.
+    :param why: no model is left, where there is a response.
+    """
+    fits = [(ground.problem, ground.fopdt), *((c.problem, c.state) for c in candidates)]
+    if any(_responds(problem, state, _SEARCHED) for problem, state in fits):
+        return IdentificationError(why)
+    return IdentificationError(_NO_RESPONSE)
 
 
 def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
@@ -357,7 +385,4 @@ def _responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
 
 def _require_response(problem: Problem, state: Trial) -> None:
     if not _responds(problem, state, _SEARCHED):
-        raise IdentificationError(
-            "the measurement shows no response to the command beyond its noise: raise the "
-            "amplitude, or check that both topics belong to one loop"
-        )
+        raise IdentificationError(_NO_RESPONSE)
