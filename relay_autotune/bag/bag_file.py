@@ -49,8 +49,7 @@ from relay_autotune.bag.mcap_records import (
     Messages,
     Sorted,
     indexed_offsets,
-    messages_at,
-    record_offsets,
+    records_of,
     sorted_records,
 )
 from relay_autotune.bag.source import MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, Source, expanding
@@ -323,18 +322,20 @@ class McapFile(BagFile):
             for places in piece.listed.values()
         ]
         hints = np.concatenate(listed) if listed else None
-        offsets, end = record_offsets(content, hints)
-        if len(pieces) > 1 and not bool(np.isin(begins, np.append(offsets, end)).all()):
+        records = records_of(content, hints)
+        if len(pieces) > 1 and not bool(
+            np.isin(begins, np.append(records.offsets, records.end)).all()
+        ):
             # One of them does not end with a record.
             return [found for piece in pieces for found in self._messages([piece], wanted)]
-        if end != len(content) and pieces[0].segment.whole:
-            damage = DamageError(f"a record of impossible length at {end}")
+        if records.end != len(content) and pieces[0].segment.whole:
+            damage = DamageError(f"a record of impossible length at {records.end}")
             self._note(damage_note(self._source, pieces[0].segment, damage))
-        found = sorted_records(content, offsets, wanted, self.channels)
+        found = sorted_records(records, wanted, self.channels)
         self._check(content, found)
         for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
             self._check_index(piece, found, wanted, int(begin), int(stop))
-        return [(len(content), {c: messages_at(content, at) for c, at in found.places.items()})]
+        return [(len(content), found.messages)]
 
     def _check(self, content: Content, found: Sorted) -> None:
         """Note what in some records cannot be used, or contradicts what is known."""
@@ -360,7 +361,8 @@ class McapFile(BagFile):
         if piece.segment.index_end <= piece.segment.end:
             return
         for channel in wanted:
-            there = found.places.get(channel, _NOWHERE)
+            own = found.messages.get(channel)
+            there = _NOWHERE if own is None else own.order
             there = there[np.searchsorted(there, begin) : np.searchsorted(there, stop)]
             listed = piece.listed.get(channel, _NOWHERE) + begin
             if np.array_equal(there, listed) or np.array_equal(there, np.sort(listed)):

@@ -26,10 +26,10 @@ from relay_autotune.bag.mcap_records import (
     DamageError,
     Declarations,
     Opcode,
+    Records,
     every_byte,
     indexed_offsets,
-    nanoseconds,
-    record_offsets,
+    records_of,
     sorted_records,
     text,
     unsigned,
@@ -302,30 +302,30 @@ class _Scan:
             content = segment_content(self.source, segment)
             listed = indexed_offsets(self.source.read(segment.end, segment.index_end))
             places = np.concatenate([*listed.values()]) if listed else None
-            channels = self._declare(content, record_offsets(content, places)[0])
+            channels = self._declare(records_of(content, places))
         except DamageError as damage:
             if not segment.whole:
                 return
             self.layout.notes.append(damage_note(self.source, segment, damage))
         self.layout.segments.append(replace(segment, channels=channels))
 
-    def _declare(self, content: Content, offsets: IntArray) -> frozenset[int]:
-        found = sorted_records(content, offsets, None, ())
+    def _declare(self, records: Records) -> frozenset[int]:
+        found = sorted_records(records, None, ())
         with contextlib.suppress(DamageError):
-            self.layout.declared.take_all(content, found.others)
-        for places in found.places.values():
-            times = nanoseconds(every_byte(content, "<u8", RECORD.size + 6)[places])
-            self.count += places.size
-            first = int(times.min())
+            self.layout.declared.take_all(records.content, found.others)
+        for messages in found.messages.values():
+            self.count += len(messages)
+            first = int(messages.log_time.min())
             self.first = first if self.first is None else min(self.first, first)
-            self.last = max(self.last, int(times.max()))
-        return frozenset(found.places)
+            self.last = max(self.last, int(messages.log_time.max()))
+        return frozenset(found.messages)
 
     def _loose(self, position: int) -> int:
         """Take a piece of records outside of chunks; return where the next one begins."""
         stop = min(position + _PIECE, self.source.size)
         piece = self.source.read(position, stop)
-        offsets, end = record_offsets(piece)
+        records = records_of(piece)
+        offsets, end = records.offsets, records.end
         if len(piece) < RECORD.size:
             return position
         if end == 0:
@@ -344,7 +344,7 @@ class _Scan:
 
     def _take_loose(self, piece: bytes, position: int, end: int) -> int:
         if len(piece) == end - position:
-            channels = self._declare(piece, record_offsets(piece)[0])
+            channels = self._declare(records_of(piece))
             self.layout.segments.append(Segment(position, end, True, False, channels))
         return end
 
@@ -400,9 +400,10 @@ def layout_by_summary(source: Source) -> Layout | None:
 
 def _take(summary: bytes, data_end: int, layout: Layout) -> ChunkIndex:
     """Take in what a summary declares, and return its chunks."""
-    offsets, end = record_offsets(summary)
-    if end != len(summary):
-        raise DamageError(f"a record of impossible length at {end}")
+    records = records_of(summary)
+    offsets = records.offsets
+    if records.end != len(summary):
+        raise DamageError(f"a record of impossible length at {records.end}")
     is_chunk = every_byte(summary, "u1")[offsets] == Opcode.CHUNK_INDEX
     for at in offsets[~is_chunk].tolist():
         opcode, length = RECORD.unpack_from(summary, at)

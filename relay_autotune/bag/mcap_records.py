@@ -211,6 +211,7 @@ _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 # Records of one size that must follow each other before a longer run of them is looked for.
 _RUN = 4
 _LONGEST_RUN = 1 << 16
+_NOWHERE: IntArray = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -266,60 +267,112 @@ def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> N
     return np.ndarray((count,), kind, content, shift, (1,))
 
 
+@dataclass(frozen=True)
+class Records:
+    """The records that follow each other in some content.
+
+    :param content: the records.
+    :param offsets: where each begins, shape (n,).
+    :param end: where the last whole one ends.
+    :param read: the heads of all of them as `heads` has them, where they are read already.
+    """
+
+    content: Content
+    offsets: IntArray
+    end: int
+    read: NDArray[Any] | None = None
+
+    @property
+    def heads(self) -> NDArray[Any]:
+        """The heads of messages as opaque bytes, shape (m,).
+
+        The content ends within those of the last n - m records, which are none of messages.
+        """
+        if self.read is not None:
+            return self.read
+        last = len(self.content) - _HEAD.itemsize
+        return _heads(self.content, self.offsets[: np.searchsorted(self.offsets, last, "right")])
+
+
+def _heads(content: Content, offsets: IntArray) -> NDArray[Any]:
+    # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
+    return every_byte(content, f"V{_HEAD.itemsize}")[offsets]
+
+
 class _Hints:
-    """Places at which records are said to begin; each is checked before it is used.
+    """Places at which messages are said to begin; each is checked before it is used.
 
     :param content: the records.
     :param places: in any order, wrong ones among them; shape (n,).
     """
 
     def __init__(self, content: Content, places: IntArray) -> None:
-        inside = (places >= 0) & (places <= len(content) - RECORD.size)
-        at = np.unique(places[inside])
-        room = len(content) - RECORD.size - at
-        length = every_byte(content, "<u8", 1)[at] if at.size else np.empty(0, np.uint64)
-        fits = (length <= room.astype(np.uint64)) & (_opcodes(content, at) != 0)
-        self._at = at[fits]
-        self._after = self._at + RECORD.size + length[fits].astype(np.int64)
+        last = len(content) - _HEAD.itemsize
+        # Each channel lists its places rising, and this sort is for such runs; to find equal ones
+        # takes numpy ten times as long as to leave them out here.
+        at = np.sort(places, kind="stable")
+        at = at[np.searchsorted(at, 0) : np.searchsorted(at, last, "right")]
+        at, _ = _parted(at, np.append(at[1:] != at[:-1], [True] * bool(at.size)))
+        heads = _heads(content, at)
+        # A length beyond the signed range is negative here.
+        length = heads.view(_HEAD)["length"].astype(np.int64)
+        fits = (length >= 0) & (length <= len(content) - RECORD.size - at)
+        fits &= heads.view(_HEAD)["opcode"] != 0
+        if not fits.all():
+            at, heads, length = at[fits], heads[fits], length[fits]
+        self._at, self._heads = at, heads
+        self._after = at + length + RECORD.size
         # A run ends where the next place is not the one that its last record leads to.
-        self._ends = np.append(np.flatnonzero(self._after[:-1] != self._at[1:]), self._at.size - 1)
-        self.next = int(self._at[0]) if self._at.size else len(content)
+        self._ends = np.append(np.flatnonzero(self._after[:-1] != at[1:]), at.size - 1)
+        self.next = int(at[0]) if at.size else len(content)
 
-    def run(self, position: int, size: int) -> tuple[IntArray, int]:
+    def run(self, position: int, size: int) -> tuple[IntArray, NDArray[Any], int]:
         """Return records that follow each other from a place on, and where the last one ends.
 
         :param position: where a record begins; `next` is not beyond it.
         :param size: of the content.
+        :return: where they begin, their heads, and the end.
         """
-        first = int(np.searchsorted(self._at, position))
-        found = self._at[first:first]
+        first = last = int(np.searchsorted(self._at, position))
+        begin = position
         if first < self._at.size and self._at[first] == position:
-            last = int(self._ends[np.searchsorted(self._ends, first)])
-            found, position = self._at[first : last + 1], int(self._after[last])
-            first = int(np.searchsorted(self._at, position))
-        self.next = int(self._at[first]) if first < self._at.size else size
-        return found, position
+            last = int(self._ends[np.searchsorted(self._ends, first)]) + 1
+            position = int(self._after[last - 1])
+        after = last if position == begin else int(np.searchsorted(self._at, position))
+        self.next = int(self._at[after]) if after < self._at.size else size
+        return self._at[first:last], self._heads[first:last], position
 
 
-def record_offsets(content: Content, places: IntArray | None = None) -> tuple[IntArray, int]:
-    """Return where each record begins, and where the last whole one ends.
+def records_of(content: Content, places: IntArray | None = None) -> Records:
+    """Return the records that follow each other from the beginning of some content.
+
+    They end before the content where it has more of them than messages and declarations can be
+    in it: records of nothing would take several times its memory.
 
     :param content: the records.
-    :param places: where records are said to begin, which saves time and changes nothing else.
+    :param places: where messages are said to begin, which saves time and changes nothing else.
     """
     size, unpack = len(content), _LENGTH.unpack_from
-    hints = None if places is None else _Hints(content, places)
-    expected = size if hints is None else hints.next
+    hints: _Hints | None = None
+    left = size // _HEAD.itemsize + MOST_DECLARATIONS
     parts: list[IntArray] = []
     found: list[int] = []
     position, previous, repeats, needed = 0, -1, 0, _RUN
-    while position + RECORD.size <= size:
-        if hints is not None and expected <= position:
-            run, position = hints.run(position, size)
-            expected = hints.next
+
+    def keep(more: IntArray) -> None:
+        nonlocal found, left
+        parts.extend((np.array(found, dtype=np.int64), more))
+        left -= len(found) + more.size
+        found = []
+
+    while position + RECORD.size <= size and left > len(found):
+        if hints is not None and hints.next <= position:
+            run, heads, after = hints.run(position, size)
+            if position == 0 and after == size:
+                return Records(content, run, size, heads)
             if run.size:
-                parts += [np.array(found, dtype=np.int64), run]
-                found = []
+                position = after
+                keep(run)
                 continue
         (length,) = unpack(content, position + 1)
         if length > size - position - RECORD.size or content[position] == 0:
@@ -329,18 +382,22 @@ def record_offsets(content: Content, places: IntArray | None = None) -> tuple[In
         repeats = repeats + 1 if length == previous else 0
         previous = length
         if repeats >= needed:
-            count = _equal_records(content, position, length)
+            count = min(_equal_records(content, position, length), left)
             # Where runs are short, looking for them costs more than it gives.
             needed = _RUN if count >= 4 * _RUN else 2 * needed
-            if count:
-                step = RECORD.size + length
-                parts += [np.array(found, dtype=np.int64)]
-                parts += [position + step * np.arange(count, dtype=np.int64)]
-                found = []
-                position += count * step
+            step = RECORD.size + length
+            keep(position + step * np.arange(count, dtype=np.int64))
+            position += count * step
             repeats = 0
-    parts.append(np.array(found, dtype=np.int64))
-    return np.concatenate(parts), position
+        elif hints is None and places is not None and len(found) >= 2 * _RUN:
+            # Records of equal size are found sooner without. All at once from the beginning.
+            hints = _Hints(content, places)
+            if not parts:
+                found, position = [], 0
+        elif len(found) >= _LONGEST_RUN:
+            keep(_NOWHERE)
+    keep(_NOWHERE)
+    return Records(content, np.concatenate(parts), position)
 
 
 def _equal_records(content: Content, position: int, length: int) -> int:
@@ -367,9 +424,8 @@ def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
     :param indexes: the records of message indexes that follow the chunk; what makes no sense in
         them is left out.
     """
-    offsets, _ = record_offsets(indexes)
     found: dict[int, IntArray] = {}
-    for at in offsets.tolist():
+    for at in records_of(indexes).offsets.tolist():
         opcode, length = RECORD.unpack_from(indexes, at)
         if opcode != Opcode.MESSAGE_INDEX or length < 6:
             continue
@@ -386,52 +442,58 @@ def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
 class Sorted:
     """The records of some content by what they are.
 
-    :param places: where the messages of each wanted channel begin, shape (n,) each.
+    :param messages: those of each wanted channel that has any.
     :param others: where the records begin that are no messages, shape (m,).
     :param unknown: where messages of channels begin that are not declared, shape (k,).
     :param short: number of messages that are too short to be one.
     """
 
-    places: dict[int, IntArray]
+    messages: dict[int, Messages]
     others: IntArray
     unknown: IntArray
     short: int
 
 
 def sorted_records(
-    content: Content, offsets: IntArray, wanted: Collection[int] | None, declared: Collection[int]
+    records: Records, wanted: Collection[int] | None, declared: Collection[int]
 ) -> Sorted:
     """Tell messages by their channels, and from other records.
 
-    :param content: the records.
-    :param offsets: where each begins.
+    :param records: all of them.
     :param wanted: the channels whose messages are wanted; None: all of them.
     :param declared: the channels that there are.
     """
-    is_message = _opcodes(content, offsets) == Opcode.MESSAGE
-    others, places = offsets[~is_message], offsets[is_message]
-    if not places.size:
-        return Sorted({}, others, places, 0)
-    whole = every_byte(content, "<u8", 1)[places] >= MESSAGE_HEAD_SIZE
-    short = int(places.size - np.count_nonzero(whole))
-    places = places[whole]
-    channels = every_byte(content, "<u2", RECORD.size)[places]
+    offsets, opaque = records.offsets, records.heads
+    near = opaque.size
+    last = _opcodes(records.content, offsets[near:]) == Opcode.MESSAGE
+    is_message = opaque.view(_HEAD)["opcode"] == Opcode.MESSAGE
+    others = np.append(offsets[:near][~is_message], offsets[near:][~last])
+    whole = is_message & (opaque.view(_HEAD)["length"] >= MESSAGE_HEAD_SIZE)
+    short = np.count_nonzero(is_message) - np.count_nonzero(whole) + np.count_nonzero(last)
+    places = offsets[:near]
+    if not whole.all():
+        places, opaque = places[whole], opaque[whole]
+    channels = np.ascontiguousarray(opaque.view(_HEAD)["channel"])
     known = np.zeros(1 << 16, dtype=np.bool_)
     known[list(declared)] = True
-    unknown = places[~known[channels]]
-    chosen = np.unique(channels).tolist() if wanted is None else sorted(wanted)
-    found = {number: places[channels == number] for number in chosen}
-    return Sorted({n: at for n, at in found.items() if at.size}, others, unknown, short)
+    _, unknown = _parted(places, known[channels])
+    chosen = np.flatnonzero(np.bincount(channels)).tolist() if wanted is None else sorted(wanted)
+    found: dict[int, Messages] = {}
+    for number in chosen:
+        own = np.flatnonzero(channels == number)
+        if own.size:
+            found[number] = _messages_at(records.content, places[own], opaque[own].view(_HEAD))
+    return Sorted(found, others, unknown, int(short))
 
 
-def messages_at(content: Content, offsets: IntArray) -> Messages:
-    """Return the messages at some places.
+def _parted(places: IntArray, chosen: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+    """Return the places that are chosen, mostly all of them, and the others."""
+    if chosen.all():
+        return places, places[:0]
+    return places[chosen], places[~chosen]
 
-    :param content: the records.
-    :param offsets: where messages begin, as `sorted_records` found them, shape (n,).
-    """
-    # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
-    heads = every_byte(content, f"V{_HEAD.itemsize}")[offsets].view(_HEAD)
+
+def _messages_at(content: Content, offsets: IntArray, heads: NDArray[Any]) -> Messages:
     body = offsets + RECORD.size
     times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
     end = body + heads["length"].astype(np.int64)
