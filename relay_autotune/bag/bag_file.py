@@ -49,7 +49,8 @@ from relay_autotune.bag.mcap_records import (
     Messages,
     Sorted,
     indexed_offsets,
-    records_of,
+    listed_records,
+    record_offsets,
     sorted_records,
 )
 from relay_autotune.bag.source import MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, Source, expanding
@@ -206,6 +207,17 @@ class _Piece:
     listed: dict[int, IntArray]
 
 
+def _listed_together(pieces: Sequence[_Piece], begins: IntArray) -> dict[int, IntArray]:
+    """Return where the messages of each channel are said to begin in all pieces together."""
+    if len(pieces) == 1:
+        return pieces[0].listed
+    parts: dict[int, list[IntArray]] = {}
+    for piece, begin in zip(pieces, begins[:-1], strict=True):
+        for channel, places in piece.listed.items():
+            parts.setdefault(channel, []).append(places + begin)
+    return {channel: np.concatenate(some) for channel, some in parts.items()}
+
+
 class McapFile(BagFile):
     """An MCAP file open for reading.
 
@@ -316,25 +328,23 @@ class McapFile(BagFile):
         """Return the messages of each run of records, after the size of that."""
         content = pieces[0].content if len(pieces) == 1 else b"".join(p.content for p in pieces)
         begins = np.cumsum([0, *(len(piece.content) for piece in pieces)])
-        listed = [
-            places + begin
-            for piece, begin in zip(pieces, begins[:-1], strict=True)
-            for places in piece.listed.values()
-        ]
-        hints = np.concatenate(listed) if listed else None
-        records = records_of(content, hints)
-        if len(pieces) > 1 and not bool(
-            np.isin(begins, np.append(records.offsets, records.end)).all()
-        ):
-            # One of them does not end with a record.
-            return [found for piece in pieces for found in self._messages([piece], wanted)]
-        if records.end != len(content) and pieces[0].segment.whole:
-            damage = DamageError(f"a record of impossible length at {records.end}")
-            self._note(damage_note(self._source, pieces[0].segment, damage))
-        found = sorted_records(records, wanted, self.channels)
-        self._check(content, found)
-        for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
-            self._check_index(piece, found, wanted, int(begin), int(stop))
+        found = None
+        if all(piece.listed for piece in pieces):
+            found = listed_records(
+                content, _listed_together(pieces, begins), wanted, self.channels
+            )
+        if found is None:
+            offsets, end = record_offsets(content)
+            if len(pieces) > 1 and not bool(np.isin(begins, np.append(offsets, end)).all()):
+                # One of them does not end with a record.
+                return [found for piece in pieces for found in self._messages([piece], wanted)]
+            if end != len(content) and pieces[0].segment.whole:
+                damage = DamageError(f"a record of impossible length at {end}")
+                self._note(damage_note(self._source, pieces[0].segment, damage))
+            found = sorted_records(content, offsets, wanted, self.channels)
+            self._check(content, found)
+            for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
+                self._check_index(piece, found, wanted, int(begin), int(stop))
         return [(len(content), found.messages)]
 
     def _check(self, content: Content, found: Sorted) -> None:

@@ -26,10 +26,8 @@ from relay_autotune.bag.mcap_records import (
     DamageError,
     Declarations,
     Opcode,
-    Records,
     every_byte,
-    indexed_offsets,
-    records_of,
+    record_offsets,
     sorted_records,
     text,
     unsigned,
@@ -300,19 +298,17 @@ class _Scan:
         channels: frozenset[int] = frozenset()
         try:
             content = segment_content(self.source, segment)
-            listed = indexed_offsets(self.source.read(segment.end, segment.index_end))
-            places = np.concatenate([*listed.values()]) if listed else None
-            channels = self._declare(records_of(content, places))
+            channels = self._declare(content)
         except DamageError as damage:
             if not segment.whole:
                 return
             self.layout.notes.append(damage_note(self.source, segment, damage))
         self.layout.segments.append(replace(segment, channels=channels))
 
-    def _declare(self, records: Records) -> frozenset[int]:
-        found = sorted_records(records, None, ())
+    def _declare(self, content: Content) -> frozenset[int]:
+        found = sorted_records(content, record_offsets(content)[0], None, ())
         with contextlib.suppress(DamageError):
-            self.layout.declared.take_all(records.content, found.others)
+            self.layout.declared.take_all(content, found.others)
         for messages in found.messages.values():
             self.count += len(messages)
             first = int(messages.log_time.min())
@@ -324,8 +320,7 @@ class _Scan:
         """Take a piece of records outside of chunks; return where the next one begins."""
         stop = min(position + _PIECE, self.source.size)
         piece = self.source.read(position, stop)
-        records = records_of(piece)
-        offsets, end = records.offsets, records.end
+        offsets, end = record_offsets(piece)
         if len(piece) < RECORD.size:
             return position
         if end == 0:
@@ -344,7 +339,7 @@ class _Scan:
 
     def _take_loose(self, piece: bytes, position: int, end: int) -> int:
         if len(piece) == end - position:
-            channels = self._declare(records_of(piece))
+            channels = self._declare(piece)
             self.layout.segments.append(Segment(position, end, True, False, channels))
         return end
 
@@ -400,10 +395,9 @@ def layout_by_summary(source: Source) -> Layout | None:
 
 def _take(summary: bytes, data_end: int, layout: Layout) -> ChunkIndex:
     """Take in what a summary declares, and return its chunks."""
-    records = records_of(summary)
-    offsets = records.offsets
-    if records.end != len(summary):
-        raise DamageError(f"a record of impossible length at {records.end}")
+    offsets, end = record_offsets(summary)
+    if end != len(summary):
+        raise DamageError(f"a record of impossible length at {end}")
     is_chunk = every_byte(summary, "u1")[offsets] == Opcode.CHUNK_INDEX
     for at in offsets[~is_chunk].tolist():
         opcode, length = RECORD.unpack_from(summary, at)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -267,137 +267,43 @@ def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> N
     return np.ndarray((count,), kind, content, shift, (1,))
 
 
-@dataclass(frozen=True)
-class Records:
-    """The records that follow each other in some content.
-
-    :param content: the records.
-    :param offsets: where each begins, shape (n,).
-    :param end: where the last whole one ends.
-    :param read: the heads of all of them as `heads` has them, where they are read already.
-    """
-
-    content: Content
-    offsets: IntArray
-    end: int
-    read: NDArray[Any] | None = None
-
-    @property
-    def heads(self) -> NDArray[Any]:
-        """The heads of messages as opaque bytes, shape (m,).
-
-        The content ends within those of the last n - m records, which are none of messages.
-        """
-        if self.read is not None:
-            return self.read
-        last = len(self.content) - _HEAD.itemsize
-        return _heads(self.content, self.offsets[: np.searchsorted(self.offsets, last, "right")])
-
-
-def _heads(content: Content, offsets: IntArray) -> NDArray[Any]:
-    # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
-    return every_byte(content, f"V{_HEAD.itemsize}")[offsets]
-
-
-class _Hints:
-    """Places at which messages are said to begin; each is checked before it is used.
-
-    :param content: the records.
-    :param places: in any order, wrong ones among them; shape (n,).
-    """
-
-    def __init__(self, content: Content, places: IntArray) -> None:
-        last = len(content) - _HEAD.itemsize
-        # Each channel lists its places rising, and this sort is for such runs; to find equal ones
-        # takes numpy ten times as long as to leave them out here.
-        at = np.sort(places, kind="stable")
-        at = at[np.searchsorted(at, 0) : np.searchsorted(at, last, "right")]
-        at, _ = _parted(at, np.append(at[1:] != at[:-1], [True] * bool(at.size)))
-        heads = _heads(content, at)
-        # A length beyond the signed range is negative here.
-        length = heads.view(_HEAD)["length"].astype(np.int64)
-        fits = (length >= 0) & (length <= len(content) - RECORD.size - at)
-        fits &= heads.view(_HEAD)["opcode"] != 0
-        if not fits.all():
-            at, heads, length = at[fits], heads[fits], length[fits]
-        self._at, self._heads = at, heads
-        self._after = at + length + RECORD.size
-        # A run ends where the next place is not the one that its last record leads to.
-        self._ends = np.append(np.flatnonzero(self._after[:-1] != at[1:]), at.size - 1)
-        self.next = int(at[0]) if at.size else len(content)
-
-    def run(self, position: int, size: int) -> tuple[IntArray, NDArray[Any], int]:
-        """Return records that follow each other from a place on, and where the last one ends.
-
-        :param position: where a record begins; `next` is not beyond it.
-        :param size: of the content.
-        :return: where they begin, their heads, and the end.
-        """
-        first = last = int(np.searchsorted(self._at, position))
-        begin = position
-        if first < self._at.size and self._at[first] == position:
-            last = int(self._ends[np.searchsorted(self._ends, first)]) + 1
-            position = int(self._after[last - 1])
-        after = last if position == begin else int(np.searchsorted(self._at, position))
-        self.next = int(self._at[after]) if after < self._at.size else size
-        return self._at[first:last], self._heads[first:last], position
-
-
-def records_of(content: Content, places: IntArray | None = None) -> Records:
-    """Return the records that follow each other from the beginning of some content.
+def record_offsets(content: Content) -> tuple[IntArray, int]:
+    """Return where each record begins, and where the last whole one ends.
 
     They end before the content where it has more of them than messages and declarations can be
     in it: records of nothing would take several times its memory.
 
     :param content: the records.
-    :param places: where messages are said to begin, which saves time and changes nothing else.
     """
     size, unpack = len(content), _LENGTH.unpack_from
-    hints: _Hints | None = None
     left = size // _HEAD.itemsize + MOST_DECLARATIONS
     parts: list[IntArray] = []
     found: list[int] = []
     position, previous, repeats, needed = 0, -1, 0, _RUN
-
-    def keep(more: IntArray) -> None:
-        nonlocal found, left
-        parts.extend((np.array(found, dtype=np.int64), more))
-        left -= len(found) + more.size
-        found = []
-
-    while position + RECORD.size <= size and left > len(found):
-        if hints is not None and hints.next <= position:
-            run, heads, after = hints.run(position, size)
-            if position == 0 and after == size:
-                return Records(content, run, size, heads)
-            if run.size:
-                position = after
-                keep(run)
-                continue
+    while position + RECORD.size <= size and left > 0:
         (length,) = unpack(content, position + 1)
         if length > size - position - RECORD.size or content[position] == 0:
             break
         found.append(position)
+        left -= 1
         position += RECORD.size + length
         repeats = repeats + 1 if length == previous else 0
         previous = length
+        count = 0
         if repeats >= needed:
             count = min(_equal_records(content, position, length), left)
             # Where runs are short, looking for them costs more than it gives.
             needed = _RUN if count >= 4 * _RUN else 2 * needed
-            step = RECORD.size + length
-            keep(position + step * np.arange(count, dtype=np.int64))
-            position += count * step
             repeats = 0
-        elif hints is None and places is not None and len(found) >= 2 * _RUN:
-            # Records of equal size are found sooner without. All at once from the beginning.
-            hints = _Hints(content, places)
-            if not parts:
-                found, position = [], 0
-        elif len(found) >= _LONGEST_RUN:
-            keep(_NOWHERE)
-    keep(_NOWHERE)
-    return Records(content, np.concatenate(parts), position)
+        if count or len(found) >= _LONGEST_RUN:
+            step = RECORD.size + length
+            parts += [np.array(found, dtype=np.int64)]
+            parts += [position + step * np.arange(count, dtype=np.int64)]
+            found = []
+            position += count * step
+            left -= count
+    parts.append(np.array(found, dtype=np.int64))
+    return np.concatenate(parts), position
 
 
 def _equal_records(content: Content, position: int, length: int) -> int:
@@ -425,7 +331,7 @@ def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
         them is left out.
     """
     found: dict[int, IntArray] = {}
-    for at in records_of(indexes).offsets.tolist():
+    for at in record_offsets(indexes)[0].tolist():
         opcode, length = RECORD.unpack_from(indexes, at)
         if opcode != Opcode.MESSAGE_INDEX or length < 6:
             continue
@@ -455,57 +361,102 @@ class Sorted:
 
 
 def sorted_records(
-    records: Records, wanted: Collection[int] | None, declared: Collection[int]
+    content: Content, offsets: IntArray, wanted: Collection[int] | None, declared: Collection[int]
 ) -> Sorted:
     """Tell messages by their channels, and from other records.
 
-    :param records: all of them.
+    :param content: the records.
+    :param offsets: where each begins.
     :param wanted: the channels whose messages are wanted; None: all of them.
     :param declared: the channels that there are.
     """
-    offsets, opaque = records.offsets, records.heads
-    near = opaque.size
-    last = _opcodes(records.content, offsets[near:]) == Opcode.MESSAGE
-    is_message = opaque.view(_HEAD)["opcode"] == Opcode.MESSAGE
-    others = np.append(offsets[:near][~is_message], offsets[near:][~last])
-    whole = is_message & (opaque.view(_HEAD)["length"] >= MESSAGE_HEAD_SIZE)
-    short = np.count_nonzero(is_message) - np.count_nonzero(whole) + np.count_nonzero(last)
-    places = offsets[:near]
-    if not whole.all():
-        places, opaque = places[whole], opaque[whole]
-    channels = np.ascontiguousarray(opaque.view(_HEAD)["channel"])
+    is_message = _opcodes(content, offsets) == Opcode.MESSAGE
+    others, places = offsets[~is_message], _chosen(offsets, is_message)
+    # Nearer to the end of the content only one that is too short begins.
+    last = len(content) - _HEAD.itemsize
+    heads = _heads(content, places[: np.searchsorted(places, last, side="right")])
+    whole = heads["length"] >= MESSAGE_HEAD_SIZE
+    short = places.size - int(np.count_nonzero(whole))
+    places, heads = _chosen(places[: heads.size], whole), _chosen(heads, whole)
+    channels = np.ascontiguousarray(heads["channel"])
     known = np.zeros(1 << 16, dtype=np.bool_)
     known[list(declared)] = True
-    _, unknown = _parted(places, known[channels])
+    unknown = places[~known[channels]]
     chosen = np.flatnonzero(np.bincount(channels)).tolist() if wanted is None else sorted(wanted)
     found: dict[int, Messages] = {}
     for number in chosen:
         own = np.flatnonzero(channels == number)
         if own.size:
-            found[number] = _messages_at(records.content, places[own], opaque[own].view(_HEAD))
-    return Sorted(found, others, unknown, int(short))
+            at, of_it = places[own], heads[own]
+            end = at + RECORD.size + of_it["length"].astype(np.int64)
+            found[number] = _messages_at(content, at, of_it, end)
+    return Sorted(found, others, unknown, short)
 
 
-def _parted(places: IntArray, chosen: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
-    """Return the places that are chosen, mostly all of them, and the others."""
-    if chosen.all():
-        return places, places[:0]
-    return places[chosen], places[~chosen]
+def listed_records(
+    content: Content,
+    listed: Mapping[int, IntArray],
+    wanted: Collection[int],
+    declared: Collection[int],
+) -> Sorted | None:
+    """Return what `sorted_records` would, without going from record to record.
+
+    Where each place that is listed holds a message of its channel, and each message ends where
+    another one begins, or the content ends, nothing else is in it.
+
+    :param content: the records.
+    :param listed: where messages are said to begin, by channel, shape (n,) each.
+    :param wanted: the channels whose messages are wanted.
+    :param declared: the channels that there are.
+    :return: None: not all of that is so.
+    """
+    begins, ends = [np.array([len(content)])], [np.array([0])]
+    found: dict[int, Messages] = {}
+    last = len(content) - _HEAD.itemsize
+    for channel, at in listed.items():
+        rising = bool((at[1:] > at[:-1]).all())
+        if channel not in declared or not rising or not at.size or at[0] < 0 or at[-1] > last:
+            return None
+        heads = _heads(content, at)
+        # One beyond the signed range is negative here.
+        length = heads["length"].astype(np.int64)
+        right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channel)
+        right &= (length >= MESSAGE_HEAD_SIZE) & (length <= last + MESSAGE_HEAD_SIZE - at)
+        if not right.all():
+            return None
+        begins.append(at)
+        ends.append(at + (length + RECORD.size))
+        if channel in wanted:
+            found[channel] = _messages_at(content, at, heads, ends[-1])
+    # Numbers of few bytes are sorted sooner.
+    form = np.min_scalar_type(len(content))
+    begin, end = (np.sort(np.concatenate(some).astype(form)) for some in (begins, ends))
+    return Sorted(found, _NOWHERE, _NOWHERE, 0) if np.array_equal(begin, end) else None
 
 
-def _messages_at(content: Content, offsets: IntArray, heads: NDArray[Any]) -> Messages:
-    body = offsets + RECORD.size
+def _chosen(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return the values that are chosen, mostly all of them."""
+    return values if chosen.all() else values[chosen]
+
+
+def _heads(content: Content, offsets: IntArray) -> NDArray[Any]:
+    # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
+    return every_byte(content, f"V{_HEAD.itemsize}")[offsets].view(_HEAD)
+
+
+def _messages_at(
+    content: Content, offsets: IntArray, heads: NDArray[Any], end: IntArray
+) -> Messages:
     times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
-    end = body + heads["length"].astype(np.int64)
-    return Messages(content, offsets, *times, body + MESSAGE_HEAD_SIZE, end)
+    begin = offsets + (RECORD.size + MESSAGE_HEAD_SIZE)
+    return Messages(content, offsets, *times, begin, end)
 
 
 def nanoseconds(values: NDArray[np.uint64]) -> IntArray:
     """Return times as signed numbers; one beyond their range is no time of any clock."""
     signed = values.astype(np.int64)
-    beyond = signed < 0
-    if bool(beyond.any()):
-        signed[beyond] = np.iinfo(np.int64).max
+    if signed.size and int(signed.min()) < 0:
+        signed[signed < 0] = np.iinfo(np.int64).max
     return signed
 
 
