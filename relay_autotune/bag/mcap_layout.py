@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW
+from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW, MOST_DECLARATIONS
 from relay_autotune.bag.mcap_records import (
     FOOTER_SIZE,
     RECORD,
@@ -306,7 +306,10 @@ class _Scan:
         self.layout.segments.append(replace(segment, channels=channels))
 
     def _declare(self, content: Content) -> frozenset[int]:
-        found = sorted_records(content, record_offsets(content)[0], None, ())
+        offsets, _ = record_offsets(content)
+        # Before they take several times the memory of the content.
+        self.source.count_messages(self.count + offsets.size - MOST_DECLARATIONS)
+        found = sorted_records(content, offsets, None, ())
         with contextlib.suppress(DamageError):
             self.layout.declared.take_all(content, found.others)
         for messages in found.messages.values():

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.limits import MOST_DECLARATIONS
+from relay_autotune.bag.limits import MOST_DECLARATIONS, MOST_DECLARED
+from relay_autotune.errors import BagError
 from relay_autotune.text import visible
 
 
@@ -114,6 +115,7 @@ class Declarations:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._channels: dict[int, tuple[str, int, str, dict[str, str]]] = {}
         self._taken: set[tuple[int, bytes]] = set()
+        self._size = 0
 
     @property
     def channels(self) -> dict[int, Channel]:
@@ -131,17 +133,27 @@ class Declarations:
             schema in self._schemas or schema == 0 for _, schema, *_ in self._channels.values()
         )
 
+    @staticmethod
+    def _too_many() -> BagError:
+        return BagError(
+            f"the recording declares more than {MOST_DECLARATIONS} schemas, channels and "
+            f"metadata, or more than {MOST_DECLARED} bytes of them; expected a recording"
+        )
+
     def take_all(self, content: bytes | memoryview, offsets: IntArray) -> None:
         """Take in those of the records inside of a chunk that declare channels.
 
         :param content: the records.
         :param offsets: where each begins, shape (n,).
-        :raises DamageError: if one contradicts itself, or there are too many; the others are
-            taken in.
+        :raises DamageError: if one contradicts itself; the others are taken in.
+        :raises BagError: if there are too many.
         """
         opcodes = np.ndarray((len(content),), "u1", content)[offsets]
         damage: DamageError | None = None
-        for at in offsets[(opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)].tolist():
+        declaring = offsets[(opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)]
+        if declaring.size > MOST_DECLARATIONS:
+            raise self._too_many()
+        for at in declaring.tolist():
             opcode, length = RECORD.unpack_from(content, at)
             begin = at + RECORD.size
             try:
@@ -154,14 +166,16 @@ class Declarations:
     def take(self, opcode: int, body: bytes) -> None:
         """Take in a record, if it declares anything.
 
-        :raises DamageError: if it contradicts itself, or there are too many.
+        :raises DamageError: if it contradicts itself.
+        :raises BagError: if there are too many.
         """
         if opcode not in _DECLARING:
             return
         if (opcode, body) in self._taken:
             return
-        if len(self._taken) >= MOST_DECLARATIONS:
-            raise DamageError(f"more than {MOST_DECLARATIONS} schemas, channels and metadata")
+        self._size += len(body)
+        if len(self._taken) >= MOST_DECLARATIONS or self._size > MOST_DECLARED:
+            raise self._too_many()
         self._taken.add((opcode, body))
         if opcode == Opcode.SCHEMA:
             number = unsigned(body, 0, "<H")
@@ -270,10 +284,9 @@ def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> N
 def record_offsets(content: Content) -> tuple[IntArray, int]:
     """Return where each record begins, and where the last whole one ends.
 
-    They end before the content where it has more of them than messages and declarations can be
-    in it: records of nothing would take several times its memory.
-
     :param content: the records.
+    :raises BagError: if it has more of them than messages and declarations can be in it: records
+        of nothing would take several times its memory.
     """
     size, unpack = len(content), _LENGTH.unpack_from
     left = size // _HEAD.itemsize + MOST_DECLARATIONS
@@ -302,6 +315,11 @@ def record_offsets(content: Content) -> tuple[IntArray, int]:
             found = []
             position += count * step
             left -= count
+    if left <= 0:
+        raise BagError(
+            f"the recording holds {size} bytes with more records than messages that they can be; "
+            f"expected a recording"
+        )
     parts.append(np.array(found, dtype=np.int64))
     return np.concatenate(parts), position
 
