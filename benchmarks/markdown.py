@@ -34,11 +34,14 @@ class Figure:
     :param value: as it stands.
     :param target: the bound.
     :param is_least: whether the figure is to be at least that, not at most.
+    :param comparable: the figure, or, where the row has it, the multiple of a reference workload
+        that was timed in turns with it: that one does not turn on the machine and its other work.
     """
 
     value: float
     target: float
     is_least: bool
+    comparable: float
 
     @property
     def is_met(self) -> bool:
@@ -47,9 +50,11 @@ class Figure:
 
     def loss(self, earlier: Figure) -> float:
         """Return how many times worse it is than an earlier one."""
-        return earlier.value / self.value if self.is_least else self.value / earlier.value
+        ratio = self.comparable / earlier.comparable
+        return 1.0 / ratio if self.is_least else ratio
 
 
+_MULTIPLE = "x reference"
 _CELL = re.compile(r"(?P<sign>[<>]=)? ?(?P<number>\d[\d,]*(\.\d+)?)")
 
 
@@ -69,9 +74,13 @@ def figures(text: str, naming: int) -> dict[tuple[str, ...], Figure]:
         for k, (value, target) in enumerate(pairwise(cells)):
             figure, bound = _CELL.match(value), _CELL.match(target)
             if headings[k + 1].startswith("target") and figure and bound and bound["sign"]:
-                stated, wanted = (float(m["number"].replace(",", "")) for m in (figure, bound))
+                multiple = _CELL.match(dict(zip(headings, cells, strict=True)).get(_MULTIPLE, ""))
+                stated, wanted, comparable = (
+                    float(m["number"].replace(",", ""))
+                    for m in (figure, bound, multiple or figure)
+                )
                 name = (*cells[:naming], headings[k])
-                found[name] = Figure(stated, wanted, bound["sign"] == ">=")
+                found[name] = Figure(stated, wanted, bound["sign"] == ">=", comparable)
     return found
 
 

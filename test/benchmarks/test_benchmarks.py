@@ -121,13 +121,6 @@ def place_on_page(name: str) -> str:
     return PAGE.split(f"<!-- results of {name} -->")[1].split("<!-- end -->")[0]
 
 
-@pytest.mark.parametrize("name", SHORT)
-def test_the_page_has_figures_within_their_targets(name: str) -> None:
-    stated = markdown.figures(place_on_page(name), SHORT[name][1])
-    assert stated
-    assert [key for key, figure in stated.items() if not figure.is_met] == []
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", SHORT)
 def test_the_page_is_still_true(name: str) -> None:
@@ -159,10 +152,11 @@ def test_a_table_that_is_no_longer_true_is_noticed() -> None:
     assert not found.is_met
     assert found.loss(stated) == pytest.approx(53 / 15)
     assert found.loss(stated) > MOST_LOSS
-    (time,) = markdown.figures(
-        "| d | [ms] | target [ms] |\n|-|-|-|\n| b | 1,071 | <= 10,000 |", 1
-    ).values()
+    heads = "| d | [ms] | target [ms] | x reference |\n|-|-|-|-|\n"
+    (time,) = markdown.figures(f"{heads}| b | 1,071 | <= 10,000 | 20 |", 1).values()
     assert (time.value, time.target, time.is_met) == (1071.0, 10_000.0, True)
+    (slower,) = markdown.figures(f"{heads}| b | 4,000 | <= 10,000 | 30 |", 1).values()
+    assert slower.loss(time) == 1.5
 
 
 JUDGE = """
