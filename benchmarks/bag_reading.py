@@ -132,10 +132,10 @@ def expand(chunks: list[tuple[bytes, int]]) -> None:
 def comparison(folder: Path, count: int, turns: int) -> list[tuple[str, ...]]:
     """Compare with the libraries, on pairs in regular and irregular turns."""
     cases = (
-        ("in turns, zstd", pair_of_numbers, "zstd", 30),
-        ("in turns, uncompressed", pair_of_numbers, "", 30),
-        ("irregular among others, zstd", among_others, "zstd", 15),
-        ("irregular among others, uncompressed", among_others, "", 15),
+        ("in turns, zstd", pair_of_numbers, "zstd", 40),
+        ("in turns, uncompressed", pair_of_numbers, "", 75),
+        ("irregular among others, zstd", among_others, "zstd", 27),
+        ("irregular among others, uncompressed", among_others, "", 50),
     )
     rows = []
     for name, make, compression, target in cases:

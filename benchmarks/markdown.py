@@ -5,7 +5,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -22,6 +25,63 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
     rule = "|" + "|".join("-" * (w + 2) for w in widths) + "|"
     return "\n".join([line(cells[0]), rule, *map(line, cells[1:])])
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of a table, and the bound that the next column sets for it.
+
+    :param value: as it stands.
+    :param target: the bound.
+    :param is_least: whether the figure is to be at least that, not at most.
+    :param comparable: the figure, or, where the row has it, the multiple of a reference workload
+        that was timed in turns with it: that one does not turn on the machine and its other work.
+    """
+
+    value: float
+    target: float
+    is_least: bool
+    comparable: float
+
+    @property
+    def is_met(self) -> bool:
+        """Whether it is within its bound."""
+        return self.value >= self.target if self.is_least else self.value <= self.target
+
+    def loss(self, earlier: Figure) -> float:
+        """Return how many times worse it is than an earlier one."""
+        ratio = self.comparable / earlier.comparable
+        return 1.0 / ratio if self.is_least else ratio
+
+
+_MULTIPLE = "x reference"
+_CELL = re.compile(r"(?P<sign>[<>]=)? ?(?P<number>\d[\d,]*(\.\d+)?)")
+
+
+def figures(text: str, naming: int) -> dict[tuple[str, ...], Figure]:
+    """Return the figures of all tables in a text that have a target in the next column.
+
+    :param text: with tables as `table` makes them.
+    :param naming: number of columns at the beginning that name a row.
+    :return: the figures by the cells that name them, and the heading.
+    """
+    found: dict[tuple[str, ...], Figure] = {}
+    headings: list[str] = []
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if len(cells) != len(headings):
+            headings = cells
+        for k, (value, target) in enumerate(pairwise(cells)):
+            figure, bound = _CELL.match(value), _CELL.match(target)
+            if headings[k + 1].startswith("target") and figure and bound and bound["sign"]:
+                multiple = _CELL.match(dict(zip(headings, cells, strict=True)).get(_MULTIPLE, ""))
+                stated, wanted, comparable = (
+                    float(m["number"].replace(",", ""))
+                    for m in (figure, bound, multiple or figure)
+                )
+                name = (*cells[:naming], headings[k])
+                found[name] = Figure(stated, wanted, bound["sign"] == ">=", comparable)
+    return found
 
 
 def three(value: float) -> str:

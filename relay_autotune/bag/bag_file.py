@@ -31,7 +31,10 @@ from relay_autotune.bag.limits import (
     LARGEST_CHUNK,
     LARGEST_DEFINITION,
     MOST_DECLARATIONS,
+    MOST_DECLARED,
     MOST_NOTES,
+    MOST_STEPS_OF_SQLITE,
+    STEPS_OF_SQLITE_PER_BYTE,
 )
 from relay_autotune.bag.mcap_layout import (
     Segment,
@@ -49,12 +52,13 @@ from relay_autotune.bag.mcap_records import (
     Messages,
     Sorted,
     indexed_offsets,
-    messages_at,
+    listed_records,
     record_offsets,
     sorted_records,
 )
 from relay_autotune.bag.source import MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, Source, expanding
 from relay_autotune.errors import BagError
+from relay_autotune.text import visible
 
 # Size of the expanded messages that are handed on together [bytes].
 _EXPANDED = 16 << 20
@@ -207,6 +211,17 @@ class _Piece:
     listed: dict[int, IntArray]
 
 
+def _listed_together(pieces: Sequence[_Piece], begins: IntArray) -> dict[int, IntArray]:
+    """Return where the messages of each channel are said to begin in all pieces together."""
+    if len(pieces) == 1:
+        return pieces[0].listed
+    parts: dict[int, list[IntArray]] = {}
+    for piece, begin in zip(pieces, begins[:-1], strict=True):
+        for channel, places in piece.listed.items():
+            parts.setdefault(channel, []).append(places + begin)
+    return {channel: np.concatenate(some) for channel, some in parts.items()}
+
+
 class McapFile(BagFile):
     """An MCAP file open for reading.
 
@@ -269,6 +284,7 @@ class McapFile(BagFile):
             for size, found in self._messages(pieces, wanted):
                 for channel, messages in found.items():
                     counts[channel] += messages.begin.size
+                    self._source.count_messages(counts[channel])
                     for part in self._as_sent(channel, messages, f" of {self._name(channel)}"):
                         yield channel, before, part
                 before += size + _SMALLEST_RECORD
@@ -317,24 +333,25 @@ class McapFile(BagFile):
         """Return the messages of each run of records, after the size of that."""
         content = pieces[0].content if len(pieces) == 1 else b"".join(p.content for p in pieces)
         begins = np.cumsum([0, *(len(piece.content) for piece in pieces)])
-        listed = [
-            places + begin
-            for piece, begin in zip(pieces, begins[:-1], strict=True)
-            for places in piece.listed.values()
-        ]
-        hints = np.concatenate(listed) if listed else None
-        offsets, end = record_offsets(content, hints)
-        if len(pieces) > 1 and not bool(np.isin(begins, np.append(offsets, end)).all()):
-            # One of them does not end with a record.
-            return [found for piece in pieces for found in self._messages([piece], wanted)]
-        if end != len(content) and pieces[0].segment.whole:
-            damage = DamageError(f"a record of impossible length at {end}")
-            self._note(damage_note(self._source, pieces[0].segment, damage))
-        found = sorted_records(content, offsets, wanted, self.channels)
-        self._check(content, found)
-        for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
-            self._check_index(piece, found, wanted, int(begin), int(stop))
-        return [(len(content), {c: messages_at(content, at) for c, at in found.places.items()})]
+        found = None
+        if all(piece.listed for piece in pieces):
+            found = listed_records(
+                content, _listed_together(pieces, begins), wanted, self.channels
+            )
+        if found is None:
+            offsets, end = record_offsets(content)
+            self._source.count_messages(offsets.size - MOST_DECLARATIONS)
+            if len(pieces) > 1 and not bool(np.isin(begins, np.append(offsets, end)).all()):
+                # One of them does not end with a record.
+                return [found for piece in pieces for found in self._messages([piece], wanted)]
+            if end != len(content) and pieces[0].segment.whole:
+                damage = DamageError(f"a record of impossible length at {end}")
+                self._note(damage_note(self._source, pieces[0].segment, damage))
+            found = sorted_records(content, offsets, wanted, self.channels)
+            self._check(content, found)
+            for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
+                self._check_index(piece, found, wanted, int(begin), int(stop))
+        return [(len(content), found.messages)]
 
     def _check(self, content: Content, found: Sorted) -> None:
         """Note what in some records cannot be used, or contradicts what is known."""
@@ -360,7 +377,8 @@ class McapFile(BagFile):
         if piece.segment.index_end <= piece.segment.end:
             return
         for channel in wanted:
-            there = found.places.get(channel, _NOWHERE)
+            own = found.messages.get(channel)
+            there = _NOWHERE if own is None else own.order
             there = there[np.searchsorted(there, begin) : np.searchsorted(there, stop)]
             listed = piece.listed.get(channel, _NOWHERE) + begin
             if np.array_equal(there, listed) or np.array_equal(there, np.sort(listed)):
@@ -379,6 +397,8 @@ class McapFile(BagFile):
 
 # Size of the messages that are handed on together [bytes].
 _ROWS = 4 << 20
+# Steps of a query between two looks at how many it has taken.
+_STEPS = 10_000
 
 
 class SqliteFile(BagFile):
@@ -393,6 +413,7 @@ class SqliteFile(BagFile):
     """
 
     def __init__(self, path: Path, largest: int = LARGEST_CHUNK) -> None:
+        self._steps = 0
         super().__init__(path, largest, SQLITE_MAGIC)
 
     def _open(self) -> None:
@@ -404,8 +425,9 @@ class SqliteFile(BagFile):
             self._database = self._connected()
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self._source.largest)
             self._database.text_factory = lambda text: text.decode("utf-8", "replace")
-            # A file may define views and functions that never end.
+            # A file may define views, functions and trees of pages that never end.
             self._database.execute("PRAGMA trusted_schema = OFF")
+            self._database.set_progress_handler(self._count_steps, _STEPS)
             self.channels = self._declared()
         except sqlite3.Error as error:
             raise BagError(
@@ -417,6 +439,11 @@ class SqliteFile(BagFile):
         with suppress(AttributeError):
             self._database.close()
         super().close()
+
+    def _count_steps(self) -> bool:
+        """Return whether to end a query, which has taken more steps than the file has rows for."""
+        self._steps += _STEPS
+        return self._steps > MOST_STEPS_OF_SQLITE + STEPS_OF_SQLITE_PER_BYTE * self.size
 
     def _connected(self) -> sqlite3.Connection:
         descriptor = self._source.fileno()
@@ -438,32 +465,58 @@ class SqliteFile(BagFile):
                 f"{self.path} is an SQLite file without the tables topics and messages; expected "
                 "a recording of rosbag2"
             )
+        for table in tables & {"topics", "messages", "message_definitions"}:
+            columns = self._database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (table,))
+            if any(hidden for (hidden,) in columns):
+                raise BagError(
+                    f"{self.path} has a table {table} with columns that are computed; expected a "
+                    f"recording of rosbag2, which stores them"
+                )
         definitions: dict[str, tuple[str, bytes]] = {}
         if "message_definitions" in tables:
-            found = self._database.execute(
-                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions "
-                f"LIMIT {MOST_DECLARATIONS}"
-            )
-            for kind, encoding, text in found:
+            for kind, encoding, text in self._rows(
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            ):
                 if len(str(text)) <= LARGEST_DEFINITION:
                     definitions[str(kind)] = (str(encoding), str(text).encode())
-        channels = {}
-        topics = self._database.execute(
-            f"SELECT id, name, type, serialization_format FROM topics LIMIT {MOST_DECLARATIONS}"
-        )
-        for number, name, kind, encoding in topics:
-            known = definitions.get(str(kind))
-            if known is None or not known[1]:
+        channels: dict[int, Channel] = {}
+        for number, *texts in self._rows(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ):
+            if not isinstance(number, int) or number in channels:
+                raise BagError(
+                    f"{self.path} has a topic with the id {number!r}, expected a whole number "
+                    f"that no other topic has"
+                )
+            name, kind, encoding = (visible(str(text)) for text in texts)
+            if not definitions.get(kind, ("", b""))[1]:
+                definitions[kind] = ("", b"")
                 with suppress(BagError):
-                    known = ("ros2msg", find_definition(str(kind)).text.encode())
-            form, text = known or ("", b"")
-            channels[int(number)] = Channel(
-                int(number), str(name), str(kind), str(encoding), form, text, {}
-            )
+                    definitions[kind] = ("ros2msg", find_definition(kind).text.encode())
+            form, text = definitions[kind]
+            channels[number] = Channel(number, name, kind, encoding, form, text, {})
         return channels
+
+    def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query for what the file declares.
+
+        :raises BagError: if there are too many.
+        """
+        size = 0
+        # An index of the file may list other rows than its table.
+        for count, row in enumerate(self._database.execute(f"{query} NOT INDEXED")):
+            size += sum(len(value) for value in row if isinstance(value, str | bytes))
+            if count >= MOST_DECLARATIONS or size > MOST_DECLARED:
+                raise BagError(
+                    f"{self.path} declares more than {MOST_DECLARATIONS} topics or types, or more "
+                    f"than {MOST_DECLARED} bytes of them; expected a recording"
+                )
+            yield row
 
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:
         """Yield the messages of some channels, a run of them at a time.
+
+        They come in the order in which they were written.
 
         :param channels: their ids.
         :return: the channel; the number of messages that came before the run; the messages.
@@ -471,8 +524,9 @@ class SqliteFile(BagFile):
         wanted = sorted(set(channels))
         marks = ", ".join("?" * len(wanted))
         query = (
-            "SELECT topic_id, timestamp, data FROM messages "
-            f"WHERE topic_id IN ({marks}) ORDER BY timestamp, id"
+            # An index of the file may list other rows than its table.
+            "SELECT topic_id, timestamp, data FROM messages NOT INDEXED "
+            f"WHERE topic_id IN ({marks})"
         )
         rows: list[tuple[int, int, bytes]] = []
         before = size = 0

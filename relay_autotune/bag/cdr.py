@@ -74,14 +74,15 @@ class Path:
         if begin.size == 0:
             return np.empty(0), np.empty(0, dtype=np.bool_)
         fits = end - begin >= _ENCAPSULATION
+        all_fit = bool(fits.all())
         # A message shorter than that may lie at the very end.
-        kinds = every_byte(content, "<u2")[begin if fits.all() else np.where(fits, begin, 0)]
-        little = (kinds == 0x0100) & fits
-        if bool(little.all()):
+        kinds = every_byte(content, "<u2")[begin if all_fit else np.where(fits, begin, 0)]
+        little = kinds == 0x0100
+        if all_fit and bool(little.all()):
             return self._of_one_order(content, begin, end, "<")
         values = np.zeros(begin.size)
         good = np.zeros(begin.size, dtype=np.bool_)
-        for order, chosen in (("<", little), (">", (kinds == 0x0000) & fits)):
+        for order, chosen in (("<", little & fits), (">", (kinds == 0x0000) & fits)):
             at = np.flatnonzero(chosen)
             if at.size:
                 values[at], good[at] = self._of_one_order(content, begin[at], end[at], order)

@@ -14,6 +14,13 @@ LARGEST_WINDOW = 128 << 20
 # Largest expanded size of a file: a multiple of its own size, or a gigabyte if that is more.
 MOST_EXPANSION = 1000
 UNSUSPICIOUS = 1 << 30
+# Messages that any file may hold; a larger one as many as it has bytes, since even compressed the
+# time of each takes more.
+MOST_MESSAGES = 4_000_000
+# Steps of SQLite's machine that any file may take, and further ones for each of its bytes: a row
+# of a few bytes takes some twenty.
+MOST_STEPS_OF_SQLITE = 1_000_000
+STEPS_OF_SQLITE_PER_BYTE = 5
 # Bytes of the disk that stay free.
 FREE_DISK = 256 << 20
 
@@ -40,8 +47,9 @@ LARGEST_SUMMARY = 256 << 20
 # Messages of a topic for which memory is set aside because the file says that it has them.
 MOST_EXPECTED = 1 << 27
 
-# Records of a file that declare something, and notes on what is wrong in a file.
+# Records of a file that declare something, their bytes, and notes on what is wrong in a file.
 MOST_DECLARATIONS = 50_000
+MOST_DECLARED = 64 << 20
 MOST_NOTES = 20
 
 # Largest value of a quantity of a process, in any unit; its square does not overflow.

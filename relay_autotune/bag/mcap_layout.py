@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW
+from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW, MOST_DECLARATIONS
 from relay_autotune.bag.mcap_records import (
     FOOTER_SIZE,
     RECORD,
@@ -27,8 +27,6 @@ from relay_autotune.bag.mcap_records import (
     Declarations,
     Opcode,
     every_byte,
-    indexed_offsets,
-    nanoseconds,
     record_offsets,
     sorted_records,
     text,
@@ -300,26 +298,26 @@ class _Scan:
         channels: frozenset[int] = frozenset()
         try:
             content = segment_content(self.source, segment)
-            listed = indexed_offsets(self.source.read(segment.end, segment.index_end))
-            places = np.concatenate([*listed.values()]) if listed else None
-            channels = self._declare(content, record_offsets(content, places)[0])
+            channels = self._declare(content)
         except DamageError as damage:
             if not segment.whole:
                 return
             self.layout.notes.append(damage_note(self.source, segment, damage))
         self.layout.segments.append(replace(segment, channels=channels))
 
-    def _declare(self, content: Content, offsets: IntArray) -> frozenset[int]:
+    def _declare(self, content: Content) -> frozenset[int]:
+        offsets, _ = record_offsets(content)
+        # Before they take several times the memory of the content.
+        self.source.count_messages(self.count + offsets.size - MOST_DECLARATIONS)
         found = sorted_records(content, offsets, None, ())
         with contextlib.suppress(DamageError):
             self.layout.declared.take_all(content, found.others)
-        for places in found.places.values():
-            times = nanoseconds(every_byte(content, "<u8", RECORD.size + 6)[places])
-            self.count += places.size
-            first = int(times.min())
+        for messages in found.messages.values():
+            self.count += len(messages)
+            first = int(messages.log_time.min())
             self.first = first if self.first is None else min(self.first, first)
-            self.last = max(self.last, int(times.max()))
-        return frozenset(found.places)
+            self.last = max(self.last, int(messages.log_time.max()))
+        return frozenset(found.messages)
 
     def _loose(self, position: int) -> int:
         """Take a piece of records outside of chunks; return where the next one begins."""
@@ -344,7 +342,7 @@ class _Scan:
 
     def _take_loose(self, piece: bytes, position: int, end: int) -> int:
         if len(piece) == end - position:
-            channels = self._declare(piece, record_offsets(piece)[0])
+            channels = self._declare(piece)
             self.layout.segments.append(Segment(position, end, True, False, channels))
         return end
 

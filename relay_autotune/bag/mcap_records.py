@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import IntArray
-from relay_autotune.bag.limits import MOST_DECLARATIONS
+from relay_autotune.bag.limits import MOST_DECLARATIONS, MOST_DECLARED
+from relay_autotune.errors import BagError
 from relay_autotune.text import visible
 
 
@@ -114,6 +115,7 @@ class Declarations:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._channels: dict[int, tuple[str, int, str, dict[str, str]]] = {}
         self._taken: set[tuple[int, bytes]] = set()
+        self._size = 0
 
     @property
     def channels(self) -> dict[int, Channel]:
@@ -131,17 +133,27 @@ class Declarations:
             schema in self._schemas or schema == 0 for _, schema, *_ in self._channels.values()
         )
 
+    @staticmethod
+    def _too_many() -> BagError:
+        return BagError(
+            f"the recording declares more than {MOST_DECLARATIONS} schemas, channels and "
+            f"metadata, or more than {MOST_DECLARED} bytes of them; expected a recording"
+        )
+
     def take_all(self, content: bytes | memoryview, offsets: IntArray) -> None:
         """Take in those of the records inside of a chunk that declare channels.
 
         :param content: the records.
         :param offsets: where each begins, shape (n,).
-        :raises DamageError: if one contradicts itself, or there are too many; the others are
-            taken in.
+        :raises DamageError: if one contradicts itself; the others are taken in.
+        :raises BagError: if there are too many.
         """
         opcodes = np.ndarray((len(content),), "u1", content)[offsets]
         damage: DamageError | None = None
-        for at in offsets[(opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)].tolist():
+        declaring = offsets[(opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)]
+        if declaring.size > MOST_DECLARATIONS:
+            raise self._too_many()
+        for at in declaring.tolist():
             opcode, length = RECORD.unpack_from(content, at)
             begin = at + RECORD.size
             try:
@@ -154,14 +166,16 @@ class Declarations:
     def take(self, opcode: int, body: bytes) -> None:
         """Take in a record, if it declares anything.
 
-        :raises DamageError: if it contradicts itself, or there are too many.
+        :raises DamageError: if it contradicts itself.
+        :raises BagError: if there are too many.
         """
         if opcode not in _DECLARING:
             return
         if (opcode, body) in self._taken:
             return
-        if len(self._taken) >= MOST_DECLARATIONS:
-            raise DamageError(f"more than {MOST_DECLARATIONS} schemas, channels and metadata")
+        self._size += len(body)
+        if len(self._taken) >= MOST_DECLARATIONS or self._size > MOST_DECLARED:
+            raise self._too_many()
         self._taken.add((opcode, body))
         if opcode == Opcode.SCHEMA:
             number = unsigned(body, 0, "<H")
@@ -211,6 +225,7 @@ _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 # Records of one size that must follow each other before a longer run of them is looked for.
 _RUN = 4
 _LONGEST_RUN = 1 << 16
+_NOWHERE: IntArray = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -266,79 +281,45 @@ def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> N
     return np.ndarray((count,), kind, content, shift, (1,))
 
 
-class _Hints:
-    """Places at which records are said to begin; each is checked before it is used.
-
-    :param content: the records.
-    :param places: in any order, wrong ones among them; shape (n,).
-    """
-
-    def __init__(self, content: Content, places: IntArray) -> None:
-        inside = (places >= 0) & (places <= len(content) - RECORD.size)
-        at = np.unique(places[inside])
-        room = len(content) - RECORD.size - at
-        length = every_byte(content, "<u8", 1)[at] if at.size else np.empty(0, np.uint64)
-        fits = (length <= room.astype(np.uint64)) & (_opcodes(content, at) != 0)
-        self._at = at[fits]
-        self._after = self._at + RECORD.size + length[fits].astype(np.int64)
-        # A run ends where the next place is not the one that its last record leads to.
-        self._ends = np.append(np.flatnonzero(self._after[:-1] != self._at[1:]), self._at.size - 1)
-        self.next = int(self._at[0]) if self._at.size else len(content)
-
-    def run(self, position: int, size: int) -> tuple[IntArray, int]:
-        """Return records that follow each other from a place on, and where the last one ends.
-
-        :param position: where a record begins; `next` is not beyond it.
-        :param size: of the content.
-        """
-        first = int(np.searchsorted(self._at, position))
-        found = self._at[first:first]
-        if first < self._at.size and self._at[first] == position:
-            last = int(self._ends[np.searchsorted(self._ends, first)])
-            found, position = self._at[first : last + 1], int(self._after[last])
-            first = int(np.searchsorted(self._at, position))
-        self.next = int(self._at[first]) if first < self._at.size else size
-        return found, position
-
-
-def record_offsets(content: Content, places: IntArray | None = None) -> tuple[IntArray, int]:
+def record_offsets(content: Content) -> tuple[IntArray, int]:
     """Return where each record begins, and where the last whole one ends.
 
     :param content: the records.
-    :param places: where records are said to begin, which saves time and changes nothing else.
+    :raises BagError: if it has more of them than messages and declarations can be in it: records
+        of nothing would take several times its memory.
     """
     size, unpack = len(content), _LENGTH.unpack_from
-    hints = None if places is None else _Hints(content, places)
-    expected = size if hints is None else hints.next
+    left = size // _HEAD.itemsize + MOST_DECLARATIONS
     parts: list[IntArray] = []
     found: list[int] = []
     position, previous, repeats, needed = 0, -1, 0, _RUN
-    while position + RECORD.size <= size:
-        if hints is not None and expected <= position:
-            run, position = hints.run(position, size)
-            expected = hints.next
-            if run.size:
-                parts += [np.array(found, dtype=np.int64), run]
-                found = []
-                continue
+    while position + RECORD.size <= size and left > 0:
         (length,) = unpack(content, position + 1)
         if length > size - position - RECORD.size or content[position] == 0:
             break
         found.append(position)
+        left -= 1
         position += RECORD.size + length
         repeats = repeats + 1 if length == previous else 0
         previous = length
+        count = 0
         if repeats >= needed:
-            count = _equal_records(content, position, length)
+            count = min(_equal_records(content, position, length), left)
             # Where runs are short, looking for them costs more than it gives.
             needed = _RUN if count >= 4 * _RUN else 2 * needed
-            if count:
-                step = RECORD.size + length
-                parts += [np.array(found, dtype=np.int64)]
-                parts += [position + step * np.arange(count, dtype=np.int64)]
-                found = []
-                position += count * step
             repeats = 0
+        if count or len(found) >= _LONGEST_RUN:
+            step = RECORD.size + length
+            parts += [np.array(found, dtype=np.int64)]
+            parts += [position + step * np.arange(count, dtype=np.int64)]
+            found = []
+            position += count * step
+            left -= count
+    if left <= 0:
+        raise BagError(
+            f"the recording holds {size} bytes with more records than messages that they can be; "
+            f"expected a recording"
+        )
     parts.append(np.array(found, dtype=np.int64))
     return np.concatenate(parts), position
 
@@ -367,9 +348,8 @@ def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
     :param indexes: the records of message indexes that follow the chunk; what makes no sense in
         them is left out.
     """
-    offsets, _ = record_offsets(indexes)
     found: dict[int, IntArray] = {}
-    for at in offsets.tolist():
+    for at in record_offsets(indexes)[0].tolist():
         opcode, length = RECORD.unpack_from(indexes, at)
         if opcode != Opcode.MESSAGE_INDEX or length < 6:
             continue
@@ -386,13 +366,13 @@ def indexed_offsets(indexes: bytes) -> dict[int, IntArray]:
 class Sorted:
     """The records of some content by what they are.
 
-    :param places: where the messages of each wanted channel begin, shape (n,) each.
+    :param messages: those of each wanted channel that has any.
     :param others: where the records begin that are no messages, shape (m,).
     :param unknown: where messages of channels begin that are not declared, shape (k,).
     :param short: number of messages that are too short to be one.
     """
 
-    places: dict[int, IntArray]
+    messages: dict[int, Messages]
     others: IntArray
     unknown: IntArray
     short: int
@@ -409,41 +389,92 @@ def sorted_records(
     :param declared: the channels that there are.
     """
     is_message = _opcodes(content, offsets) == Opcode.MESSAGE
-    others, places = offsets[~is_message], offsets[is_message]
-    if not places.size:
-        return Sorted({}, others, places, 0)
-    whole = every_byte(content, "<u8", 1)[places] >= MESSAGE_HEAD_SIZE
-    short = int(places.size - np.count_nonzero(whole))
-    places = places[whole]
-    channels = every_byte(content, "<u2", RECORD.size)[places]
+    others, places = offsets[~is_message], _chosen(offsets, is_message)
+    # Nearer to the end of the content only one that is too short begins.
+    last = len(content) - _HEAD.itemsize
+    heads = _heads(content, places[: np.searchsorted(places, last, side="right")])
+    whole = heads["length"] >= MESSAGE_HEAD_SIZE
+    short = places.size - int(np.count_nonzero(whole))
+    places, heads = _chosen(places[: heads.size], whole), _chosen(heads, whole)
+    channels = np.ascontiguousarray(heads["channel"])
     known = np.zeros(1 << 16, dtype=np.bool_)
     known[list(declared)] = True
     unknown = places[~known[channels]]
-    chosen = np.unique(channels).tolist() if wanted is None else sorted(wanted)
-    found = {number: places[channels == number] for number in chosen}
-    return Sorted({n: at for n, at in found.items() if at.size}, others, unknown, short)
+    chosen = np.flatnonzero(np.bincount(channels)).tolist() if wanted is None else sorted(wanted)
+    found: dict[int, Messages] = {}
+    for number in chosen:
+        own = np.flatnonzero(channels == number)
+        if own.size:
+            at, of_it = places[own], heads[own]
+            end = at + RECORD.size + of_it["length"].astype(np.int64)
+            found[number] = _messages_at(content, at, of_it, end)
+    return Sorted(found, others, unknown, short)
 
 
-def messages_at(content: Content, offsets: IntArray) -> Messages:
-    """Return the messages at some places.
+def listed_records(
+    content: Content,
+    listed: Mapping[int, IntArray],
+    wanted: Collection[int],
+    declared: Collection[int],
+) -> Sorted | None:
+    """Return what `sorted_records` would, without going from record to record.
+
+    Where each place that is listed holds a message of its channel, and each message ends where
+    another one begins, or the content ends, nothing else is in it.
 
     :param content: the records.
-    :param offsets: where messages begin, as `sorted_records` found them, shape (n,).
+    :param listed: where messages are said to begin, by channel, shape (n,) each.
+    :param wanted: the channels whose messages are wanted.
+    :param declared: the channels that there are.
+    :return: None: not all of that is so.
     """
+    begins, ends = [np.array([len(content)])], [np.array([0])]
+    found: dict[int, Messages] = {}
+    last = len(content) - _HEAD.itemsize
+    for channel, at in listed.items():
+        rising = bool((at[1:] > at[:-1]).all())
+        if channel not in declared or not rising or not at.size or at[0] < 0 or at[-1] > last:
+            return None
+        heads = _heads(content, at)
+        # One beyond the signed range is negative here.
+        length = heads["length"].astype(np.int64)
+        right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channel)
+        right &= (length >= MESSAGE_HEAD_SIZE) & (length <= last + MESSAGE_HEAD_SIZE - at)
+        if not right.all():
+            return None
+        begins.append(at)
+        ends.append(at + (length + RECORD.size))
+        if channel in wanted:
+            found[channel] = _messages_at(content, at, heads, ends[-1])
+    # Numbers of few bytes are sorted sooner.
+    form = np.min_scalar_type(len(content))
+    begin, end = (np.sort(np.concatenate(some).astype(form)) for some in (begins, ends))
+    return Sorted(found, _NOWHERE, _NOWHERE, 0) if np.array_equal(begin, end) else None
+
+
+def _chosen(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return the values that are chosen, mostly all of them."""
+    return values if chosen.all() else values[chosen]
+
+
+def _heads(content: Content, offsets: IntArray) -> NDArray[Any]:
     # Copied as opaque bytes: numpy copies a structure field by field, ten times as slowly.
-    heads = every_byte(content, f"V{_HEAD.itemsize}")[offsets].view(_HEAD)
-    body = offsets + RECORD.size
+    return every_byte(content, f"V{_HEAD.itemsize}")[offsets].view(_HEAD)
+
+
+def _messages_at(
+    content: Content, offsets: IntArray, heads: NDArray[Any], end: IntArray
+) -> Messages:
     times = nanoseconds(heads["log_time"]), nanoseconds(heads["publish_time"])
-    end = body + heads["length"].astype(np.int64)
-    return Messages(content, offsets, *times, body + MESSAGE_HEAD_SIZE, end)
+    begin = offsets + (RECORD.size + MESSAGE_HEAD_SIZE)
+    return Messages(content, offsets, *times, begin, end)
 
 
 def nanoseconds(values: NDArray[np.uint64]) -> IntArray:
     """Return times as signed numbers; one beyond their range is no time of any clock."""
     signed = values.astype(np.int64)
-    beyond = signed < 0
-    if bool(beyond.any()):
-        signed[beyond] = np.iinfo(np.int64).max
+    if signed.size and int(signed.min()) < 0:
+        signed[signed < 0] = np.iinfo(np.int64).max
     return signed
 
 

@@ -22,6 +22,7 @@ from relay_autotune.bag.limits import (
     LARGEST_SUMMARY,
     LARGEST_WINDOW,
     MOST_EXPANSION,
+    MOST_MESSAGES,
     UNSUSPICIOUS,
 )
 from relay_autotune.bag.mcap_records import RECORD, DamageError
@@ -149,6 +150,19 @@ class Source:
             raise BagError(
                 f"what {self.path} holds expands to more than {most} bytes, over "
                 f"{MOST_EXPANSION} times its size; expected a recording"
+            )
+
+    def count_messages(self, count: int) -> None:
+        """Count messages, which take time and memory, however little a compressed file takes.
+
+        :param count: of the messages that were found together.
+        :raises BagError: if there are more of them than a recording of this size has.
+        """
+        most = max(MOST_MESSAGES, self.size)
+        if count > most:
+            raise BagError(
+                f"{self.path} holds more than {most} messages in {self.size} bytes; expected a "
+                f"recording"
             )
 
     def announce(self, ranges: Iterable[tuple[int, int]]) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -50,6 +51,10 @@ class Columns:
         return int(self.values.size)
 
 
+# Topics that a message lists: a robot's bag has some hundred.
+_MOST_LISTED = 1000
+
+
 @dataclass
 class Topics:
     """The open files of one bag, read as one recording.
@@ -87,7 +92,9 @@ class Topics:
             f"{topic} ({kind}, {known[topic]})" if topic in known else f"{topic} ({kind})"
             for topic, kind in sorted(self.types().items())
         )
-        return ", ".join(described) or "no topic"
+        first = ", ".join(islice(described, _MOST_LISTED))
+        more = len(self.types()) - _MOST_LISTED
+        return first + (f" and {more} more" if more > 0 else "") or "no topic"
 
     def metadata(self, name: str) -> list[dict[str, str]]:
         """Return the metadata records of a name."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import zstandard
 
+from relay_autotune.bag import bag_file
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import encode_float64
@@ -105,3 +106,74 @@ def test_what_is_no_such_file_is_a_sentence(tmp_path):
     other.close()
     with pytest.raises(BagError, match="without the tables topics and messages"):
         read_experiments(tmp_path / "d.db3", NAMES)
+
+
+def refused(path, *statements):
+    """Return why a bag is refused after some statements."""
+    database = sqlite3.connect(path)
+    database.executescript("; ".join(statements))
+    database.close()
+    with pytest.raises(BagError) as raised:
+        read_experiments(path, NAMES)
+    return str(raised.value)
+
+
+def test_an_index_of_the_file_is_not_trusted(tmp_path):
+    path = bag(tmp_path / "a.db3")
+    database = sqlite3.connect(path)
+    # As a recorder that was killed between two pages may leave it.
+    whole = "CREATE INDEX timestamp_idx ON messages(timestamp ASC)"
+    database.execute(f"{whole} WHERE id % 2")
+    database.execute("PRAGMA writable_schema = ON")
+    database.execute("UPDATE sqlite_master SET sql = ? WHERE name = 'timestamp_idx'", (whole,))
+    database.commit()
+    database.close()
+    check(path)
+
+
+def test_messages_that_were_not_written_in_the_order_of_their_times(tmp_path):
+    path = bag(tmp_path / "a.db3")
+    database = sqlite3.connect(path)
+    database.execute("UPDATE messages SET id = id + 1000 WHERE id % 3 = 0")
+    database.commit()
+    database.close()
+    check(path)
+
+
+@pytest.mark.parametrize("value", ["'one'", "NULL", "9e999", "2.5", "x'31'", "2"])
+def test_a_topic_without_a_number_of_its_own_is_a_sentence(tmp_path, value):
+    said = refused(
+        bag(tmp_path / "a.db3"),
+        "ALTER TABLE topics RENAME TO old",
+        "CREATE TABLE topics AS SELECT * FROM old",
+        f"UPDATE topics SET id = {value} WHERE id = 1",
+    )
+    assert "expected a whole number that no other topic has" in said
+
+
+def test_columns_that_are_computed_are_refused(tmp_path):
+    said = refused(
+        bag(tmp_path / "a.db3"),
+        "ALTER TABLE messages RENAME TO old",
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+        " data BLOB GENERATED ALWAYS AS (zeroblob(200000000)))",
+        "INSERT INTO messages SELECT id, topic_id, timestamp FROM old",
+    )
+    assert "a table messages with columns that are computed" in said
+
+
+def test_more_topics_than_a_recorder_has_are_refused(tmp_path):
+    said = refused(
+        bag(tmp_path / "a.db3"),
+        "WITH RECURSIVE n(k) AS (SELECT 3 UNION ALL SELECT k + 1 FROM n WHERE k < 50010)"
+        " INSERT INTO topics SELECT k, '/t' || k, 'x', 'cdr', '' FROM n",
+    )
+    assert "declares more than 50000 topics" in said
+
+
+def test_pages_that_lead_to_the_same_rows_again_and_again_end(tmp_path, monkeypatch):
+    """Each row of a real file takes bytes of it."""
+    monkeypatch.setattr(bag_file, "MOST_STEPS_OF_SQLITE", 0)
+    monkeypatch.setattr(bag_file, "STEPS_OF_SQLITE_PER_BYTE", 0.1)
+    found = read_experiments(bag(tmp_path / "a.db3", 0, 4000), Selection("/y", "/u", start=0.0))
+    assert found.notes == ("a.db3 cannot be read to its end (interrupted)",)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from made_bags import REPOSITORY, START
 from mcap.writer import CompressionType, Writer
 
-from relay_autotune.bag import source
+from relay_autotune.bag import mcap_records, source
 from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.definitions import message_type
 from relay_autotune.bag.field_path import numeric_paths
@@ -142,6 +142,61 @@ def test_chunks_that_together_expand_too_far_are_refused(tmp_path, monkeypatch):
         read(path)
     monkeypatch.setattr(source, "UNSUSPICIOUS", 1 << 20)
     np.testing.assert_array_equal(read(path)[0], np.arange(COUNT))
+
+
+def _bag_of(*records):
+    """Return a bag without a summary whose one chunk, compressed, has these records too."""
+
+    def record(opcode, body):
+        return struct.pack("<BQ", opcode, len(body)) + body
+
+    def sized(data):
+        return struct.pack("<I", len(data)) + data
+
+    schema = struct.pack("<H", 1) + sized(b"std_msgs/msg/Float64") + sized(b"ros2msg")
+    declared = record(3, schema + sized(b"float64 data\n"))
+    channel = struct.pack("<HH", 1, 1) + sized(b"/x") + sized(b"cdr") + sized(b"")
+    content = declared + record(4, channel) + b"".join(records)
+    data = zstandard.ZstdCompressor(1).compress(content)
+    head = struct.pack("<QQQI", 0, 0, len(content), 0) + sized(b"zstd")
+    body = head + struct.pack("<Q", len(data)) + data
+    return b"\x89MCAP0\r\n" + record(6, body)
+
+
+_NOTHING = struct.pack("<BQ", 0x80, 0)
+_MESSAGE = struct.pack("<BQHIQQ", 5, 34, 1, 0, START, START) + encode_float64(1.0)
+
+
+@pytest.mark.parametrize(
+    ("records", "said"),
+    [
+        ([_NOTHING * 200_000], "with more records than messages that they can be"),
+        ([_NOTHING + b"\x80\1" + bytes(8)] * 100_000, "with more records than messages"),
+        ([struct.pack("<BQ", 3, 0) * 60_000, bytes(2_000_000)], "more than 50000 schemas"),
+        ([_MESSAGE * 160_000], "more than 100000 messages in"),
+        (
+            [
+                struct.pack("<BQHIQ", 3, 40_000_000, k, 4, 0) + bytes(40_000_000 - 14)
+                for k in (2, 3)
+            ],
+            "more than 5000000 bytes of them",
+        ),
+    ],
+    ids=["nothing", "little", "no schemas", "messages", "large schemas"],
+)
+def test_a_small_file_that_asks_for_much_is_refused(tmp_path, monkeypatch, records, said):
+    monkeypatch.setattr(source, "MOST_MESSAGES", 100_000)
+    monkeypatch.setattr(mcap_records, "MOST_DECLARED", 5_000_000)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(_bag_of(*records))
+    assert path.stat().st_size < 20_000
+    size = sum(map(len, records))
+    tracemalloc.start()
+    with pytest.raises(BagError, match=said):
+        read(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 4 * size + (4 << 20)
 
 
 def test_large_chunks_are_not_in_memory_together(tmp_path):

@@ -24,6 +24,8 @@ from relay_autotune.record.record import Record
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted((ROOT / "benchmarks").glob("[!_]*.py"))
+sys.path.insert(0, str(ROOT / "benchmarks"))
+markdown = importlib.import_module("markdown")
 PAGE = (ROOT / "docs" / "benchmarks.md").read_text()
 QUICK = {
     "fit_time": ("--quick",),
@@ -103,6 +105,58 @@ def test_it_prints_its_table(name: str) -> None:
 def test_the_page_has_its_command_and_its_place(name: str) -> None:
     assert f"python3 benchmarks/{name}.py" in PAGE
     assert f"<!-- results of {name} -->" in PAGE
+
+
+# Short forms of those with targets, and the number of columns that name a row of their tables.
+SHORT = {
+    "bag_reading": (("--part", "comparison", "--messages", "200000"), 1),
+    "fit_time": (("--quick",), 3),
+    "design_time": (("--quick",), 2),
+}
+# How many times worse than on the page a figure may be, for the machine has other work.
+MOST_LOSS = 2.0
+
+
+def place_on_page(name: str) -> str:
+    return PAGE.split(f"<!-- results of {name} -->")[1].split("<!-- end -->")[0]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", SHORT)
+def test_the_page_is_still_true(name: str) -> None:
+    """Half of the speed of a program goes without anybody seeing it."""
+    flags, naming = SHORT[name]
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / f"{name}.py"), *flags],
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    stated = markdown.figures(place_on_page(name), naming)
+    found = markdown.figures(done.stdout, naming)
+    assert found.keys() & stated.keys(), done.stdout
+    worse = {
+        key: figure.loss(stated[key])
+        for key, figure in found.items()
+        if key in stated and figure.loss(stated[key]) > MOST_LOSS
+    }
+    assert not worse, done.stdout
+
+
+def test_a_table_that_is_no_longer_true_is_noticed() -> None:
+    page = "| pair | faster | target | x |\n|---|---|---|---|\n| a | 53 x rosbags | >= 40 | 9 |"
+    stated = markdown.figures(page, 1)["a", "faster"]
+    found = markdown.figures(page.replace("53", "15"), 1)["a", "faster"]
+    assert stated.is_met
+    assert not found.is_met
+    assert found.loss(stated) == pytest.approx(53 / 15)
+    assert found.loss(stated) > MOST_LOSS
+    heads = "| d | [ms] | target [ms] | x reference |\n|-|-|-|-|\n"
+    (time,) = markdown.figures(f"{heads}| b | 1,071 | <= 10,000 | 20 |", 1).values()
+    assert (time.value, time.target, time.is_met) == (1071.0, 10_000.0, True)
+    (slower,) = markdown.figures(f"{heads}| b | 4,000 | <= 10,000 | 30 |", 1).values()
+    assert slower.loss(time) == 1.5
 
 
 JUDGE = """

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 from itertools import pairwise
+from statistics import median
 from typing import Any
 
 import pytest
@@ -256,11 +257,12 @@ def test_gains_for_another_law_are_proven_by_a_node_that_runs_it(rig: Rig) -> No
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
     assert result.passed, result.reason
     # The law takes the derivative of the error, so that a step of the set-point jumps through it,
-    # and it runs at every fifth sample.
+    # and it runs at every fifth sample: most of its commands stand for five of them. On a busy
+    # machine, which loses samples or delays them, some stand for other numbers.
     values = [message.data for message in commands]
     assert max(values) > 1.0 + 0.9 * (0.4 + 0.4 * 0.12 / 0.1) * 0.3
-    changes = sum(a != b for a, b in pairwise(values))
-    assert changes == pytest.approx(len(values) / 5.0, rel=0.15)
+    changed = [k for k, (a, b) in enumerate(pairwise(values)) if a != b]
+    assert 4 <= median(b - a for a, b in pairwise(changed)) <= 6
 
 
 def test_doubtful_gains_are_never_applied_by_themselves(rig: Rig) -> None:
