@@ -104,7 +104,7 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known)
     dense = problem.thinned(_MOST_WHITE)
-    if found and found[0].problem.colour is None and dense.time.size > few.problem.time.size:
+    if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
     own = [c for c in found if sign * c.model.process_sign >= 0]
     if sign and not known.structure:
@@ -117,7 +117,7 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
         fit = _finished(candidate, found, problem, scale)
         if fit is not None and responds(fit.problem, fit.state, _SEARCHED):
             return fit
-    if known.structure and not own:
+    if known.structure and responds(few.problem, few.fopdt, _SEARCHED):
         raise IdentificationError(
             f"no {known.structure} model explains the record; leave the structure open to have "
             "it chosen"
@@ -126,10 +126,10 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
-    """Return candidates fitted to more samples, unless these are correlated.
+    """Return candidates fitted to more samples in white noise, unless these are correlated.
 
     :param context: of all samples.
-    :param found: fitted to some of them in white noise, the best first.
+    :param found: fitted to some of them, the best first.
     """
     again = []
     for c in found:
@@ -138,9 +138,10 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
             problem = replace(context.problem, structure=c.structure, **terms)
             problem = drop_first_dead_time(problem, c.state)
             state = refine(problem, c.state.theta, tolerance=TRIAL, most=_STEPS)
+            if c is found[0] and _colour(problem, state) is not None:
+                return found
             again.append(context.candidate(problem, state))
-    dense = sorted((c for c in again if c is not None), key=lambda c: c.score)
-    return dense if dense and _colour(dense[0].problem, dense[0].state) is None else found
+    return sorted((c for c in again if c is not None), key=lambda c: c.score) or found
 
 
 def responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
