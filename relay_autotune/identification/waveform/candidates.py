@@ -96,6 +96,8 @@ IMITATES_A_DRIFT = 10.0
 _LASTING = 2.0
 # Longest dead time in lengths of the record: a later response cannot be told from a drift.
 _LATE = 0.25
+# Longest of all: what came later than half of the record has nothing to confirm it.
+_LATEST = 0.5
 # Latest turn of an inverse response, in lengths of the test: a later one is a drift.
 _HORIZON = 2.0
 # Slow lags of an inverse response at the start, relative to the fast one.
@@ -242,6 +244,8 @@ class FitContext:
             if not any(-_HORIZON * self.length < z.real < 0.0 for z in model.zeros):
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
+            return None
+        if not self.held and model.dead_time > _LATEST * self.length:
             return None
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.

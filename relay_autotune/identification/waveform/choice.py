@@ -70,7 +70,7 @@ _SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
 PLAIN = (FOPDT.name, SOPDT.name)
 # Numbers of samples, and samples for each response of the process. More correlated samples tell
 # little, unless the process is fast; much denser ones would favour what is faster than it.
-_FEW, _MOST = 1200, 4000
+_FEW, _MOST = 2000, 4000
 _A_RESPONSE = 5.0
 # In white noise every sample tells something; more than these change no choice.
 _MOST_WHITE = 16_384
@@ -107,8 +107,9 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
     own = [c for c in found if sign * c.model.process_sign >= 0]
-    if sign and not known.structure:
-        found = [*found, *(_in_own_colour(few, c) for c in few.turned())]
+    if found and sign and not known.structure:
+        turned = (few.refit(c, found[0].problem.colour, _STEPS) for c in few.turned())
+        found = [*found, *(c for c in turned if c is not None)]
     # Where a disturbance that no term describes made a colour that explains the response, too,
     # the simulation shows it.
     white = (few.refit(c, None, _STEPS) for c in own if c.problem.colour is not None)

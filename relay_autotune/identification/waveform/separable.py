@@ -232,11 +232,11 @@ class Problem:
     def thinned(self, most: int) -> Problem:
         """Return the problem of evenly spaced samples.
 
-        :param most: about the number to keep, of all experiments together.
+        :param most: largest number to keep, of all experiments together.
         """
-        share = most // len(self.bounds)
+        share = max(most // len(self.bounds), 1)
         parts = self.experiments
-        steps = [max(1, (part.stop - part.start) // share) for part in parts]
+        steps = [-(-(part.stop - part.start) // share) for part in parts]
         if len(parts) == 1:
             return self if steps[0] == 1 else self.part(slice(None, None, steps[0]))
         chosen = np.zeros(self.time.size, dtype=bool)
