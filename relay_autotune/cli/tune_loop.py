@@ -29,7 +29,7 @@ from relay_autotune.cli.arguments import (
     add_web,
     check_web,
     finite,
-    guarded,
+    guarded_in_graph,
     say,
 )
 from relay_autotune.cli.own_nodes import (
@@ -87,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> int:
     with Working("loading what talks to the nodes") if starts else nullcontext():
         import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
 
-    return guarded(PROGRAM, lambda: _tune(options, ros))
+    return guarded_in_graph(PROGRAM, lambda graph: _tune(options, ros, graph))
 
 
 def _apart(given: list[str]) -> tuple[list[str], list[str]]:
@@ -140,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _tune(options: argparse.Namespace, ros: list[str]) -> int:
+def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
     interrupted: list[int] = []
 
     def heed(number: int) -> None:
@@ -166,14 +166,14 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         namespace = own_namespace(options) if new else options.namespace
         spaces = namespace.split(",") if options.web else [namespace]
         with Working("joining the ROS graph"):
-            clients = [TuneClient(space, options.node, ros) for space in spaces]
+            clients = [
+                graph.enter_context(TuneClient(space, options.node, ros)) for space in spaces
+            ]
     except ParameterError as error:
         say(PROGRAM, str(error))
         return USAGE
     client = clients[0]
     with ExitStack() as stack:
-        for each in clients:
-            stack.enter_context(each)
         patience, joint, nodes = options.wait, None, None
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
