@@ -278,9 +278,7 @@ class RelayNode(ServedNode):
         session = self._session
         running = session if session is not None and message.experiment_id == session.id else None
         now = self._now_ns()
-        taken = self._results.take(
-            name, message, None if running is None else running.experiment, self._on_setpoint
-        )
+        taken = self._results.take(name, message, running, self._on_setpoint)
         for topic, found in taken:
             self._action.note(topic, found)
             self._recordings.message(found.experiment_id, topic, now, found)
