@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.errors import LoopError, SelectionError
-from relay_autotune.text import TOLD_EVERY, duration
+from relay_autotune.text import TOLD_EVERY, duration, visible
 
 if TYPE_CHECKING:
     from relay_autotune.control.verification import StepRange
@@ -174,6 +174,7 @@ class StatusLine:
 
     def __call__(self, status: str) -> None:
         """Show a sentence."""
+        status = visible(status)
         text = f"\r\x1b[K{status[: width() - 1]}" if self.in_place else f"{status}\n"
         # The work goes on even if this cannot be written.
         with suppress(OSError):

@@ -52,6 +52,7 @@ from rclpy.task import Future
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.quantities import Quantity
+from relay_autotune.text import visible
 
 # Messages further apart than this take the ordinary path [s].
 CLOSE = 0.002
@@ -152,6 +153,33 @@ _NO_SIGNAL = 0
 _FLAGS_OF_RULES = ("-p", "--param", "-r", "--remap")
 
 
+class _Log:
+    """The log of a node, in which text of other nodes cannot pass for lines of ours.
+
+    :param log: that of rclpy.
+    """
+
+    def __init__(self, log: Any) -> None:
+        self._log = log
+
+    # A line of code has one severity; with another one rclpy raises.
+    def info(self, text: str) -> None:
+        self._log.info(visible(text))
+
+    def warning(self, text: str) -> None:
+        self._log.warning(visible(text))
+
+    def error(self, text: str) -> None:
+        self._log.error(visible(text))
+
+    def fatal(self, text: str) -> None:
+        self._log.fatal(visible(text))
+
+    def __getattr__(self, name: str) -> Any:
+        # What rclpy itself asks of it.
+        return getattr(self._log, name)
+
+
 class ServedNode(Node):
     """A node with work that waits until its callbacks have returned."""
 
@@ -161,6 +189,10 @@ class ServedNode(Node):
         self.favoured: Subscription | None = None
         """The subscription with the fast path, see `Executor.favour`."""
         self._when_idle: deque[Callable[[], None]] = deque()
+
+    def get_logger(self) -> Any:
+        """Return the log, in which text of other nodes is made visible."""
+        return _Log(super().get_logger())
 
     def favour(self, subscription: Subscription) -> None:
         """Give the messages of a subscription the fast path, see `Executor.favour`."""
@@ -349,7 +381,7 @@ def _refuse(name: str, why: str) -> int:
     """Say why a node cannot run; return the exit status."""
     # Standard error may be closed.
     with suppress(OSError):
-        print(f"{name}: {why}", file=sys.stderr)
+        print(visible(f"{name}: {why}"), file=sys.stderr)
     return 2
 
 
