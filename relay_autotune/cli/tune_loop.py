@@ -178,6 +178,8 @@ def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            if interrupted:
+                raise KeyboardInterrupt
             joint = JointTune(client, options) if of_joint else None
             nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
             patience = max(patience, START_WITHIN)
@@ -235,6 +237,9 @@ def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
         for number in heeded:
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        if interrupted and nodes is not None and not client.cancelled:
+            # It came as the tune ended: nothing is asked for, or done, after that.
+            raise KeyboardInterrupt
         try:
             return AfterTune(client, options, _parser(), nodes, joint).conclude()
         except OSError:
