@@ -27,6 +27,14 @@ from typing import Any, TypeVar, get_type_hints
 
 from relay_autotune.errors import RelayAutotuneError
 
+LARGEST = 1e152
+"""Largest number that anybody may give: squares up to its own can be added without overflow."""
+SHORTEST, LONGEST = 1e-9, 1e9
+"""A time that anybody may give is 0 or between these [s]: the resolution of the clocks of ROS, and
+thirty years."""
+
+# Longest part of a value that is shown.
+_SHOWN = 60
 _DECLARED = "quantity"
 _TOLD = "told"
 _Getter = TypeVar("_Getter", bound=Callable[..., float])
@@ -104,17 +112,35 @@ class Quantity:
             fine = all(math.isfinite(number) for number in value)
         elif not self.is_number:
             fine = True
-        elif not isinstance(value, (int, float)):
-            return f"{self.name} is {value!r}, expected {self.range_text}"
+        elif isinstance(value, bool) or not isinstance(value, (int, float)):
+            return f"{self.name} is {repr(value)[:_SHOWN]}, expected {self.range_text}"
+        elif isinstance(value, int) and abs(value) > LARGEST:
+            # It may have more digits than a float can hold.
+            return f"{self.name} is a number of many digits, expected {self.range_text}"
         elif math.isinf(value) and value != self.default:
             # Only the default of a limit may be infinite: there is no limit then.
             return f"{self.name} is {value:g}, expected a finite number{self._or_not_given}"
+        elif not self._is_possible(abs(value)):
+            return f"{self.name} is {value:g}, expected {self._possible}"
         elif isinstance(self.default, int) and value != value // 1:
             return f"{self.name} is {value:g}, expected a whole number"
         else:
             fine = self._includes(value)
-        found = f"{value:g}" if self.is_number else repr(value)
+        found = f"{value:g}" if self.is_number else repr(value)[:_SHOWN]
         return None if fine else f"{self.name} is {found}, expected {self.range_text}"
+
+    def _is_possible(self, size: float) -> bool:
+        # What is infinite here is the default.
+        if size == 0.0 or not math.isfinite(size):
+            return True
+        return SHORTEST <= size <= LONGEST if self.unit == "s" else size <= LARGEST
+
+    @property
+    def _possible(self) -> str:
+        if self.unit != "s":
+            return f"a number of at most {LARGEST:g}"
+        zero = ", or 0" if self._includes(0.0) else ""
+        return f"a time from {SHORTEST:g} to {LONGEST:g} s{zero}"
 
     def _includes(self, value: float) -> bool:
         if math.isnan(value):

@@ -34,10 +34,12 @@ def digits(value: float, count: int = 4) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration as text, such as "12 min 5 s".
+    """Return a duration as text, such as "12 min 5 s"; a dash if it is not finite.
 
     :param seconds: the duration [s], not negative.
     """
+    if not math.isfinite(seconds):
+        return "-"
     if seconds < 90.0:
         return f"{seconds:.{1 if seconds < 10.0 else 0}f} s"
     minutes, rest = divmod(round(seconds), 60)

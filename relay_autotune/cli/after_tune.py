@@ -261,6 +261,12 @@ class AfterTune:
     def _reported(self) -> tuple[str, str]:
         """Write the report if it is wanted; return the flags for `replay`, and its name."""
         client, options, result = self.client, self.options, self.result
+        if client.cancelled:
+            # Who ends it waits for nothing more that takes long.
+            if options.report:
+                told = f"no report: the tune was cancelled; {prefix()}report makes one"
+                say(PROGRAM, f"{told} of {result.bag}" if result.bag else told)
+            return "", ""
         with Working("asking identifier_node for its parameters"):
             # Imported here, because it loads slowly.
             from relay_autotune.cli.report import defaults, flags_of, report_of_tune

@@ -20,9 +20,10 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded_in_graph, say
 from relay_autotune.cli.terminal import (
     Help,
     StatusLine,
@@ -67,7 +68,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(given)
     import relay_autotune.nodes.gains_client  # noqa: F401  see guarded
 
-    return guarded(PROGRAM, lambda: _work(options))
+    return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -110,22 +111,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _work(options: argparse.Namespace) -> int:
+def _work(options: argparse.Namespace, graph: ExitStack) -> int:
     from relay_autotune.nodes.gains_client import GainsClient
 
     try:
-        client = GainsClient(options.namespace, options.node)
+        client = graph.enter_context(GainsClient(options.namespace, options.node))
     except ParameterError as error:
         say(PROGRAM, str(error))
         return USAGE
-    with client:
-        if options.file:
-            return _write(client, options)
-        client.find(_FOUND_WITHIN)
-        if options.revert:
-            print(client.ask("revert"))
-            return DONE
-        return apply_and_verify(client, options)
+    if options.file:
+        return _write(client, options)
+    client.find(_FOUND_WITHIN)
+    if options.revert:
+        print(client.ask("revert"))
+        return DONE
+    return apply_and_verify(client, options)
 
 
 def apply_at(

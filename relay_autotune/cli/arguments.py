@@ -15,17 +15,14 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from relay_autotune.cli.terminal import broken, width
 from relay_autotune.errors import MissingPackageError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.quantities import Quantity
 from relay_autotune.text import visible
-
-if TYPE_CHECKING:
-    pass
-
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
 # From best to worst; a command for several bags ends with the worst of their statuses.
@@ -130,6 +127,22 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     finally:
         if left_to_system:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return status
+
+
+def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
+    """Return the exit status of a command that talks to nodes, as `guarded`; leave the graph.
+
+    :param program: name of the command.
+    :param work: does it, and returns its exit status; the clients that it enters into the stack
+        end afterwards.
+    """
+    with ExitStack() as graph:
+        status = guarded(program, lambda: work(graph))
+        # Imported here, because other commands do not need ROS.
+        from relay_autotune.nodes.lifetime import LEAVE_WITHIN, end_within
+
+        end_within(LEAVE_WITHIN, status)
     return status
 
 

@@ -14,12 +14,14 @@ import json
 import logging
 import multiprocessing
 import os
+import signal
 import threading
 import uuid
 from asyncio import CancelledError as TaskCancelledError
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 from typing import Any, Self
 
@@ -274,14 +276,25 @@ def _pool(count: int) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("forkserver")
     # The modules that every job needs are loaded once, in the process that is forked.
     context.set_forkserver_preload(_PRELOADED)
+    # Ctrl-C reaches it, too, and while it loads them it would answer with a traceback. What it
+    # starts itself lets the signal through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_the_command)
 
 
 def _end_with_the_command() -> None:
-    """Let this process end when the command ends, whichever signal ended that.
+    """Let this process end at once by Ctrl-C, and when the command ends, whatever ended that.
 
     Without it a worker would go on, or wait for work forever.
     """
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     command = multiprocessing.parent_process()
     assert command is not None, "this is a worker"
 

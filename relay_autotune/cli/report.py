@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -175,8 +176,8 @@ def check_output(program: str, output: str) -> None:
 
     :param program: name of the command.
     :param output: name of its file.
-    :raises SelectionError: if the ending is unknown, the folder does not exist, or the file is a
-        page of somebody else.
+    :raises SelectionError: if the ending is unknown, the folder does not exist, the file cannot be
+        written, or it is a page of somebody else.
     """
     path = Path(output)
     if path.suffix.lower() not in (".html", *PICTURES):
@@ -186,12 +187,24 @@ def check_output(program: str, output: str) -> None:
         )
     if not path.parent.is_dir():
         raise SelectionError(f"there is no folder {path.parent} for the report; make it first")
-    if not path.exists():
-        return
-    if path.suffix.lower() == ".html" and not is_ours(path):
+    existed = os.path.lexists(path)
+    if existed and not path.is_file():
+        raise SelectionError(f"{path} exists and is no file; name another one for the report")
+    if existed and path.suffix.lower() == ".html" and not is_ours(path):
         raise SelectionError(
             f"{path} exists and is not a report of this package; name another file, or remove it"
         )
+    try:
+        # Only an attempt tells of rights, of file systems and of the length of names.
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise SelectionError(
+            f"the report {path} cannot be written: {error.strerror}; name another file"
+        ) from error
+    if not existed:
+        path.unlink()
+        return
     say(program, f"{path} exists and will be replaced")
 
 

@@ -9,6 +9,7 @@ import argparse
 import math
 import os
 import re
+import select
 import signal
 import sys
 import textwrap
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
-from relay_autotune.text import TOLD_EVERY, duration
+from relay_autotune.text import TOLD_EVERY, duration, visible
 
 if TYPE_CHECKING:
     from relay_autotune.control.verification import StepRange
@@ -175,6 +176,7 @@ class StatusLine:
 
     def __call__(self, status: str) -> None:
         """Show a sentence."""
+        status = visible(status)
         text = f"\r\x1b[K{status[: width() - 1]}" if self.in_place else f"{status}\n"
         # The work goes on even if this cannot be written.
         with suppress(OSError):
@@ -393,9 +395,35 @@ def _require_somebody(flag: str) -> None:
 
 def _input(shown: str) -> str:
     try:
-        return input(shown).strip()
+        _await_line(shown)
+        return input().strip()
     except EOFError:
         raise LoopError("the input has ended: nothing was changed") from None
+
+
+def _await_line(shown: str) -> None:
+    """Show a prompt and wait for a line; a signal is never missed.
+
+    One that comes between the last look of the interpreter and a plain read would be noted, and
+    heeded after the line.
+
+    :param shown: the prompt.
+    """
+    sys.stderr.write(shown)
+    sys.stderr.flush()
+    if not sys.stdin.isatty():
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    before = signal.set_wakeup_fd(writer)
+    try:
+        # Python runs the handler as soon as this returns.
+        while sys.stdin not in select.select([sys.stdin, reader], [], [])[0]:
+            os.read(reader, 64)
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(reader)
+        os.close(writer)
 
 
 def number_of(text: str) -> float | None:

@@ -29,7 +29,7 @@ from relay_autotune.cli.arguments import (
     add_web,
     check_web,
     finite,
-    guarded,
+    guarded_in_graph,
     say,
 )
 from relay_autotune.cli.own_nodes import (
@@ -87,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> int:
     with Working("loading what talks to the nodes") if starts else nullcontext():
         import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
 
-    return guarded(PROGRAM, lambda: _tune(options, ros))
+    return guarded_in_graph(PROGRAM, lambda graph: _tune(options, ros, graph))
 
 
 def _apart(given: list[str]) -> tuple[list[str], list[str]]:
@@ -140,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _tune(options: argparse.Namespace, ros: list[str]) -> int:
+def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
     interrupted: list[int] = []
 
     def heed(number: int) -> None:
@@ -166,18 +166,20 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         namespace = own_namespace(options) if new else options.namespace
         spaces = namespace.split(",") if options.web else [namespace]
         with Working("joining the ROS graph"):
-            clients = [TuneClient(space, options.node, ros) for space in spaces]
+            clients = [
+                graph.enter_context(TuneClient(space, options.node, ros)) for space in spaces
+            ]
     except ParameterError as error:
         say(PROGRAM, str(error))
         return USAGE
     client = clients[0]
     with ExitStack() as stack:
-        for each in clients:
-            stack.enter_context(each)
         patience, joint, nodes = options.wait, None, None
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            if interrupted:
+                raise KeyboardInterrupt
             joint = JointTune(client, options) if of_joint else None
             nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
             patience = max(patience, START_WITHIN)
@@ -235,6 +237,9 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         for number in heeded:
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        if interrupted and nodes is not None and not client.cancelled:
+            # It came as the tune ended: nothing is asked for, or done, after that.
+            raise KeyboardInterrupt
         try:
             return AfterTune(client, options, _parser(), nodes, joint).conclude()
         except OSError:

@@ -15,11 +15,11 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from relay_autotune.cli.apply_gains import verdict_lines
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, worst
@@ -60,6 +60,7 @@ from relay_autotune.web.shape import Asked, Subject
 from relay_autotune.web.wire import curve, of_running
 from relay_autotune_msgs.msg import PidGains
 
+_Result = TypeVar("_Result")
 # How long messages are handled before wishes are looked at [s].
 _TICK = 0.05
 # How long to wait for what the analysis needs from the nodes [s].
@@ -131,7 +132,7 @@ class _LoopOnPage:
         # About the running tune: messages of the cycles, K_u after each, signals and wishes to end
         # it, how many of the signals are among these, and what is done at its first feedback.
         self._cycles: list[Any] = []
-        self._ultimate: list[tuple[int, EstimatedQuantity]] = []
+        self._ultimate: dict[int, EstimatedQuantity] = {}
         self._ends: list[int] = []
         self._heeded = 0
         self._at_first: Callable[[], object] | None = None
@@ -204,7 +205,7 @@ class _LoopOnPage:
         client, live = self._client, self._live
         live.forget_wishes()
         self._cycles.clear()
-        self._ultimate, self._ends, self._heeded = [], [], len(interrupted)
+        self._ultimate, self._ends, self._heeded = {}, [], len(interrupted)
         live.show("model", None)
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
@@ -281,16 +282,18 @@ class _LoopOnPage:
         found: Identification,
         cycle: int,
         cycles: list[Any],
-        ultimate: list[tuple[int, EstimatedQuantity]],
+        ultimate: dict[int, EstimatedQuantity],
     ) -> None:
         """Show a model over the data so far, and how its intervals narrow."""
         case = model_case(found, None)
-        ultimate += [(cycle, e) for e in case.ultimate if e.name == ULTIMATE_GAIN]
+        for each in case.ultimate:
+            if each.name == ULTIMATE_GAIN:
+                ultimate[cycle] = each
         record = None
         # Without the first cycle it is not known where the process was at rest.
         if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
             record = record_from_cycles(cycles)
-        self._live.show("model", of_running(case, record, ultimate))
+        self._live.show("model", of_running(case, record, list(ultimate.items())))
 
     def tick(self) -> None:
         """Heed what was wished or signalled since the last call."""
@@ -313,7 +316,11 @@ class _LoopOnPage:
         try:
             record = self._client.record(_PATIENCE)
             values = self._client.identifier_values(_PATIENCE) or defaults()
-            found = analysed_as_there(record, values)
+            found = _awaited(
+                self._client,
+                self._page.slow.ask(partial(analysed_as_there, record, values)),
+                lambda: bool(self._interrupted),
+            )
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains cannot be shaped: {error}")
             return
@@ -333,6 +340,21 @@ class _LoopOnPage:
         case = replace(case, command=command(first))
         subject = Subject(case, found.shaping, first, command, self._number)
         self._page.add(subject)
+
+
+def _awaited(client: TuneClient, work: Future[_Result], leave: Callable[[], bool]) -> _Result:
+    """Return what another thread computes; messages are handled, and signals are heeded.
+
+    :param client: whose messages are handled.
+    :param work: what is computed.
+    :param leave: returns True when it is to end.
+    :raises LoopError: if it has to end before.
+    """
+    client.wait(lambda: work.done() or leave(), math.inf)
+    if not work.done():
+        work.cancel()
+        raise LoopError("ended while it was computed")
+    return work.result()
 
 
 # How long a verification waits until the loop is at rest [s].
@@ -458,7 +480,8 @@ class GainsPage:
         subject: Subject = self.page.subjects[wish.of]
         if subject.loop != self.number:
             raise TuningError(f"the gains are for another loop than {self.live.told.node}")
-        shaped = subject.shaped(wish.asked)
+        work = self.page.worker.ask(partial(subject.shaped, wish.asked))
+        shaped = _awaited(self.client, work, self.leave)
         gains, judgement = shaped.gains, shaped.judgement
         if judgement.verdict is not Verdict.TRUSTED and not wish.doubtful:
             raise TuningError(f"the gains are doubtful, and were not accepted: {judgement.reason}")

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.quantities import Told, told_fields
+from relay_autotune.text import visible
 
 # Largest relative difference, by rounding, of a number from the one that follows from others.
 _SAME = 1e-9
@@ -315,13 +316,18 @@ def _of_field(
         held = np.asarray(held, dtype=np.float64)
         _require_length(name, held, message.parameters, "parameters", error, of)
     elif get_origin(each.kind) is tuple:
-        held = tuple(map(get_args(each.kind)[0], held))
+        held = tuple(_shown(get_args(each.kind)[0](item)) for item in held)
     else:
-        held = each.kind(held)
+        held = _shown(each.kind(held))
     problem = each.problem(held) if isinstance(held, float | np.ndarray) else None
     if problem is not None:
         raise error(f"{name} {of} {problem}")
     return held
+
+
+def _shown(held: Any) -> Any:
+    """Return a value of another node; in a text nothing acts on a terminal or a log."""
+    return visible(held) if type(held) is str else held
 
 
 def _read_columns(

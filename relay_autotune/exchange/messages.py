@@ -26,9 +26,10 @@ from relay_autotune.errors import (
 )
 from relay_autotune.exchange.fields import float64_array, of_message, to_message
 from relay_autotune.experiment.early_end import FitProgress
+from relay_autotune.quantities import Quantity
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.text import visible
-from relay_autotune.verdict import NOT_JUDGED, Judgement
+from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.identification.result import Identification
@@ -352,13 +353,48 @@ def fill_gains(
     to_message(message, gains)
 
 
+def made_visible(message: Any) -> Any:
+    """Return a message of another node, in whose texts nothing acts on a terminal or a log.
+
+    :param message: of rclpy; changed in place.
+    """
+    for name, kind in message.get_fields_and_field_types().items():
+        held = getattr(message, name)
+        if isinstance(held, str):
+            if not held.isprintable():
+                setattr(message, name, visible(held))
+        elif "string" in kind:
+            setattr(message, name, [visible(text) for text in held])
+        elif "/" in kind:
+            for part in held if "sequence" in kind or "[" in kind else (held,):
+                made_visible(part)
+    return message
+
+
+# Numbers of a feedback; one that cannot be is not told.
+_OF_FEEDBACK = (
+    Quantity("progress", 0.0, "", 0.0, 1.0),
+    Quantity("elapsed", 0.0, "s", 0.0),
+    Quantity("remaining", math.nan, "s", 0.0),
+    Quantity("period", math.nan, "s", 0.0),
+    Quantity("amplitude", math.nan, "y", 0.0),
+    Quantity("ultimate_gain", math.nan, "u/y"),
+    Quantity("ultimate_gain_std", math.nan, "u/y", 0.0),
+)
+
+
 def without_impossible(message: Any) -> list[str]:
-    """Empty the model and the gains of a result or feedback of `Tune` if they are impossible.
+    """Empty what is impossible in a result or feedback of `Tune`: model, gains, numbers.
 
     :param message: of the action; changed in place.
     :returns: a sentence for each part that was emptied.
     """
     said = []
+    for each in _OF_FEEDBACK:
+        if each.problem(getattr(message, each.name, each.default)) is not None:
+            setattr(message, each.name, each.default)
+    if getattr(message, "verdict", Verdict.UNKNOWN) > max(Verdict):
+        message.verdict = int(Verdict.UNKNOWN)
     for name, read in (
         ("transfer_function", transfer_function_from_message),
         ("gains", gains_from_message),

@@ -21,6 +21,7 @@ from relay_autotune.control.gains_history import AT_WORK
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
+    made_visible,
     record_from_message,
     transfer_function_from_message,
 )
@@ -32,7 +33,7 @@ from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.nodes.tables import FIXED, GAINS, NONE_WAIT, rate_from
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
-from relay_autotune.text import TOLD_EVERY, duration
+from relay_autotune.text import TOLD_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
@@ -394,12 +395,12 @@ class GainsClient(LoopClient):
         goal.apply = new is not None
         while not leave():
             sent = self._verify.send_goal_async(
-                goal, feedback_callback=lambda message: tell(message.feedback.status)
+                goal, feedback_callback=lambda message: tell(visible(message.feedback.status))
             )
             if not self.wait(sent.done, ANSWER_WITHIN):
                 raise LoopError(f"{self.name} has not answered within {ANSWER_WITHIN:g} s")
             answer = self._ended(sent.result(), leave)
-            result = answer.result
+            result = made_visible(answer.result)
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result
             if not _is_early(result.reason) or time.monotonic() - begun > ANSWER_WITHIN:

@@ -16,6 +16,7 @@ everything else a few hundred times a second.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import itertools
 import os
@@ -51,6 +52,7 @@ from rclpy.task import Future
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.quantities import Quantity
+from relay_autotune.text import visible
 
 # Messages further apart than this take the ordinary path [s].
 CLOSE = 0.002
@@ -146,10 +148,39 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _SWITCH_INTERVAL = 5e-5
 # Time limit for tasks at the end of a node, such as the answer to a goal [s].
 _FINISH_WITHIN = 0.2
+# Time in which a process that is otherwise done has to leave the ROS graph [s]; it takes a tenth.
+LEAVE_WITHIN = 2.0
 # Byte that ends the thread at the pipe of signals.
 _NO_SIGNAL = 0
 # After these ROS expects NAME:=VALUE.
 _FLAGS_OF_RULES = ("-p", "--param", "-r", "--remap")
+
+
+class _Log:
+    """The log of a node, in which text of other nodes cannot pass for lines of ours.
+
+    :param log: that of rclpy.
+    """
+
+    def __init__(self, log: Any) -> None:
+        self._log = log
+
+    # A line of code has one severity; with another one rclpy raises.
+    def info(self, text: str) -> None:
+        self._log.info(visible(text))
+
+    def warning(self, text: str) -> None:
+        self._log.warning(visible(text))
+
+    def error(self, text: str) -> None:
+        self._log.error(visible(text))
+
+    def fatal(self, text: str) -> None:
+        self._log.fatal(visible(text))
+
+    def __getattr__(self, name: str) -> Any:
+        # What rclpy itself asks of it.
+        return getattr(self._log, name)
 
 
 class ServedNode(Node):
@@ -161,6 +192,10 @@ class ServedNode(Node):
         self.favoured: Subscription | None = None
         """The subscription with the fast path, see `Executor.favour`."""
         self._when_idle: deque[Callable[[], None]] = deque()
+
+    def get_logger(self) -> Any:
+        """Return the log, in which text of other nodes is made visible."""
+        return _Log(super().get_logger())
 
     def favour(self, subscription: Subscription) -> None:
         """Give the messages of a subscription the fast path, see `Executor.favour`."""
@@ -288,23 +323,68 @@ def run(
     try:
         node = create()
     except RelayAutotuneError as error:
+        status = _refuse(name, str(error))
+        end_within(LEAVE_WITHIN, status)
         rclpy.try_shutdown()
-        return _refuse(name, str(error))
+        return status
+    status = 1
     try:
         for unknown in unknown_parameters(list(node._parameter_overrides), parameters):
             # Only a warning: a file may hold parameters of other nodes.
             node.get_logger().warning(unknown)
-        return _serve(node, signals)
+        status = _serve(node, signals)
     finally:
+        end_within(LEAVE_WITHIN, status)
         node.destroy_node()
         rclpy.try_shutdown()
+    return status
+
+
+class _SignalEvent(ctypes.Structure):
+    """The C library's `struct sigevent`, with a function to call in a thread of its own."""
+
+    _fields_ = (
+        ("value", ctypes.c_int),
+        ("_", ctypes.c_int),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("rest", ctypes.c_char * 40),
+    )
+
+
+_SIGEV_THREAD = 2
+
+
+def end_within(seconds: float, status: int) -> None:
+    """End the process after a time, wherever it is then; to be called once all is in order.
+
+    The middleware may compute without end while it leaves the graph, in C code that holds the
+    interpreter and blocks all signals. So a timer of the C library calls `_exit`, which needs
+    neither.
+
+    :param seconds: how long the process may take to end by itself [s].
+    :param status: its exit status then.
+    """
+    for output in (sys.stdout, sys.stderr):
+        # A closed output, or a full one, takes nothing.
+        with suppress(OSError, ValueError):
+            output.flush()
+    library = ctypes.CDLL(None)
+    leave = ctypes.cast(library._exit, ctypes.c_void_p)
+    event = _SignalEvent(value=status, notify=_SIGEV_THREAD, function=leave)
+    timer = ctypes.c_void_p()
+    library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer))
+    # Interval and first expiry, each in seconds and nanoseconds.
+    whole, rest = divmod(round(seconds * 1e9), 1_000_000_000)
+    library.timer_settime(timer, 0, (ctypes.c_long * 4)(0, 0, whole, rest), None)
 
 
 def _refuse(name: str, why: str) -> int:
     """Say why a node cannot run; return the exit status."""
     # Standard error may be closed.
     with suppress(OSError):
-        print(f"{name}: {why}", file=sys.stderr)
+        print(visible(f"{name}: {why}"), file=sys.stderr)
     return 2
 
 

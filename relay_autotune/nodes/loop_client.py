@@ -25,6 +25,7 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import FieldError, LoopError, ParameterError
+from relay_autotune.exchange.messages import made_visible
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage
 
@@ -111,7 +112,10 @@ class LoopClient:
         """
         came: list[Any] = []
         self._node.create_subscription(
-            kind, self._resolved(topic), came.append, quality.latched(_MOST_HEARD)
+            kind,
+            self._resolved(topic),
+            lambda message: came.append(made_visible(message)),
+            quality.latched(_MOST_HEARD),
         )
         return came
 
@@ -143,7 +147,7 @@ class LoopClient:
         if self.wait(self._service(kind, service).service_is_ready, patience):
             answer = self.begin(kind, service, request)
             if self.wait(answer.done, deadline - time.monotonic()):
-                return answer.result()
+                return made_visible(answer.result())
         raise LoopError(f"{service} has not answered within {patience:g} s")
 
     def begin(self, kind: Any, service: str, request: Any) -> Any:
@@ -205,7 +209,9 @@ class LoopClient:
         profile: QoSProfile = qos_profile_sensor_data,
     ) -> Iterator[None]:
         """Hear a topic until the end of the block."""
-        ear = self._node.create_subscription(kind, topic, take, profile)
+        ear = self._node.create_subscription(
+            kind, topic, lambda message: take(made_visible(message)), profile
+        )
         try:
             yield
         finally:

@@ -87,7 +87,7 @@ class RelayNode(ServedNode):
         self._results = OwnResults(self)
         self.create_service(StartTune, "~/start_tune", self._on_start)
         serve(self, Trigger, "~/abort", self._abort)
-        self._action = TuneAction(self, self._request, partial(self._stop_now, "cancelled"))
+        self._action = TuneAction(self, self._request, self._cancel)
         self._awaits_results: Session | None = None
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
@@ -277,9 +277,7 @@ class RelayNode(ServedNode):
         session = self._session
         running = session if session is not None and message.experiment_id == session.id else None
         now = self._now_ns()
-        taken = self._results.take(
-            name, message, None if running is None else running.experiment, self._on_setpoint
-        )
+        taken = self._results.take(name, message, running, self._on_setpoint)
         for topic, found in taken:
             self._action.note(topic, found)
             self._recordings.message(found.experiment_id, topic, now, found)
@@ -300,6 +298,12 @@ class RelayNode(ServedNode):
     def _stop_now(self, reason: str) -> None:
         if (session := self._session) is not None:
             self._stop(session, reason)
+
+    def _cancel(self) -> None:
+        """End a tune at its client's wish, also one that waits for its model alone."""
+        self._stop_now("cancelled")
+        if self._awaits_results is not None:
+            self._recordings.wait_no_longer(self._awaits_results.id, "cancelled")
 
     def _stop(self, session: Session, reason: str) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""

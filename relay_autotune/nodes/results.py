@@ -12,8 +12,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
@@ -26,13 +28,15 @@ from relay_autotune.exchange.messages import (
     record_from_message,
     transfer_function_from_message,
 )
-from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import Outcome, Record
 from relay_autotune.verdict import Verdict
+
+if TYPE_CHECKING:
+    from relay_autotune.nodes.session import Session
 
 SIGNS_OF_LIFE = "identifier_status"
 # Interval of the signs of life during a computation [s].
@@ -274,15 +278,17 @@ class OwnResults(ResultCheck):
         super().__init__(node)
         # Gains that arrived before their model.
         self._early: tuple[str, Any] | None = None
+        # Of the running experiment: its id and number of switches, its facts, its swing [y].
+        self._so_far = ("", 0), ExperimentFacts("", Outcome.UNKNOWN, 0.0), math.nan
 
     def take(
-        self, name: str, message: Any, running: RelayExperiment | None, on_setpoint: bool
+        self, name: str, message: Any, running: Session | None, on_setpoint: bool
     ) -> list[tuple[str, Any]]:
         """Return the messages that may be stored, each with the name of its topic.
 
         :param name: the message's topic, ``transfer_function`` or ``pi_gains``.
         :param message: the message.
-        :param running: its experiment, if it still runs.
+        :param running: the session of its experiment, if that still runs.
         :param on_setpoint: True if the relay moves a set-point, so that its levels and its sign
             are not those of the command.
         """
@@ -306,23 +312,40 @@ class OwnResults(ResultCheck):
         return [(name, message)] if self.gains(message) is not None else []
 
     def _why_not_running(
-        self, name: str, message: Any, experiment: RelayExperiment, on_setpoint: bool
+        self, name: str, message: Any, running: Session, on_setpoint: bool
     ) -> RelayAutotuneError | None:
         if name != MODEL or message.final:
             return TuningError(_TOO_SOON)
+        experiment = running.experiment
         sign, amplitude, relay = experiment.process_gain_sign, math.nan, math.nan
         cycles, settings = experiment.cycles, experiment.settings
-        if on_setpoint:
-            sign = 0
-        elif cycles and settings is not None:
-            amplitude = 0.5 * (cycles[-1].peak_max - cycles[-1].peak_min)
-            relay = settings.amplitude
         try:
+            facts, swing = self._facts_so_far(running)
+            if on_setpoint:
+                sign = 0
+            elif settings is not None:
+                last = cycles[-1].peak_max - cycles[-1].peak_min if cycles else swing
+                amplitude, relay = 0.5 * last, settings.amplitude
             found = finding_from_message(message)
             check_finding(found, sign=sign, amplitude=amplitude, relay=relay)
+            facts.check_model(transfer_function_from_message(message))
         except RelayAutotuneError as error:
             return error
         return None
+
+    def _facts_so_far(self, running: Session) -> tuple[ExperimentFacts, float]:
+        """Return what is known of a running experiment, and its swing [y].
+
+        :raises RecordError: if it has no sample yet.
+        """
+        # Anybody may send any number of models, and a long record takes time.
+        of = running.id, running.experiment.switches
+        if of != self._so_far[0]:
+            record = running.record()
+            # An oscillation that has just begun tells the size of the response, not its phase.
+            facts = replace(ExperimentFacts.of(record), whole=False)
+            self._so_far = of, facts, float(np.ptp(record.measurement))
+        return self._so_far[1:]
 
 
 def why_doubtful(message: Any) -> str:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -662,16 +663,24 @@ class Recordings:
             self.close(experiment_id, "with model and gains")
             return
 
-        def late() -> None:
-            missing = " and ".join(recording.missing)
-            silent = f"identifier_node did not send them within {timeout:g} s"
-            recording.reason = recording.reason or silent
-            self.close(experiment_id, f"without {missing}: {recording.reason}")
-
+        silent = f"identifier_node did not send them within {timeout:g} s"
+        late = partial(self.wait_no_longer, experiment_id, silent)
         recording.waits_since = time.monotonic()
         recording.patience = LONGEST * timeout
         recording.until = recording.waits_since + recording.patience
         recording.timer = self._node.create_timer(max(timeout, 1e-3), late, clock=STEADY)
+
+    def wait_no_longer(self, experiment_id: str, reason: str) -> None:
+        """Close a recording without the results that it lacks.
+
+        :param experiment_id: the id of the experiment.
+        :param reason: why they are missing, unless identifier_node has told another one.
+        """
+        recording = self._open.get(experiment_id)
+        if recording is not None:
+            recording.reason = recording.reason or reason
+            missing = " and ".join(recording.missing)
+            self.close(experiment_id, f"without {missing}: {recording.reason}")
 
     def close(self, experiment_id: str, why: str) -> None:
         """Close a recording; its thread finishes it.

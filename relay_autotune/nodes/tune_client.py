@@ -16,7 +16,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import qos_profile_sensor_data
 
 from relay_autotune.errors import FieldError, LoopError
-from relay_autotune.exchange.messages import record_from_message, without_impossible
+from relay_autotune.exchange.messages import made_visible, record_from_message, without_impossible
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.loop_client import LoopClient
@@ -160,7 +160,7 @@ class TuneClient(LoopClient):
         """Return the feedback received since the last call."""
         news, self._feedback[:] = list(self._feedback), []
         for feedback in news:
-            self.refused.update(without_impossible(feedback))
+            self.refused.update(without_impossible(made_visible(feedback)))
         return [feedback for feedback in news if feedback.state <= Tune.Feedback.STATE_FAILED]
 
     def cancel(self) -> None:
@@ -174,7 +174,7 @@ class TuneClient(LoopClient):
     @property
     def result(self) -> Any:
         """The `Tune.Result`, without a model or gains that failed their check."""
-        result = self._answer.result().result
+        result = made_visible(self._answer.result().result)
         self.refused.update(without_impossible(result))
         result.outcome = min(result.outcome, Tune.Result.FAILED)
         return result

@@ -17,12 +17,10 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RecordError
-from relay_autotune.quantities import told
+from relay_autotune.quantities import LARGEST, told
 
 # Difference of equal slopes, relative to the steepest one.
 _STRAIGHT = 1e-12
-# Largest value of a quantity; squares of values up to this can be added without overflow.
-LARGEST = 1e152
 
 
 _P = ParamSpec("_P")

@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from relay_autotune.errors import TuningError
 from relay_autotune.exchange.fields import json_number
+from relay_autotune.quantities import check, quantity
 from relay_autotune.report.style import in_steps
 from relay_autotune.web.shape import Asked
 from relay_autotune.web.wire import curve
@@ -35,18 +37,19 @@ WISHES = (CHECK, START, ABORT, APPLY, VERIFY, REVERT)
 class Wish:
     """What a page wishes.
 
-    :param what: one of `WISHES`.
-    :param of: number of the model whose gains are meant.
-    :param asked: what these gains were asked for by; None: no gains are meant.
-    :param step: of the set-point, to verify the gains [y]; 0: none.
-    :param doubtful: whether gains whose verdict is not trusted are accepted.
+    :raises TuningError: if a value is out of its range.
     """
 
-    what: str
-    of: int = 0
+    what: str = quantity("", choices=WISHES).means("What is to be done.")
+    of: int = quantity(0, lower=0).means("Number of the model whose gains are meant.")
     asked: Asked | None = None
-    step: float = 0.0
+    """What these gains were asked for by; None: no gains are meant."""
+    step: float = quantity(0.0, "y").means("Of the set-point, to verify the gains; 0: none.")
     doubtful: bool = False
+    """Whether gains whose verdict is not trusted are accepted."""
+
+    def __post_init__(self) -> None:
+        check(self, TuningError)
 
 
 @dataclass(frozen=True)

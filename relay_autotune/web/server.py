@@ -1,33 +1,29 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The server of the page: a few files, a socket for what is asked, and files to keep.
-
-One thread computes what pages ask for at once, and in between what they may ask next.
-"""
+"""The server of the page: a few files, a socket for what is asked, and files to keep."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import mimetypes
-import os
-import queue
-import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
-from math import isfinite
 from threading import Lock, Thread
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import parse_qs
 
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import PeriodicCallback
+from tornado.iostream import StreamClosedError
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -43,81 +39,9 @@ from relay_autotune.tuning import RULES
 from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.address import Address
-from relay_autotune.web.live import WISHES, Live, Wish
+from relay_autotune.web.live import Live, Wish
 from relay_autotune.web.shape import Asked, Subject, asked_of
-
-_Result = TypeVar("_Result")
-_Work = Callable[[], object]
-# How long to wait for a question where nothing is worth computing ahead [s].
-_PAUSE = 0.25
-_COMPUTING_NICE = 10
-
-
-def yield_to_nodes(nice: int) -> None:
-    """Let the nodes of a loop, which may need the same processor, go before this thread.
-
-    Linux has a priority for each thread, and a policy under which one that wakes up interrupts
-    no other.
-
-    :param nice: how far to step back, 1 to 19.
-    """
-    this = threading.get_native_id()
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, this, nice)
-        os.sched_setscheduler(this, os.SCHED_BATCH, os.sched_param(0))
-
-
-class Worker:
-    """Compute one thing after the other: first what is asked for, then what may be asked.
-
-    :param ahead: returns what to compute while nothing is asked for; None: nothing.
-    """
-
-    def __init__(self, ahead: Callable[[], _Work | None]) -> None:
-        self._queue: queue.SimpleQueue[_Work] = queue.SimpleQueue()
-        self._ahead = ahead
-        self._open = True
-        # It holds nothing that would have to be put in order, so it may end with the process.
-        threading.Thread(target=self._run, name="page", daemon=True).start()
-
-    def ask(self, work: Callable[[], _Result]) -> Future[_Result]:
-        """Compute something before all that may wait; it is left out if it is cancelled before.
-
-        :param work: computes it.
-        """
-        future: Future[_Result] = Future()
-
-        def done() -> None:
-            if not future.set_running_or_notify_cancel():
-                return
-            try:
-                future.set_result(work())
-            except BaseException as error:  # noqa: BLE001  it belongs to whoever asked
-                future.set_exception(error)
-
-        self._queue.put(done)
-        return future
-
-    def close(self) -> None:
-        """Compute nothing more; what is computed right now is finished."""
-        self._open = False
-        self._queue.put(lambda: None)
-
-    def _run(self) -> None:
-        yield_to_nodes(_COMPUTING_NICE)
-        while self._open:
-            try:
-                work: _Work | None = self._queue.get_nowait()
-            except queue.Empty:
-                work = self._ahead()
-            if work is None:
-                try:
-                    work = self._queue.get(timeout=_PAUSE)
-                except queue.Empty:
-                    continue
-            if self._open:
-                work()
-
+from relay_autotune.web.worker import Worker, yield_to_nodes
 
 _STATIC = ("page.html", "page.css", "page.js", "plot.js", "live.js")
 # No script, style or connection but those of this server, and no page around ours.
@@ -134,6 +58,10 @@ _EVERY = 0.5
 _LIVE_EVERY = 0.04
 # Priority of the thread; one that ends a tune has to be heard on a busy machine, too.
 _NICE = 5
+# Time after which a report or a model makes way for another one [s]: each takes seconds.
+_SLOW = 10.0
+# What did not end so often while nothing was asked is not begun again unasked.
+_MOST_BEGUN = 3
 # Answers that are kept; the oldest is dropped first.
 _MOST_KEPT = 2000
 
@@ -162,11 +90,15 @@ class Page:
         """Whether what the slider may ask for is computed while nothing is asked."""
         self._known: dict[tuple[int, Asked], str] = {}
         self._last: dict[int, Asked] = {}
+        self._begun: Counter[tuple[int, Asked]] = Counter()
         self._adding = Lock()
         self.open: set[_Socket] = set()
         """Connections of the pages that are open."""
         self.worker = Worker(self._next_ahead)
         """Computes what is asked; what the page shows first, at once."""
+        self.sketches = Worker()
+        self.slow = Worker(turn=_SLOW, longest=6.0 * _SLOW)
+        """Computes what takes seconds: reports, and models."""
         for subject in subjects:
             self.add(subject)
 
@@ -188,7 +120,9 @@ class Page:
             return None
         for number, last in list(self._last.items()):
             for asked in self.subjects[number].positions(last):
-                if (number, asked) not in self._known:
+                key = number, asked
+                if key not in self._known and self._begun[key] < _MOST_BEGUN:
+                    self._begun[key] += 1
                     return partial(self._answer, number, asked)
         return None
 
@@ -230,8 +164,7 @@ class Page:
         subject = self.subjects[number]
         try:
             shaped = subject.sketched(asked)
-        except RelayAutotuneError:
-            # The exact answer says what is wrong.
+        except Exception:  # noqa: BLE001  the exact answer says what is wrong
             return None
         if shaped is None:
             return None
@@ -247,13 +180,32 @@ class Page:
             exports = {"exports": list(exports_of(shaped.gains.law))}
             told = wire.to_text({"shaped": wire.of_shaped(subject, shaped) | exports})
         except RelayAutotuneError as error:
-            told = wire.to_text({"refused": visible(str(error))})
+            told = _refused(error)
         except Exception as error:  # noqa: BLE001  a defect must not leave the page waiting
             told = wire.to_text({"refused": defect(error)})
+        return self.keep(number, asked, told)
+
+    def keep(self, number: int, asked: Asked, answer: str) -> str:
+        """Keep the answer to what a page asks, and return it.
+
+        :param number: of the model.
+        :param asked: what was asked for.
+        :param answer: as JSON.
+        """
         if len(self._known) >= _MOST_KEPT:
             self._known.pop(next(iter(self._known)))
-        self._known[number, asked] = told
-        return told
+        self._known[number, asked] = answer
+        return answer
+
+    def tend(self) -> None:
+        """Stop what computes for too long; to be called now and then."""
+        for worker in (self.worker, self.sketches, self.slow):
+            worker.tend()
+
+    def close(self) -> None:
+        """Compute nothing more."""
+        for worker in (self.worker, self.sketches, self.slow):
+            worker.close()
 
     def everything(self) -> str:
         """Return what a page shows whatever is asked, as JSON."""
@@ -313,9 +265,9 @@ class _Guarded(RequestHandler):
 
     def subject_and_asked(self) -> tuple[int, Asked]:
         """Return the model and what is asked for, from the request's query."""
-        given = parse_qs(self.request.query, max_num_fields=10)
         try:
-            fields = json.loads(given.get("asked", ["{}"])[0])
+            given = parse_qs(self.request.query, max_num_fields=10)
+            fields = _read(given.get("asked", ["{}"])[0])
             return self.page.question(int(given.get("of", ["0"])[0]), fields)
         except (ValueError, RecursionError) as error:
             raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not understood") from error
@@ -359,7 +311,7 @@ class _Report(_Guarded):
 
         # Figures take seconds to draw, for which the slider must not wait.
         try:
-            text = await asyncio.to_thread(written)
+            text = await asyncio.wrap_future(self.page.slow.ask(written))
         except RelayAutotuneError as error:
             raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
         self.set_header("Content-Type", "text/html; charset=utf-8")
@@ -435,7 +387,7 @@ class _Socket(_Guarded, WebSocketHandler):
         """Answer what the page asks."""
         begun = time.perf_counter()
         try:
-            question = json.loads(message)
+            question = _read(message)
             if self.page.lives and "do" in question:
                 loop = question.get("loop", 0)
                 if not (isinstance(loop, int) and 0 <= loop < len(self.page.lives)):
@@ -444,7 +396,7 @@ class _Socket(_Guarded, WebSocketHandler):
                 return
             count = question["n"]
             number, asked = self.page.question(question["of"], question["asked"])
-        except (TuningError, KeyError, TypeError, ValueError, RecursionError):
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
             self.close(1008, "not understood")
             return
         head = {"of": number, "n": count if isinstance(count, int) else 0}
@@ -461,10 +413,16 @@ class _Socket(_Guarded, WebSocketHandler):
     async def _sketch_and_answer(self, head: dict[str, int], asked: Asked, begun: float) -> None:
         """Tell gains that come near, then the exact ones."""
         # One after the other, since both threads would only hold each other up.
-        sketch = await asyncio.to_thread(self.page.sketch, head["of"], asked)
-        if sketch is not None:
-            self._tell_answer(head, sketch, begun)
-        answer = await asyncio.wrap_future(self.page.ask(head["of"], asked))
+        number = head["of"]
+        with suppress(RelayAutotuneError):
+            work = partial(self.page.sketch, number, asked)
+            sketch = await asyncio.wrap_future(self.page.sketches.ask(work))
+            if sketch is not None:
+                self._tell_answer(head, sketch, begun)
+        try:
+            answer = await asyncio.wrap_future(self.page.ask(number, asked))
+        except RelayAutotuneError as error:
+            answer = self.page.keep(number, asked, _refused(error))
         self._tell_answer(head, answer, begun)
 
     def _tell_answer(self, head: dict[str, int], answer: str, begun: float) -> None:
@@ -472,17 +430,14 @@ class _Socket(_Guarded, WebSocketHandler):
         self.tell(f'{wire.to_text(head | {"took": took})[:-1]},"answer":{answer}}}')
 
     def _wish(self, question: dict[str, Any]) -> Wish:
-        what, of, step = question["do"], question.get("of", 0), question.get("step", 0.0)
-        asked = question.get("asked")
-        if what not in WISHES or not isinstance(of, int):
+        of, asked = question.get("of", 0), question.get("asked")
+        if not isinstance(of, int):
             raise TuningError("there is no such wish")
-        if isinstance(step, bool) or not isinstance(step, (int, float)) or not isfinite(step):
-            raise TuningError("expected a number for the step")
         return Wish(
-            what,
+            question["do"],
             of,
             None if asked is None else asked_of(asked, tuple(RULES)),
-            float(step),
+            question.get("step", 0.0),
             question.get("accept_doubtful") is True,
         )
 
@@ -499,6 +454,19 @@ class _Socket(_Guarded, WebSocketHandler):
                 self._present[number] = subject.case.present
                 rows = wire.of_present(subject.case)
                 self.tell(wire.to_text({"of": number, "present": rows}))
+
+
+def _read(text: str | bytes) -> Any:
+    """Return what JSON says; NaN and the like are no numbers of it."""
+    return json.loads(text, parse_constant=_no_number)
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _refused(error: Exception) -> str:
+    return wire.to_text({"refused": visible(str(error))})
 
 
 def _one_line(error: Exception) -> str:
@@ -525,6 +493,33 @@ def application(page: Page) -> Application:
     )
 
 
+class _OneLine(logging.Formatter):
+    """What the libraries of the server log, in which a request may be quoted, as one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        said = visible(record.getMessage().partition("\n")[0])
+        error = record.exc_info[1] if record.exc_info else None
+        return said if error is None else f"{said}: {defect(error)}"
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Return whether something else is logged than that a page has gone."""
+    gone = (WebSocketClosedError, StreamClosedError, ConnectionError)
+    return not (record.exc_info and isinstance(record.exc_info[1], gone))
+
+
+def _log_in_lines() -> None:
+    """Let the libraries of the server log single lines, in which text of others is visible."""
+    lines = logging.StreamHandler()
+    lines.setFormatter(_OneLine())
+    lines.setLevel(logging.WARNING)
+    lines.addFilter(_is_news)
+    for name in ("tornado", "asyncio"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [lines], False
+
+
 async def serve(page: Page, tell: Callable[[str], None]) -> None:
     """Serve a page until the task is cancelled.
 
@@ -540,17 +535,22 @@ async def serve(page: Page, tell: Callable[[str], None]) -> None:
             f"the page cannot be served on {address.host}:{address.port}: {error.strerror}; "
             "name another with --web-address"
         ) from error
+    _log_in_lines()
     server = HTTPServer(application(page), max_body_size=_LARGEST_QUESTION)
     server.add_sockets(sockets)
     tell(address.url(sockets[0].getsockname()[1]))
-    news = PeriodicCallback(page.tell_news, 1000.0 * _LIVE_EVERY)
-    news.start()
+    regular = [
+        PeriodicCallback(work, 1000.0 * _LIVE_EVERY) for work in (page.tell_news, page.tend)
+    ]
+    for each in regular:
+        each.start()
     try:
         await asyncio.Event().wait()
     finally:
         page.tell_news()
-        news.stop()
-        page.worker.close()
+        for each in regular:
+            each.stop()
+        page.close()
         server.stop()
         for socket in list(page.open):
             socket.close(1001, "the command has ended")

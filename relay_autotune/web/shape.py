@@ -9,7 +9,6 @@ Every number comes from the functions that `replay` and `tune` call, with their 
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -21,6 +20,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import abscissae, inverted, step_responses
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.quantities import Quantity, declared
 from relay_autotune.report.case import Case
 from relay_autotune.report.frequency import (
     loop_frequencies,
@@ -181,7 +181,6 @@ class Subject:
     _found: dict[Asked, tuple[Designed, Gains] | TuningError] = field(
         default_factory=dict, repr=False
     )
-    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _shown: tuple[float, float] | None = None
 
     def positions(self, near: Asked) -> Iterator[Asked]:
@@ -203,8 +202,8 @@ class Subject:
 
         :param of: for the same law, rate and noise.
         """
-        with self._lock:
-            known = list(self._found.items())
+        # In one call, since other threads add some.
+        known = list(self._found.items())
         wanted = replace(of.apart_from_ms, rule=DEFAULT_RULE, controller="")
         return [
             found[1]
@@ -239,12 +238,11 @@ class Subject:
         if self.shaping is None or asked.rule != DEFAULT_RULE:
             return None
         base = asked.apart_from_ms
-        with self._lock:
-            near = sorted(
-                (abs(each.ms - asked.ms), each.ms, found[0].controller)
-                for each, found in self._found.items()
-                if not isinstance(found, TuningError) and each.apart_from_ms == base
-            )[:2]
+        near = sorted(
+            (abs(each.ms - asked.ms), each.ms, found[0].controller)
+            for each, found in list(self._found.items())
+            if not isinstance(found, TuningError) and each.apart_from_ms == base
+        )[:2]
         if near and near[0][0] == 0.0:
             # The gains themselves are known, and what they do on all models is not.
             near = [near[0], (0.0, asked.ms + STEP, near[0][2])]
@@ -287,8 +285,7 @@ class Subject:
     def _gains(self, shaping: Shaping, asked: Asked) -> Gains:
         """Return the gains; the search is not repeated for another set-point weight."""
         plain = replace(asked, setpoint_weight=None)
-        with self._lock:
-            found = self._found.get(plain)
+        found = self._found.get(plain)
         if found is None:
             task = shaping.asking(plain.options(shaping.task.options)).task
             try:
@@ -296,8 +293,7 @@ class Subject:
                 found = design, judged(task, design)
             except TuningError as error:
                 found = error
-            with self._lock:
-                self._found[plain] = found
+            self._found[plain] = found
         if isinstance(found, TuningError):
             raise TuningError(str(found))
         design, gains = found
@@ -305,13 +301,12 @@ class Subject:
 
     def _scale(self, gains: Gains) -> tuple[float, float]:
         """Return duration and load of the steps, which stay the same while gains change."""
-        with self._lock:
-            if self._shown is None:
-                assert self.shaping is not None
-                model = self.shaping.task.in_loop(self.shaping.task.model)
-                best = self.case.best_gains or gains
-                self._shown = step_duration(best, model), shown_load(best, model)
-            return self._shown
+        if self._shown is None:
+            assert self.shaping is not None
+            model = self.shaping.task.in_loop(self.shaping.task.model)
+            best = self.case.best_gains or gains
+            self._shown = step_duration(best, model), shown_load(best, model)
+        return self._shown
 
 
 def _shaped(
@@ -383,19 +378,15 @@ def asked_of(given: object, rules: tuple[str, ...]) -> Asked:
     if not isinstance(given, dict):
         raise TuningError("expected what is asked for as an object of names and values")
     values = {each.name: given.get(each.name, each.default) for each in fields(Asked)}
-    for name in ("rule", "controller", "law"):
-        if not (isinstance(values[name], str) or (name == "law" and values[name] is None)):
-            raise TuningError(f"expected a name for {name}")
-    if values["rule"] not in rules:
-        raise TuningError("expected the name of a rule")
-    for name in ("ms", "setpoint_weight", "noise_share", "sample_period"):
-        value = values[name]
-        if value is None and name != "ms":
+    known = {each.name: each for each in declared(DesignOptions)}
+    known["rule"] = Quantity("rule", DEFAULT_RULE, choices=rules)
+    for each in fields(Asked):
+        value = values[each.name]
+        if value is None and each.default is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
-            raise TuningError(f"expected a number for {name}")
-        values[name] = float(value)
-    asked = Asked(**values)
-    # It refuses what is out of its range.
-    asked.options(DesignOptions())
-    return asked
+        problem = known[each.name].problem(value)
+        if problem is not None:
+            raise TuningError(problem)
+        if known[each.name].is_number:
+            values[each.name] = float(value)
+    return Asked(**values)

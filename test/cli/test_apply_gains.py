@@ -122,7 +122,8 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     # The usual step is made smaller, and another is asked for until it is within.
     given = apply_gains._parser().parse_args([])
     answers = ["-1.6", "n"]
-    monkeypatch.setattr("builtins.input", lambda shown: answers.pop(0))
+    monkeypatch.setattr("relay_autotune.cli.terminal._await_line", lambda shown: None)
+    monkeypatch.setattr("builtins.input", lambda: answers.pop(0))
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
     assert apply_gains.apply_and_verify(client, given) == 1
     told = capsys.readouterr()

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import os
+import pty
 import random
+import select
 import signal
 import subprocess
 import sys
@@ -61,6 +63,61 @@ def test_no_traceback_at_any_moment(name, words, ends, moments):
         assert status in ends, said
         assert "Traceback" not in said
         assert "KeyboardInterrupt" not in said
+
+
+ASK = """
+from relay_autotune.cli.terminal import _input
+for _ in range(300):
+    try:
+        _input("ask ")
+    except KeyboardInterrupt:
+        print("came")
+print(_input("ask "))
+"""
+
+
+def test_ctrl_c_as_a_prompt_appears_is_heeded():
+    window, inside = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", ASK], cwd=ROOT, stdin=inside, stdout=inside, stderr=inside,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    os.close(inside)
+    heard = b""
+    try:
+        for count in range(1, 302):
+            while heard.count(b"ask ") < count or heard.count(b"came") < count - 1:
+                assert select.select([window], [], [], 30.0)[0], "it waits for a line"
+                heard += os.read(window, 4096)
+            if count <= 300:
+                process.send_signal(signal.SIGINT)
+        os.write(window, b"a line\n")
+        assert process.wait(30.0) == 0
+    finally:
+        process.kill()
+        process.wait()
+        os.close(window)
+
+
+def test_ctrl_c_while_the_processes_of_a_fleet_load_is_no_traceback(tmp_path):
+    # What the fork server loads first interrupts it there.
+    (tmp_path / "loaded_first.py").write_text(
+        "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+    )
+    code = (
+        "import sys; from relay_autotune.cli import fleet, replay\n"
+        "fleet._PRELOADED.insert(0, 'loaded_first')\n"
+        "sys.exit(replay.main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--jobs", "2", "no_bag", "nor_this"],
+        cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True,
+        check=False, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    # The command itself was not meant.
+    assert done.returncode == 1
+    assert "KeyboardInterrupt" not in done.stderr
+    assert done.stderr.count("does not exist") == 2
 
 
 def test_one_that_is_not_to_be_interrupted():

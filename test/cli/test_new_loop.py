@@ -75,7 +75,8 @@ def arguments(client: Any, given: argparse.Namespace) -> dict[str, str]:
 def typed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Answer each question with the next of these texts, as at a terminal."""
     answers: list[str] = []
-    monkeypatch.setattr("builtins.input", lambda shown: answers.pop(0))
+    monkeypatch.setattr("relay_autotune.cli.terminal._await_line", lambda shown: None)
+    monkeypatch.setattr("builtins.input", lambda: answers.pop(0))
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
     return answers
 

@@ -124,6 +124,9 @@ def test_a_recording_that_was_not_read_has_its_place(capsys, tmp_path) -> None:
     [
         (("x.json", "-o", "page.doc"), ".html, .png, .svg, .pdf", 2),
         (("x.json", "-o", "no/page.html"), "there is no folder no", 2),
+        (("x.json", "-o", "folder.html"), "folder.html exists and is no file", 2),
+        (("x.json", "-o", "/proc/page.html"), "/proc/page.html cannot be written", 2),
+        (("x.json", "-o", "a" * 300 + ".png"), "cannot be written: File name too long", 2),
         (("x.json",), "does not exist", 1),
         (("no_such_bag",), "does not exist", 1),
         (("no_such_bag", "--method", "guess"), "unknown method 'guess'", 2),
@@ -133,6 +136,7 @@ def test_what_does_not_fit_is_said_in_a_line(
     capsys, tmp_path, monkeypatch, arguments, complaint, status
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.html").mkdir()
     found, out, err = run(capsys, *arguments)
     assert (found, out) == (status, "")
     assert complaint in err

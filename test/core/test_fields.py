@@ -50,7 +50,8 @@ UNTOLD = {
     (LimitCycle, "std"),
 }
 POSITIVE = st.floats(1e-3, 1e3)
-TEXTS = st.text(max_size=5)
+# What is unprintable comes back visible.
+TEXTS = st.text(max_size=5).filter(str.isprintable)
 WORDS = st.text(string.ascii_lowercase, min_size=1, max_size=5)
 
 

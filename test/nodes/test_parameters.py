@@ -18,6 +18,8 @@ LENGTH = Quantity("length", 1.0, "m", 0.5, 2.0).means("How long.")
 LIMIT = Quantity("limit", math.inf, "y").means("Where it ends.")
 OPTIONAL = Quantity("optional", math.nan, "y").means("Perhaps.")
 WORD = Quantity("word", "a", choices=("a", "b")).means("Which.")
+TIME = Quantity("time", 0.0, "s").means("When.")
+COUNT = Quantity("count", 0, lower=0).means("How many.")
 LIST = Quantity("list", (), "s").means("Several.")
 
 
@@ -25,6 +27,7 @@ LIST = Quantity("list", (), "s").means("Several.")
     ("entry", "value"),
     [
         *((LENGTH, 0.5), (LENGTH, 2.0), (LIMIT, math.inf), (LIMIT, -3.0)),
+        *((TIME, 0.0), (TIME, 1e-9), (TIME, -1e9), (COUNT, 10**20)),
         *((OPTIONAL, math.nan), (OPTIONAL, 0.0), (WORD, "b"), (LIST, []), (LIST, [1.0, 2.0])),
     ],
 )
@@ -40,6 +43,12 @@ def test_what_may_be(entry: Quantity, value: object) -> None:
         (LIMIT, math.nan, "limit is nan, expected any number [y]"),
         (LIMIT, -math.inf, "limit is -inf, expected a finite number"),
         (OPTIONAL, math.inf, "optional is inf, expected a finite number, or NaN where"),
+        (OPTIONAL, -1e153, "optional is -1e+153, expected a number of at most 1e+152"),
+        (TIME, 1e-10, "time is 1e-10, expected a time from 1e-09 to 1e+09 s, or 0"),
+        (TIME, -1e300, "time is -1e+300, expected a time from 1e-09 to 1e+09 s, or 0"),
+        (COUNT, 10**400, "count is a number of many digits, expected at least 0"),
+        (COUNT, True, "count is True, expected at least 0"),
+        (TIME, "9" * 400, f"time is '{'9' * 59}, expected any number [s]"),
         (WORD, "c", "word is 'c', expected one of a, b"),
         (LIST, [1.0, math.nan], "list is [1.0, nan], expected finite numbers"),
     ],

@@ -15,9 +15,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from loop_rig import RELIABLE, Rig
 from std_msgs.msg import Float64
 
+from relay_autotune.bag.reader import read_experiments
+from relay_autotune.record.record import Outcome
 from relay_autotune_msgs.msg import RelayExperiment
 
 LOOP = {
@@ -157,6 +160,37 @@ def test_a_terminal_that_is_closed_cancels(rig: Rig) -> None:
     tune.until_safe()
     assert "cancelled" in ended.reason
     assert tune.shown.wait() == 1
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=pytest.mark.nightly)]
+)
+def test_a_model_that_takes_for_ever_is_not_waited_for(rig: Rig, number: int) -> None:
+    quick = {"mode": "lockstep", "lockstep_speed": 50.0, "seed": 3}
+    rig.start("plant_node", *NAMED, **quick, **LOOP)
+    relay = rig.start(
+        "relay_node", *NAMED, amplitude=0.5, baseline=1.0, sample_period=0.1,
+        record_directory=str(rig.records), model_timeout=600.0,
+    )  # fmt: skip
+    code = """
+import sys, threading
+from relay_autotune.nodes import identifier
+identifier.analyse = lambda *_, **__: threading.Event().wait()
+sys.argv += ["--ros-args", "-r", "__ns:=/tank"]
+sys.exit(identifier.main())
+"""
+    rig.start_python("identifier", code)
+    ready(rig)
+    shown = rig.start_command("tune_loop", "--namespace", "tank", "--json", "--report", "a.html")
+    rig.until(lambda: "computing the model" in shown.log, "the computation")
+    shown.signal(number)
+    assert shown.wait() == 1
+    assert "no report: the tune was cancelled" in shown.log
+    assert '"outcome": "cancelled"' in shown.log
+    # The recording is whole, and the node is ready for the next tune.
+    rig.until(lambda: "without transfer_function and pi_gains: cancelled" in relay.log, "its end")
+    (record,) = read_experiments(next(rig.records.iterdir())).experiments
+    assert record.outcome == Outcome.COMPLETED
 
 
 def test_the_end_of_relay_node_is_told_with_its_reason(rig: Rig) -> None:

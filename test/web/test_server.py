@@ -5,8 +5,14 @@
 
 import asyncio
 import re
+import socket
+import struct
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import product
 from urllib.error import HTTPError
+from urllib.parse import quote
 from urllib.request import Request, urlopen
 
 import pytest
@@ -16,6 +22,7 @@ from tornado.httpclient import HTTPClientError
 from relay_autotune.errors import SelectionError
 from relay_autotune.verdict import Judgement
 from relay_autotune.web.address import Address, address_of
+from relay_autotune.web.live import Live
 from relay_autotune.web.server import Page, serve
 from relay_autotune.web.shape import Asked, Subject
 
@@ -94,6 +101,86 @@ def test_the_socket_tells_everything_and_answers(url, subject):
 )  # fmt: skip
 def test_a_question_that_cannot_be_ends_the_connection(url, question):
     assert conversation(url, question)[-1] is None
+
+
+LONG = "9" * 400
+WISHES = (
+    '{"do": "start", "loop": 1e400}', '{"do": ["start"]}', '"do"', '["do"]', '{"do": "explode"}',
+    '{"do": "apply", "of": -1}', f'{{"do": "verify", "step": {LONG}}}',
+    '{"do": "verify", "step": NaN}', '{"do": "verify", "step": 1e300}',
+    '{"do": "verify", "step": true}', '{"do": "apply", "asked": {"sample_period": 1e-300}}',
+)  # fmt: skip
+
+
+IMPOSSIBLE = ("1e300", "1e400", LONG, "-1", "NaN", "true", '"0.1"', "[]", "{}", "-1e-9")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("sample_period", "1e-300"),
+        *product(("sample_period", "noise_share", "ms", "setpoint_weight"), IMPOSSIBLE),
+    ],
+)
+def test_each_number_has_the_range_of_its_declaration(url, name, value, capfd):
+    asked = f'{{"{name}": {value}}}'
+    assert conversation(url, f'{{"of": 0, "n": 1, "asked": {asked}}}')[-1] is None
+    assert get(f"{url}report.html?asked={quote(asked)}")[0] == 400
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("wish", WISHES)
+def test_a_wish_that_cannot_be_ends_the_connection(subject, wish, capfd):
+    live = Live("/relay_node")
+    with served([subject], live=live) as url:
+        assert conversation(url, wish, {"of": 0, "n": 1, "asked": {}})[-1] is None
+    assert live.next_wish() is None
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "query", ["&".join(f"f{k}=1" for k in range(50)), f"of={LONG}", "of=%ff", "asked=%00", "of=-1"]
+)
+def test_a_query_that_cannot_be_is_no_defect(url, query, capfd):
+    assert get(f"{url}report.html?{query}")[0] == 400
+    assert get(f"{url}gains/yaml?{query}")[0] == 400
+    assert capfd.readouterr().err == ""
+
+
+def test_sockets_that_vanish_are_no_defect(url, capfd):
+    host, port = url.removeprefix("http://").strip("/").split(":")
+    for _ in range(20):
+        with socket.create_connection((host, int(port))) as end:
+            end.sendall(
+                b"GET /socket HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
+                b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n\x81\xff"
+            )
+            end.recv(10)
+            # What was not read makes the end a reset.
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    assert get(url)[0] == 200
+    assert capfd.readouterr().err == ""
+
+
+def test_no_page_waits_for_the_question_of_another_one(subject):
+    class Slow(Subject):
+        begun, over = threading.Event(), False
+
+        def shaped(self, asked):
+            while asked.ms == 2.0 and not self.over:
+                self.begun.set()
+            return super().shaped(asked)
+
+    slow = Slow(subject.case, subject.shaping, subject.first, subject.command)
+    with served([slow]) as url, ThreadPoolExecutor() as pool:
+        first = pool.submit(conversation, url, {"of": 0, "n": 1, "asked": {"ms": 2.0}})
+        assert slow.begun.wait(60.0)
+        answer = conversation(url, {"of": 0, "n": 2, "asked": {"ms": 1.5}})[1]
+        assert answer["answer"]["shaped"]["ms"] <= 1.5
+        assert not first.done()
+        Slow.over = True
+        assert "shaped" in first.result()[1]["answer"]
 
 
 def test_five_pages_at_once_have_answers_of_their_own(url):
