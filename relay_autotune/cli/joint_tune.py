@@ -38,7 +38,6 @@ from relay_autotune.nodes.live_types import CommandMessage, message_class
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune.nodes.ros2_control import (
     COMMAND_TYPE,
-    GAINS,
     STATE_TYPE,
     ControllerManager,
     ManagedController,
@@ -186,8 +185,8 @@ class JointTune:
 
     @property
     def _places(self) -> str:
-        first, *others = self._loop.parameters
-        return "/".join([first, *(name[-1] for name in others)])
+        first, *others = self._loop.places.values()
+        return "/".join([first, *(name.rpartition(".")[2] for name in others)])
 
     def _notes(self) -> Iterator[tuple[str, str]]:
         """Say what the controller's settings do to the gains."""
@@ -199,12 +198,8 @@ class JointTune:
             "antiwindup",
             {
                 "back_calculation": "back_calculation: at a u_clamp the integral gives way within "
-                + (
-                    f"tracking_time_constant {loop.tracking_time_constant:g} s, which stays"
-                    if loop.tracking_time_constant
-                    else "a time that follows from the new gains"
-                )
-                + limited,
+                "tracking_time_constant, which is set with the gains: sqrt(d/i), without "
+                "derivative action p/i" + limited,
                 "conditional_integration": "conditional_integration: no integration at a u_clamp"
                 + limited,
                 "none": "none: the integral winds up at a limit of the command",
@@ -455,8 +450,10 @@ class JointTune:
 
         :raises LoopError: if it does not answer.
         """
-        p, i, d = self._client.values(self._loop.node, self._loop.parameters).values()
-        return controller_of({"p": p, "i": i, "d": d}) if p else None
+        places = self._loop.places
+        values = self._client.values(self._loop.node, list(places.values()))
+        found = {gain: values[place] for gain, place in places.items()}
+        return controller_of(found) if found["p"] else None
 
     def apply(self, nodes: OwnNodes, doubt: str) -> int:
         """Offer the gains to the controller, verify them, and return the exit status.
@@ -469,7 +466,7 @@ class JointTune:
         loop = self._loop
         if loop.why_not_moved:
             return self._set()
-        places = ",".join(map("{}:{}".format, GAINS, loop.parameters))
+        places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
         topics, values = self._at_controller()
         values |= {
             "apply_to": loop.node,
@@ -495,8 +492,8 @@ class JointTune:
         found = client.result
         gains = gains_from_message(found.gains)
         model = transfer_function_from_message(found.transfer_function)
-        before = client.values(loop.node, loop.parameters)
-        wanted = {name: float(getattr(gains, name[-1])) for name in loop.parameters}
+        before = client.values(loop.node, list(loop.places.values()))
+        wanted = {place: float(getattr(gains, name)) for name, place in loop.places.items()}
         print("\n".join(beside(self.present(), gains, model)))
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
         if not agrees(question, yes=self._options.yes):

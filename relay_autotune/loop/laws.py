@@ -458,17 +458,6 @@ class LawRate:
         return self.law.at(self.law.best(gains, self.period), self.period)
 
 
-def _tracking(law: SampledLaw) -> float | None:
-    """Return the time constant that control_toolbox would use for 0.
-
-    It is written out, since versions of its documentation differ.
-    """
-    gains = law.gains
-    if gains.ti == 0.0:
-        return None
-    return math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
-
-
 def _gains(
     names: str, fields: str = "p i d", of: Callable[[float], float] = lambda gain: gain
 ) -> tuple[Setting, ...]:
@@ -516,7 +505,9 @@ def _control_toolbox(
 _BACK_CALCULATION = _control_toolbox(
     "back_calculation",
     "I also gets h (u limited - u)/tracking_time_constant",
-    Setting("tracking_time_constant", _tracking),
+    # That which control_toolbox takes for 0; written out, since a program that runs keeps the one
+    # of the gains before.
+    Setting("tracking_time_constant", lambda law: law.gains.tracking or None),
 )
 
 _ROWS = (

@@ -375,7 +375,6 @@ LAWS = {
 # What is read of each degree of freedom, with the value that it has where it is not declared.
 _OPTIONAL: dict[str, Any] = {
     "antiwindup_strategy": "legacy",
-    "tracking_time_constant": 0.0,
     "save_i_term": False,
     "feedforward_gain": 0.0,
     "ff_velocity_scale": 0.0,
@@ -441,7 +440,6 @@ class JointLoop(_Parts):
     :param is_simulated: True if the robot runs on /clock.
     :param gains: p, i and d in force.
     :param strategy: against windup.
-    :param tracking_time_constant: of that strategy [s]; 0: control_toolbox's own.
     :param save_i_term: True if the integral outlives a deactivation.
     :param feedforward: gain from the reference to the command [u/y]; 0: none.
     :param wraps: True if the error is wrapped to half a turn.
@@ -462,7 +460,6 @@ class JointLoop(_Parts):
     is_simulated: bool
     gains: tuple[float, float, float]
     strategy: str
-    tracking_time_constant: float
     save_i_term: bool
     feedforward: float
     wraps: bool
@@ -512,9 +509,13 @@ class JointLoop(_Parts):
         return f"values[{self.joint}]"
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """The controller's parameters that hold p, i and d."""
-        return tuple(f"gains.{self.dof}.{name}" for name in GAINS)
+    def places(self) -> dict[str, str]:
+        """The controller's parameter for each gain that is set."""
+        names = dict(zip(GAINS, GAINS, strict=True))
+        if self.strategy == "back_calculation":
+            # A pid_controller that runs takes it from new gains only where it is set with them.
+            names["tracking"] = "tracking_time_constant"
+        return {gain: f"gains.{self.dof}.{name}" for gain, name in names.items()}
 
     @property
     def reference_alone(self) -> str:
@@ -587,7 +588,6 @@ def joint_loop(
         is_simulated=client.values(node, ["use_sim_time"])["use_sim_time"],
         gains=(own["p"], own["i"], own["d"]),
         strategy=own["antiwindup_strategy"],
-        tracking_time_constant=own["tracking_time_constant"],
         save_i_term=own["save_i_term"],
         feedforward=own[parts.feeds] if parts.feeds else 0.0,
         wraps=own["angle_wraparound"]
@@ -705,8 +705,8 @@ def put_gains(
 
 
 def told(gains: Mapping[str, float]) -> str:
-    """Return gains in words, by the last letter of their parameters."""
-    return ", ".join(f"{name[-1]} {value:.6g}" for name, value in gains.items())
+    """Return gains in words, by the last part of their parameters."""
+    return ", ".join(f"{n.rpartition('.')[2]} {value:.6g}" for n, value in gains.items())
 
 
 def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:

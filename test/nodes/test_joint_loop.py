@@ -18,7 +18,7 @@ from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.gains_place import controller_of
+from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.ros2_control import (
     LAWS,
     TRAJECTORY_CONTROLLER,
@@ -249,12 +249,26 @@ def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:
     loop = joint_loop(arm, arm, "arm", "arm_2")
     assert loop.joints == loop.dofs == ("arm_1", "arm_2")
     assert (loop.interface, loop.measured, loop.period) == ("arm_2/effort", "position", 0.01)
-    assert loop.parameters == ("gains.arm_2.p", "gains.arm_2.i", "gains.arm_2.d")
+    assert loop.places == {name: f"gains.arm_2.{name}" for name in "pid"}
     assert (loop.gains, loop.feedforward) == ((5.0, 1.0, 0.5), 0.7)
     assert (loop.law, loop.has_rate, loop.wraps) == ("control_toolbox_none", True, True)
     # By the names of the message, whatever their order.
     assert loop.state == DofState(0.2, pytest.approx(0.25), pytest.approx(3.0))
     assert loop.why_not_moved == "its references are trajectories"
+
+
+def test_with_back_calculation_its_time_goes_with_the_gains() -> None:
+    # A pid_controller that runs would keep the one that it computed from the gains before.
+    arm = Arm(**{"gains.arm_2.antiwindup_strategy": "back_calculation"})
+    places = joint_loop(arm, arm, "arm", "arm_2").places
+    assert places["tracking"] == "gains.arm_2.tracking_time_constant"
+    gains = Controller(2.0, 0.9, 0.4)
+    given = {name: getattr(gains, name) for name in places}
+    assert set(mapping_of(",".join(map(":".join, places.items())))) == set(given)
+    law = ToolboxPid(gains.p, gains.i, gains.d, "back_calculation")
+    assert given["tracking"] == pytest.approx(law.tracking())
+    assert Controller(2.0, 0.9).tracking == 0.9
+    assert Controller(2.0, 0.0, 0.4).tracking == 0.0
 
 
 def test_the_trajectory_to_type_holds_numbers_also_where_a_joint_is_almost_at_zero() -> None:
