@@ -324,7 +324,7 @@ class AfterTune:
         if joint is not None and joint.applies:
             assert self.nodes is not None
             print()
-            proven = joint.apply(self.nodes, written.doubt) == DONE
+            proven = joint.apply(self.client, self.nodes, written.doubt) == DONE
         return proven, steps
 
     def _asked(self, first: _Written, against: str) -> tuple[_Written, str]:
@@ -453,10 +453,8 @@ class AfterTune:
         :param against: what speaks against the gains; empty: nothing.
         """
         assert self.nodes is not None
-        try:
-            self.nodes.require_alive()
-        except RelayAutotuneError as error:
-            say(PROGRAM, f"{error}: the last command stays in force; see to the plant")
+        if why := self.nodes.why_lost():
+            say(PROGRAM, f"{why}: the last command stays in force; see to the plant")
             return
         then = (
             "do not start a controller with these gains, they are not proven"
@@ -566,10 +564,9 @@ class _Proof:
             try:
                 with Working(f"starting {name}"):
                     loop.find(START_WITHIN)
-                    nodes.require_alive()
                     loop.put_in_force(client.result.gains)
                 patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
-                with _noted(nodes) as leave:
+                with _noted() as leave:
                     found = loop.prove(step, 0.0, self._settles, patience, shown, leave)
                     loop.let_settle(self._settles, shown, "the loop goes back", leave)
             finally:
@@ -585,26 +582,20 @@ class _Proof:
 
 
 @contextmanager
-def _noted(nodes: OwnNodes) -> Iterator[Callable[[], bool]]:
+def _noted() -> Iterator[Callable[[], bool]]:
     """Only note signals in the block, and obey them after it.
 
     An exception could be lost in a callback of rclpy.
 
-    :param nodes: of this command.
-    :return: what tells whether one has come, and raises LoopError if a node has ended.
+    :return: what tells whether one has come.
     """
     came: list[int] = []
-
-    def leave() -> bool:
-        nodes.require_alive()
-        return bool(came)
-
     before = {
         number: signal.signal(number, lambda n, _: came.append(n))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     }
     try:
-        yield leave
+        yield lambda: bool(came)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -40,6 +40,7 @@ from relay_autotune.text import digits, duration
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller, Gains, Performance
     from relay_autotune.nodes.gains_client import GainsClient
+    from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.process.transfer_function import TransferFunction
 
 PROGRAM = "apply_gains"
@@ -127,10 +128,11 @@ def _work(options: argparse.Namespace) -> int:
         return apply_and_verify(client, options)
 
 
-def apply_at(name: str, *, doubtful: bool, yes: bool, patience: float) -> int:
+def apply_at(name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patience: float) -> int:
     """Offer the newest gains to a controller_node that ends with this command.
 
     :param name: its full name.
+    :param beside: a client of its loop.
     :param doubtful: True: also gains whose verdict is not trusted.
     :param yes: True: do not ask.
     :param patience: how long to look for it [s].
@@ -138,10 +140,9 @@ def apply_at(name: str, *, doubtful: bool, yes: bool, patience: float) -> int:
     """
     from relay_autotune.nodes.gains_client import GainsClient
 
-    namespace, _, node = name.rpartition("/")
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
     options.yes, options.stays = yes, False
-    with GainsClient(namespace, node) as client:
+    with GainsClient("", name, beside) as client:
         with Working(f"looking for {name}"):
             client.find(patience)
         return apply_and_verify(client, options)

@@ -22,6 +22,7 @@ from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
     OwnNodes,
+    namespace_of_joint,
     own_namespace,
     own_node,
     ranges,
@@ -35,6 +36,7 @@ from relay_autotune.exchange.messages import gains_from_message, transfer_functi
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_place import controller_of
 from relay_autotune.nodes.live_types import CommandMessage, message_class
+from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune.nodes.ros2_control import (
     COMMAND_TYPE,
@@ -60,19 +62,23 @@ _PROOF = 0.05
 class JointTune:
     """A joint that is to be tuned.
 
-    :param client: a node of the graph.
-    :param options: with the flags of `add_joint` and `add_new_loop`.
+    :param client: a node of the graph; it goes on where a node of this command is lost.
+    :param options: with the flags of `add_joint` and `add_new_loop`; the namespace of the nodes is
+        set in it.
     :raises LoopError: if the loop is not there, or something is not known and nobody can be asked.
     """
 
-    def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
+    def __init__(self, client: LoopClient, options: argparse.Namespace) -> None:
         self._client, self._options = client, options
-        self._space = own_namespace(options)
         self._forward: ManagedController | None = None
         self._former: tuple[str, ...] = ()
         with Working(f"looking at {options.controller}"):
-            self._manager = ControllerManager(client, options.controller_manager, options.wait)
-            self._loop = joint_loop(client, self._manager, options.controller, options.joint)
+            space, slash, controller = options.controller.rpartition("/")
+            within = f"/{space.strip('/')}".rstrip("/") if slash else None
+            self._manager = ControllerManager(
+                client, options.controller_manager, within, options.wait
+            )
+            self._loop = joint_loop(client, self._manager, controller, options.joint)
             if options.open:
                 loaded = self._manager.controllers()
                 self._forward = forwarding(
@@ -81,6 +87,9 @@ class JointTune:
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
         loop = self._loop
+        if not options.namespace:
+            options.namespace = namespace_of_joint(loop.node, loop.joint)
+        self._space = own_namespace(options)
         if loop.why_not_moved and not options.open:
             raise LoopError(f"{loop.controller} stays as it is: {self._why_not_closed()}")
         if not options.open and not math.isfinite(loop.state.reference):
@@ -144,7 +153,11 @@ class JointTune:
         return list(map(str, lines))
 
     def show(self) -> None:
-        """Print the plan."""
+        """Print the plan, some seconds after the first look.
+
+        :raises LoopError: if another robot was found meanwhile, which may be the one meant.
+        """
+        self._manager.require_alone()
         print("\n".join(check_lines(self.plan(), width())), file=sys.stderr, flush=True)
 
     def _moves(self) -> Iterator[tuple[str, str]]:
@@ -455,9 +468,10 @@ class JointTune:
         found = {gain: values[place] for gain, place in places.items()}
         return controller_of(found) if found["p"] else None
 
-    def apply(self, nodes: OwnNodes, doubt: str) -> int:
+    def apply(self, client: TuneClient, nodes: OwnNodes, doubt: str) -> int:
         """Offer the gains to the controller, verify them, and return the exit status.
 
+        :param client: with the result of the tune.
         :param nodes: of this command.
         :param doubt: why they are doubtful; empty: they are trusted.
         """
@@ -465,7 +479,7 @@ class JointTune:
             raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
         loop = self._loop
         if loop.why_not_moved:
-            return self._set()
+            return self._set(client)
         places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
         topics, values = self._at_controller()
         values |= {
@@ -481,15 +495,16 @@ class JointTune:
         nodes.start("controller_node", ros_arguments(self._space, topics, values))
         return apply_at(
             own_node(self._options, "controller_node"),
+            client,
             doubtful=bool(doubt),
             yes=self._options.yes,
             patience=START_WITHIN,
         )
 
-    def _set(self) -> int:
+    def _set(self, tuned: TuneClient) -> int:
         """Set the gains of a controller whose references nobody can move; return the status."""
         loop, client = self._loop, self._client
-        found = client.result
+        found = tuned.result
         gains = gains_from_message(found.gains)
         model = transfer_function_from_message(found.transfer_function)
         before = client.values(loop.node, list(loop.places.values()))

@@ -19,13 +19,12 @@ import argparse
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from relay_autotune.cli.arguments import (
     NOTHING_FOUND,
-    USAGE,
     add_web,
     check_web,
     finite,
@@ -45,11 +44,14 @@ from relay_autotune.cli.own_nodes import (
 )
 from relay_autotune.cli.terminal import Help, Working, agrees, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
-from relay_autotune.errors import ParameterError
+from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 
 if TYPE_CHECKING:
+    from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.nodes.tune_client import TuneClient
+
+_Client = TypeVar("_Client", bound="LoopClient")
 # Parts of the checklist's lines on rest while few samples have come, and on the model while
 # identifier_node is not discovered.
 NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
@@ -150,6 +152,7 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     heed(signal.SIGINT)
     # Imported here, so that --help does not load rclpy.
     from relay_autotune.nodes.lifetime import ending_signals, never_wait_for
+    from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.nodes.tune_client import TuneClient
 
     if options.report:
@@ -159,41 +162,43 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
     if options.web:
         check_web(options)
     of_joint = is_of_joint(options)
-    if of_joint:
-        from relay_autotune.cli.joint_tune import JointTune
     new = of_joint or is_new_loop(options)
-    try:
-        namespace = own_namespace(options) if new else options.namespace
-        spaces = namespace.split(",") if options.web else [namespace]
-        with Working("joining the ROS graph"):
-            clients = [TuneClient(space, options.node, ros) for space in spaces]
-    except ParameterError as error:
-        say(PROGRAM, str(error))
-        return USAGE
-    client = clients[0]
     with ExitStack() as stack:
-        for each in clients:
-            stack.enter_context(each)
-        patience, joint, nodes = options.wait, None, None
+
+        def joined(kind: Callable[..., _Client], *arguments: Any) -> _Client:
+            try:
+                with Working("joining the ROS graph"):
+                    found = kind(*arguments)
+            except ParameterError as error:
+                raise SelectionError(str(error)) from None
+            stack.enter_context(found)
+            return found
+
+        patience, robot, joint, nodes = options.wait, None, None, None
+        if of_joint:
+            from relay_autotune.cli.joint_tune import JointTune
+
+            robot = joined(LoopClient, own_namespace(options), "", options.node, ros)
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            joint = JointTune(client, options) if of_joint else None
+            joint = JointTune(robot, options) if robot else None
+        namespace = own_namespace(options) if new else options.namespace
+        spaces = namespace.split(",") if options.web else [namespace]
+        clients = [joined(TuneClient, space, options.node, ros, robot) for space in spaces]
+        client = clients[0]
+        if new:
             nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
+            client.why_lost = nodes.why_lost
             patience = max(patience, START_WITHIN)
         deadline = time.monotonic() + patience
-
-        def leave() -> bool:
-            if nodes is not None:
-                nodes.require_alive()
-            return bool(interrupted)
 
         for each in clients:
             with Working(f"{'starting' if new else 'looking for'} {each.name}"):
                 each.find(
                     patience,
                     needs_identifier=not (options.dry_run or options.record_only),
-                    leave=leave,
+                    leave=lambda: bool(interrupted),
                 )
         if joint:
             joint.show()

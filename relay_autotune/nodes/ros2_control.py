@@ -92,37 +92,51 @@ class ControllerManager:
 
     :param client: a node of the graph.
     :param name: full name of the manager; empty: the only one that is there.
+    :param within: its namespace; None: any.
     :param patience: how long to wait for it [s].
     :raises LoopError: if it is not there, or its messages are not installed.
     """
 
-    def __init__(self, client: LoopClient, name: str, patience: float) -> None:
+    def __init__(self, client: LoopClient, name: str, within: str | None, patience: float) -> None:
         self.client = client
         """The node of the graph that asks it."""
         self._kinds = {
             kind: interface_class("controller_manager_msgs", "srv", kind)
             for kind in ("ListControllers", "ListHardwareInterfaces", "SwitchController")
         }
-        wanted = f"/{name.strip('/')}" if name else ""
-        there: list[str] = []
-
-        def is_there() -> bool:
-            there[:] = client.owners(_LIST)
-            return wanted in there if wanted else bool(there)
-
-        if not client.wait(is_there, patience):
+        self._wanted = f"/{name.strip('/')}" if name else ""
+        self._within = within
+        if not client.wait(lambda: bool(self._meant()), patience):
+            where = self._wanted or (f"in {within or '/'}" if within is not None else "")
+            there = ", ".join(client.owners(_LIST)) or "none"
             raise LoopError(
-                f"no controller_manager {wanted or ''} within {patience:g} s, of those that "
-                f"list_controllers: {', '.join(there) or 'none'}; type --controller-manager NAME"
+                f"no controller_manager {where} within {patience:g} s, of those that "
+                f"list_controllers: {there}; type --controller-manager NAME"
             )
-        if not wanted and len(there) > 1:
-            raise LoopError(
-                f"several controller_managers are there: {', '.join(there)}; type "
-                f"--controller-manager with one of them"
-            )
-        self.name = wanted or there[0]
+        self.require_alone()
+        (self.name,) = self._meant()
         self.namespace = self.name.rpartition("/")[0]
         """Namespace of the manager and of its controllers."""
+
+    def _meant(self) -> list[str]:
+        """Return the full names of the managers that may be meant."""
+        return [
+            each
+            for each in self.client.owners(_LIST)
+            if self._wanted in ("", each) and self._within in (None, each.rpartition("/")[0])
+        ]
+
+    def require_alone(self) -> None:
+        """Refuse to choose between several managers, the second of which may be found later.
+
+        :raises LoopError: with their names.
+        """
+        if len(meant := self._meant()) > 1:
+            raise LoopError(
+                f"several controller_managers are there: {', '.join(meant)}; type "
+                f"--controller-manager with one of them, or its namespace before the controller, "
+                f"such as --controller {meant[0].rpartition('/')[0]}/NAME"
+            )
 
     def node_of(self, controller: str) -> str:
         """Return the full name of a controller's node."""

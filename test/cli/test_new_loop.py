@@ -22,9 +22,11 @@ from made_experiments import record_of
 from relay_autotune.cli import report, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.own_nodes import (
+    OwnNodes,
     add_new_loop,
     is_new_loop,
     is_of_joint,
+    namespace_of_joint,
     nodes_for,
     with_flags,
 )
@@ -33,6 +35,7 @@ from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.live_types import FLOAT64
+from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
@@ -40,6 +43,27 @@ from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains
+
+
+def test_the_last_line_of_a_node_that_died_ends_every_wait_for_it() -> None:
+    with OwnNodes() as nodes:
+        # It finds nothing to run.
+        nodes.start("missing_node", [])
+        client: Any = LoopClient.__new__(LoopClient)
+        client._executor = SimpleNamespace(spin_once=lambda timeout_sec: None)
+        client.why_lost = nodes.why_lost
+        with pytest.raises(LoopError, match="missing_node has ended: ImportError: cannot import"):
+            client.wait(lambda: False, 60.0)
+        assert client.wait(lambda: True, 0.0)
+
+
+def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:
+    joints = ("odd/name", "odd_name", "odd__name", "odd__2f_name", "odd-name", "_", "__", "ö", "")
+    controllers = ("/wheel_pid", "/robot1/wheel_pid", "/robot2/wheel_pid")
+    found = [namespace_of_joint(each, joint) for each in controllers for joint in joints]
+    assert len(set(found)) == len(found)
+    assert all(re.fullmatch(r"(/[A-Za-z_][0-9A-Za-z_]*)+", each) for each in found)
+    assert namespace_of_joint("/wheel_pid", "left_wheel") == "/wheel_pid/tune_left_wheel"
 
 
 class Looker:
@@ -281,7 +305,7 @@ def shown(
     given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
     given.at, given.within, given.command_within = 35.0, [0.0, 90.0], [0.0, 100.0]
     words = ["-r", "__ns:=/tune_loop_1", "-r", "command:=/tank/valve", "-p", "baseline:=35.0"]
-    nodes: Any = SimpleNamespace(require_alive=lambda: None, arguments=lambda name: words)
+    nodes: Any = SimpleNamespace(why_lost=lambda: "", arguments=lambda name: words)
     monkeypatch.chdir(tmp_path)
 
     def analysed(_: Any, values: dict[str, Any], __: Any) -> Any:
@@ -402,6 +426,6 @@ def test_a_publisher_of_its_own_that_has_ended_is_no_reason_to_give_up(other, pa
     reason = f"/u is also published by {other}: two of them would fight for the actuator"
     client: Any = SimpleNamespace(
         succeeded=False, result=Tune.Result(reason=reason),
-        _node=SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop"),
+        _first=SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop"),
     )  # fmt: skip
     assert TuneClient.not_ready_yet.fget(client) is passes

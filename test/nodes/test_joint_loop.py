@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,7 @@ from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.ros2_control import (
     LAWS,
     TRAJECTORY_CONTROLLER,
+    ControllerManager,
     DofState,
     ManagedController,
     above,
@@ -187,6 +189,32 @@ def test_gains_are_set_all_or_none_and_those_before_come_back(answers, told) -> 
     with pytest.raises(LoopError, match=told):
         put_gains(client, "/arm", wanted, before)
     assert client.has == (wanted if "refuses: set" in told else before)
+
+
+@pytest.mark.parametrize(
+    ("name", "within", "there", "found"),
+    [
+        ("", None, ["/controller_manager"], "/controller_manager"),
+        ("", "/b", ["/a/cm", "/b/cm"], "/b/cm"),
+        ("", "", ["/cm", "/b/cm"], "/cm"),
+        ("a/cm", None, ["/a/cm", "/b/cm"], "/a/cm"),
+        ("a/cm", "/b", ["/a/cm", "/b/cm"], "no controller_manager /a/cm within 0 s"),
+        ("", "/c", ["/a/cm", "/b/cm"], "no controller_manager in /c within 0 s"),
+        ("", None, ["/a/cm", "/b/cm"], "/a/cm, /b/cm; type .* such as --controller /a/NAME"),
+    ],
+)
+def test_the_manager_is_the_only_one_that_may_be_meant(name, within, there, found) -> None:
+    client = SimpleNamespace(owners=lambda _: there, wait=lambda condition, _: condition())
+    if not found.startswith("/") or ";" in found:
+        with pytest.raises(LoopError, match=found):
+            ControllerManager(client, name, within, 0.0)
+        return
+    manager = ControllerManager(client, name, within, 0.0)
+    assert (manager.name, manager.namespace) == (found, found.rpartition("/")[0])
+    # A second robot may be discovered after the first.
+    there.append("/late/cm")
+    with pytest.raises(LoopError, match="late") if not name and within is None else nullcontext():
+        manager.require_alone()
 
 
 class Arm:
