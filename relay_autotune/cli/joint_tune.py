@@ -51,8 +51,9 @@ from relay_autotune.nodes.ros2_control import (
     told,
 )
 from relay_autotune.nodes.tune_client import TuneClient
+from relay_autotune_msgs.action import Tune
 
-_JOINT_STATES = "/joint_states"
+_JOINT_STATES = "joint_states"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _FLOATS = "std_msgs/msg/Float64MultiArray"
 # Height of the trajectory that verifies gains by hand, as a part of the joint's range.
@@ -307,7 +308,7 @@ class JointTune:
         assert self._forward is not None
         loop, options, client = self._loop, self._options, self._client
         kind, field = _JOINT_STATE, f"{loop.measured}[{loop.joint}]"
-        topic = options.measurement or _JOINT_STATES
+        topic = options.measurement or self._manager.node_of(_JOINT_STATES)
         found = client.kind_of(topic, options.wait, published=True)
         if options.measurement and options.field != "data":
             kind, field = found, options.field
@@ -385,30 +386,36 @@ class JointTune:
 
     def _position_of(self, joint: str) -> float:
         kind = message_class(_JOINT_STATE, "measurement_type")
-        for message in self._client.heard(kind, _JOINT_STATES, 0.0, 1):
+        for message in self._client.heard(kind, self._manager.node_of(_JOINT_STATES), 0.0, 1):
             if joint in message.name:
                 return float(message.position[list(message.name).index(joint)])
         return math.nan
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[], str]]:
-        """Open the loop for a tune if that is asked for, and close it however the tune ends.
+    def opened(self) -> Iterator[Callable[[int], str]]:
+        """Open the loop for a tune if that is asked for, and close it as soon as the relay ends.
 
-        :return: what tells why the tune has to end; empty: it goes on.
+        :return: to be told the state of the tune at each look, tells why the tune has to end;
+            empty: it goes on.
         """
-        if self._forward is None:
-            yield self._manager.still_active(self._loop.controller)
-            return
-        try:
-            # Controllers that command 0 when they are switched off leave it to the next one.
-            with ExitStack() as stack:
+        loop, forward = self._loop, self._forward
+        # It is closed with the block, however that ends.
+        with ExitStack() as stack:
+            if forward is not None:
+                stack.callback(self._give_references_back)
+                # Controllers that command 0 when they are switched off leave it to the next one.
                 with self._client.publishing(*self._first_command()) as command:
-                    stack.enter_context(Opened(self._manager, self._forward.name, self._former))
+                    stack.enter_context(Opened(self._manager, forward.name, self._former))
                     command()
-                yield self._manager.still_active(self._forward.name)
-        finally:
-            if why := self._why_no_references():
-                say(PROGRAM, why)
+            why_lost = self._manager.still_active(forward.name if forward else loop.controller)
+
+            def why_over(state: int) -> str:
+                if state <= Tune.Feedback.STATE_RELAY:
+                    return why_lost()
+                stack.close()
+                return ""
+
+            yield why_over
 
     def _first_command(self) -> tuple[Any, str]:
         """Return the message of the first command, and its topic."""
@@ -417,18 +424,15 @@ class JointTune:
         message = CommandMessage(values["command_type"], values["command_field"], beside)
         return message.written(self._baseline), topics["command"]
 
-    def _why_no_references(self) -> str:
-        """Publish the references of before, which the controller forgets when it is switched.
-
-        :return: why it does not have them; empty: it has, or it cannot.
-        """
+    def _give_references_back(self) -> None:
+        """Publish the references of before, which the controller forgets when it is switched."""
         loop = self._loop
         active = False
         with suppress(LoopError):
             listed = self._manager.controllers()
             active = any(each.name == loop.controller and each.is_active for each in listed)
         if loop.why_not_moved or not active:
-            return ""
+            return
         reference = loop.state.reference
         commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
         states = message_class(STATE_TYPE, "measurement_type")
@@ -440,11 +444,11 @@ class JointTune:
         if math.isfinite(reference) and not self._client.publish(
             commands.written(reference), loop.reference_topic, states, loop.state_topic, is_back
         ):
-            return (
+            say(
+                PROGRAM,
                 f"{loop.controller} is active again, but does not take its former reference "
-                f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}"
+                f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}",
             )
-        return ""
 
     # The gains.
 

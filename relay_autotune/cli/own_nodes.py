@@ -180,10 +180,13 @@ class OwnNodes:
             with Working(f"ending {name}"):
                 _end([process])
 
-    def why_lost(self) -> str:
-        """Return which of them has ended by itself, with its last line; empty: none has."""
+    def why_lost(self, only: str = "") -> str:
+        """Return which of them has ended by itself, with its last line; empty: none has.
+
+        :param only: the one that is looked at; empty: all.
+        """
         for name, process in self._running.items():
-            if (status := process.poll()) is not None:
+            if only in ("", name) and (status := process.poll()) is not None:
                 by = f" ({signal.strsignal(-status)})" if status < 0 else ""
                 lines = self.log(name).strip().splitlines() or ["without a word"]
                 return f"{name} has ended{by}: {_PREFIX.sub('', lines[-1])}"

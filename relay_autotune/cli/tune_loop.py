@@ -223,7 +223,12 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         wait_again = never_wait_for(sys.stderr.fileno())
         opens = joint is not None and not options.dry_run
         try:
-            with joint.opened() if joint and opens else nullcontext(lambda: "") as why_over:
+            with joint.opened() if joint and opens else nullcontext(lambda _: "") as left:
+
+                def why_over(state: int) -> str:
+                    # A relay_node that is lost cannot be asked to end the tune.
+                    return left(state) or (nodes.why_lost("identifier_node") if nodes else "")
+
                 while True:
                     client.ask(options.amplitude, options.dry_run)
                     follow(client, shown, interrupted, why_over=why_over)

@@ -138,9 +138,9 @@ class ControllerManager:
                 f"such as --controller {meant[0].rpartition('/')[0]}/NAME"
             )
 
-    def node_of(self, controller: str) -> str:
-        """Return the full name of a controller's node."""
-        return f"{self.namespace}/{controller}"
+    def node_of(self, name: str) -> str:
+        """Return the full name of a node or a topic in the manager's namespace."""
+        return f"{self.namespace}/{name}"
 
     def controllers(self) -> tuple[ManagedController, ...]:
         """Return the controllers that are loaded.

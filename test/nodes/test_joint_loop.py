@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -34,6 +35,7 @@ from relay_autotune.nodes.ros2_control import (
     limits_in,
     put_gains,
 )
+from relay_autotune_msgs.action import Tune
 
 DESCRIPTION = """<?xml version="1.0"?>
 <robot name="arm">
@@ -215,6 +217,45 @@ def test_the_manager_is_the_only_one_that_may_be_meant(name, within, there, foun
     there.append("/late/cm")
     with pytest.raises(LoopError, match="late") if not name and within is None else nullcontext():
         manager.require_alone()
+
+
+class Switching:
+    """Stands for the manager of a base, which switches as it is told."""
+
+    def __init__(self) -> None:
+        self.active = {"pid"}
+
+    def controllers(self):
+        return tuple(
+            replace(c, state="active" if c.name in self.active else "off") for c in LOADED
+        )
+
+    def switch(self, on, off):
+        self.active = self.active - set(off) | set(on)
+
+    def still_active(self, name):
+        return lambda: "" if name in self.active else f"{name} is off"
+
+
+@pytest.mark.parametrize("is_open", [True, False])
+def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -> None:
+    manager, given = Switching(), []
+    publishing = nullcontext(lambda: given.append("command"))
+    tune = SimpleNamespace(
+        _loop=SimpleNamespace(controller="pid"), _manager=manager, _former=("pid",),
+        _forward=next(c for c in LOADED if c.name == "one") if is_open else None,
+        _first_command=lambda: ("rest", "/one/commands"),
+        _client=SimpleNamespace(publishing=lambda *_: publishing),
+        _give_references_back=lambda: given.append("references"),
+    )  # fmt: skip
+    with JointTune.opened(tune) as why_over:
+        assert why_over(Tune.Feedback.STATE_RELAY) == ""
+        assert manager.active == ({"one"} if is_open else {"pid"})
+        # The model is still to be computed.
+        assert why_over(Tune.Feedback.STATE_COMPLETED) == ""
+        assert manager.active == {"pid"}
+        assert why_over(Tune.Feedback.STATE_COMPLETED) == ""
+    assert given == ["command", "references"] * is_open
 
 
 class Arm:
