@@ -149,14 +149,15 @@ def apply_at(name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patien
 
 
 def _write(client: GainsClient, options: argparse.Namespace) -> int:
-    from relay_autotune.exchange.export import WITHOUT_LAW, Target, exported, exports_of
+    from relay_autotune.exchange.export import Target, exported, exports_of
+    from relay_autotune.loop.laws import LAWS
 
     gains, doubt = client.waiting()
     _require_trust(doubt, options)
     how = exports_of(gains.law)[0]
     write(exported(gains, how, Target(), doubt=doubt), options.file)
     load = f"; load it with ros2 param load /pid_controller {options.file}"
-    print(f"written for {how}: {options.file}{load if how == WITHOUT_LAW else ''}")
+    print(f"written for {how}: {options.file}{load if LAWS[how].sets_gains else ''}")
     return DONE
 
 

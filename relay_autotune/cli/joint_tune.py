@@ -455,7 +455,7 @@ class JointTune:
     @property
     def target(self) -> Target:
         """Where exported gains go."""
-        return Target(self._loop.node, self._loop.dof)
+        return Target(self._loop.node, self._loop.dof, is_set_up=True)
 
     @property
     def applies(self) -> bool:

@@ -324,7 +324,11 @@ _OF_NEW_LOOP: dict[str, dict[str, Any]] = {
         "default": False, "action": "store_true",
         "help": "do not ask, for scripts; gains are then proven with --verify alone",
     },
-    "export": {"metavar": "FILE", "help": "write the gains for ros2_controllers' pid_controller"},
+    "export": {
+        "metavar": "FILE",
+        "help": "write the gains for ros2_controllers' pid_controller, or for the controller of "
+        "the joint; an existing file is refused at once",
+    },
 }  # fmt: skip
 
 # Flags of a loop without nodes that a joint takes with --open alone, and those it never takes.

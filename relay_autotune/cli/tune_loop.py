@@ -42,7 +42,7 @@ from relay_autotune.cli.own_nodes import (
     own_namespace,
     with_flags,
 )
-from relay_autotune.cli.terminal import Help, Working, agrees, width
+from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
@@ -159,6 +159,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         from relay_autotune.cli.report import check_output
 
         check_output(PROGRAM, options.report)
+    if options.export:
+        require_new(options.export)
     if options.web:
         check_web(options)
     of_joint = is_of_joint(options)

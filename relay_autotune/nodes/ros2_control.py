@@ -379,13 +379,6 @@ _LOOK, _LEAST = 0.3, 5
 _DESCRIPTION_WITHIN = 2.0
 # What a trajectory controller commands, by its field in the points of its state.
 _POINTS = {"velocity": "velocities", "effort": "effort"}
-# The laws of control_toolbox, which both controllers run.
-LAWS = {
-    "back_calculation": "control_toolbox_back_calculation",
-    "conditional_integration": "control_toolbox_conditional_integration",
-    "none": "control_toolbox_none",
-    "legacy": "control_toolbox_legacy",
-}
 # What is read of each degree of freedom, with the value that it has where it is not declared.
 _OPTIONAL: dict[str, Any] = {
     "antiwindup_strategy": "legacy",
@@ -490,10 +483,8 @@ class JointLoop(_Parts):
 
     @property
     def law(self) -> str:
-        """The law that the gains are for."""
-        # The same law, by the name of the program that has a file of parameters.
-        is_own = self.strategy == "back_calculation" and not self.follows
-        return "pid_controller" if is_own else LAWS[self.strategy]
+        """The law of control_toolbox, which all these controllers run, that the gains are for."""
+        return f"control_toolbox_{self.strategy}"
 
     @property
     def why_not_moved(self) -> str:

@@ -66,6 +66,18 @@ def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:
     assert namespace_of_joint("/wheel_pid", "left_wheel") == "/wheel_pid/tune_left_wheel"
 
 
+def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, capsys) -> None:
+    given = ["--controller", "pid", "--joint", "wheel", "--yes", "--export"]
+    (tmp_path / "gains.yaml").write_text("mine")
+    for name, told in (
+        ("gains.yaml", "exists already"),
+        ("none/gains.yaml", "no writable"),
+    ):
+        assert tune_loop.main([*given, str(tmp_path / name)]) == 2
+        assert told in capsys.readouterr().err
+    assert (tmp_path / "gains.yaml").read_text() == "mine"
+
+
 class Looker:
     """A client of a loop whose topics have these types, with a present command."""
 
