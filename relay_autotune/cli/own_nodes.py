@@ -62,12 +62,14 @@ def namespace_of_joint(controller: str, joint: str) -> str:
     :param controller: full name of the controller's node.
     :param joint: name of the joint, any text.
     """
-    # Characters that a name cannot have stand as __ and their number, so that two underscores
-    # begin nothing else.
+    # Characters that a name cannot have, as two underscores in a row, stand as _x, their number
+    # and z. So does an underscore that would begin such a text.
     escaped = re.sub(
-        r"[^0-9A-Za-z_]|_(?![0-9A-Za-z]|$)", lambda found: f"__{ord(found[0]):x}_", joint
+        r"[^0-9A-Za-z_]|_(?![0-9A-Za-z])|_(?=x[0-9a-f]+z)",
+        lambda found: f"_x{ord(found[0]):x}z",
+        f"_{joint}",
     )
-    return f"{controller}/tune_{escaped}"
+    return f"{controller}/tune{escaped}"
 
 
 def own_node(options: argparse.Namespace, name: str) -> str:

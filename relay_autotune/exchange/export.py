@@ -222,7 +222,7 @@ def _comments(gains: Gains, more: Sequence[str], remark: str, *, known: bool = F
                 "That is --sample-period, else the interval of the recording: give "
                 "--sample-period if the program runs at another."
             )
-        if gains.law != OWN_LAW:
+        if gains.law != OWN_LAW and not known:
             told.append(
                 f"controller_node proves them where its parameter law is {gains.law}; another "
                 f"proof of it was of other gains."
